@@ -1,0 +1,17 @@
+"""dynslam-bench: benchmark and tune visual SLAM in dynamic scenes through Gymnasium environments.
+
+The rooms: `core`, `geometry`, `sequences`, `evaluation`, `features`, `segmentation`, `flow`, `culling`, `slam`,
+`trackers`, `envs`, `runs`, `tuning`, `reports`, `cli`. Importing this package loads none of them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__version__ = "0.1.0"
+
+_checkout = Path(__file__).resolve().parent.parent
+if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.py").is_file():
+    # In a bare checkout `envs/`, `tuning/` and `reports/` lie beside this package instead of inside it.
+    __path__.append(str(_checkout))
+del _checkout

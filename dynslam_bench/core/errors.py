@@ -1,0 +1,89 @@
+"""The errors a user can cause; everything else is a bug and keeps its traceback.
+
+Each message is one line: what was found (with the measured numbers), what was expected. The `hint` says what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class DynslamError(Exception):
+    """Base of all errors that the user of the toolkit can cause and cure.
+
+    Args:
+        message: One line with the measured numbers and the expectation.
+        hint: One line that says how to cure it; empty if there is nothing to add.
+    """
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.hint = hint
+
+    def __str__(self) -> str:
+        message = str(self.args[0])
+        return f"{message} ({self.hint})" if self.hint else message
+
+    def __reduce__(self) -> tuple[type[DynslamError], tuple[str, str]]:
+        return type(self), (str(self.args[0]), self.hint)
+
+
+class SettingsError(DynslamError):
+    """A setting is unknown, has the wrong type or lies outside its limits."""
+
+
+class SequenceError(DynslamError):
+    """A sequence is unknown, missing, damaged or lacks what was asked of it."""
+
+
+class TrajectoryError(DynslamError):
+    """A trajectory file cannot be read, or a trajectory is not what it has to be."""
+
+
+class EvaluationError(DynslamError):
+    """A trajectory cannot be evaluated under the protocol."""
+
+
+class SegmentationError(DynslamError):
+    """A segmenter cannot be built or its network gives outputs that are not understood."""
+
+
+class PluginError(DynslamError):
+    """A plug-in is unknown, cannot be loaded or breaks its contract."""
+
+
+class TrackerError(DynslamError):
+    """A tracker cannot be built, or broke its contract while it ran."""
+
+
+class RunError(DynslamError):
+    """A run cannot be started, stored or found."""
+
+
+class StudyError(DynslamError):
+    """A tuning study is ill-defined or does not fit what is stored under its name."""
+
+
+class ReportError(DynslamError):
+    """A report cannot be made of what was given."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A hint naming the closest known names, or listing them all if there are few.
+
+    Args:
+        name: What the user wrote.
+        known: The names that exist.
+
+    Returns:
+        For example ``"did you mean 'epipolar.threshold_px'?"``; empty if nothing is known.
+    """
+    names = sorted(set(known))
+    lowered = {candidate.lower(): candidate for candidate in names}
+    close = difflib.get_close_matches(name.lower(), list(lowered), n=3, cutoff=0.5)
+    if close:
+        return "did you mean " + " or ".join(repr(lowered[match]) for match in close) + "?"
+    if 0 < len(names) <= 12:
+        return "known: " + ", ".join(names)
+    return f"{len(names)} are known, none is close" if names else ""

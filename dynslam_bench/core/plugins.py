@@ -1,0 +1,195 @@
+"""Guarded discovery of plug-ins: one scheme for trackers, segmenters, features, flows, filters and sequences.
+
+A plug-in is a light *spec* (importable without torch or OpenCV) with an `id` and an `entry_point` ``"module:Attr"`` that
+loads the heavy part. Specs are looked up, in this order: ``module:Attr`` or ``file.py:Attr`` given by the user, the
+environment variable ``DYNSLAM_BENCH_PLUGINS``, the entry-point groups ``dynslam_bench.<kind>``, the built-in ones. A
+plug-in that fails to load never breaks the rest; the reason is kept and shown by ``trackers doctor``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+from .errors import PluginError, did_you_mean
+
+ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_PLUGINS"
+Kind = Literal["trackers", "segmenters", "features", "flow", "filters", "sequences"]
+
+
+class Spec(Protocol):
+    """What every plug-in spec has."""
+
+    @property
+    def id(self) -> str:
+        """Unique name within its kind."""
+        ...
+
+    @property
+    def entry_point(self) -> str:
+        """``"module:Attr"`` of the class or factory."""
+        ...
+
+
+P = TypeVar("P", bound=Spec)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A plug-in that is not available, and why."""
+
+    source: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Found(Generic[P]):
+    """A plug-in spec and where it came from: ``argument``, ``environment``, ``entry point (dist)``, ``built in``."""
+
+    spec: P
+    source: str
+
+
+class Registry(Generic[P]):
+    """All plug-ins of one kind.
+
+    Args:
+        kind: Which entry-point group to read.
+        spec_type: What a plug-in's object must be an instance of.
+        builtin: Returns the built-in specs; called once, on first use.
+    """
+
+    def __init__(self, kind: Kind, spec_type: type[P], builtin: Callable[[], Iterable[P]]) -> None:
+        self.kind = kind
+        self._spec_type = spec_type
+        self._builtin = builtin
+        self._found: dict[str, Found[P]] | None = None
+        self._failures: list[Failure] = []
+
+    def all(self) -> list[Found[P]]:
+        """Every available plug-in, sorted by id."""
+        return [found for _, found in sorted(self._discover().items())]
+
+    def failures(self) -> list[Failure]:
+        """The plug-ins that could not be loaded, with reasons."""
+        self._discover()
+        return list(self._failures)
+
+    def get(self, name: str) -> P:
+        """The spec of an id, or of ``module:Attr`` / ``file.py:Attr``.
+
+        Raises:
+            PluginError: Unknown id (with a did-you-mean), or the named object cannot be loaded or is no spec.
+        """
+        found = self._discover()
+        if name in found:
+            return found[name].spec
+        if ":" in name:
+            return self._check(load_object(name), name)
+        broken = [failure for failure in self._failures if name in failure.source]
+        hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, found)
+        raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
+
+    def refresh(self) -> None:
+        """Forget what was discovered, e.g. after the environment variable changed."""
+        self._found = None
+        self._failures = []
+
+    def _discover(self) -> dict[str, Found[P]]:
+        if self._found is not None:
+            return self._found
+        found: dict[str, Found[P]] = {}
+        self._failures = []
+
+        def add(load: Callable[[], object], source: str) -> None:
+            try:
+                spec = self._check(load(), source)
+            except Exception as error:  # a foreign plug-in may raise anything; the reason is kept
+                self._failures.append(Failure(source, _reason(error)))
+                return
+            if spec.id in found:
+                self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {found[spec.id].source}"))
+                return
+            found[spec.id] = Found(spec, source)
+
+        for target in _environment_targets(self.kind):
+            add(lambda target=target: load_object(target), f"{ENVIRONMENT_VARIABLE}: {target}")  # type: ignore[misc]
+        for point in sorted(entry_points(group=f"dynslam_bench.{self.kind}"), key=lambda point: point.name):
+            distribution = point.dist.name if point.dist else "unknown distribution"
+            add(point.load, f"entry point '{point.name}' of {distribution}")
+        for spec in self._builtin():
+            add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
+        self._found = found
+        return found
+
+    def _check(self, value: object, source: str) -> P:
+        if isinstance(value, self._spec_type):
+            return value
+        raise PluginError(
+            f"{source} is a {type(value).__name__}, not a {self._spec_type.__name__}", "name the spec, not the class"
+        )
+
+
+def load_object(target: str) -> Any:
+    """Import ``package.module:Attr`` or ``path/to/file.py:Attr``.
+
+    Raises:
+        PluginError: The module cannot be imported or lacks the attribute; carries the original reason.
+    """
+    location, separator, attribute = target.rpartition(":")
+    if not separator or not location or not attribute:
+        raise PluginError(
+            f"'{target}' is not module:Attr", "for example my_package.trackers:SPEC or my_tracker.py:SPEC"
+        )
+    try:
+        module = _load_file(Path(location)) if location.endswith(".py") else importlib.import_module(location)
+    except Exception as error:
+        raise PluginError(f"cannot import {location}: {_reason(error)}") from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError:
+        public = [name for name in vars(module) if not name.startswith("_")]
+        raise PluginError(f"{location} has no '{attribute}'", did_you_mean(attribute, public)) from None
+
+
+def _load_file(path: Path) -> ModuleType:
+    resolved = path.expanduser().resolve()
+    if not resolved.is_file():
+        raise FileNotFoundError(f"no file {resolved}")
+    name = f"_dynslam_bench_plugin_{sha256(str(resolved).encode()).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, resolved)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _environment_targets(kind: Kind) -> list[str]:
+    """Targets of ``DYNSLAM_BENCH_PLUGINS="trackers=my.py:SPEC,flow=pkg.mod:SPEC"``; no ``kind=`` means a tracker."""
+    targets = []
+    for item in filter(None, (part.strip() for part in os.environ.get(ENVIRONMENT_VARIABLE, "").split(","))):
+        prefix, separator, rest = item.partition("=")
+        if (prefix if separator else "trackers") == kind:
+            targets.append(rest if separator else item)
+    return targets
+
+
+def _reason(error: BaseException) -> str:
+    text = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {text[-1]}" if text else type(error).__name__

@@ -1,0 +1,278 @@
+"""Settings: nested pydantic models whose tunable fields are annotated once.
+
+From the one annotation come validation, ``--set a.b=1`` on the command line, the search space of a study, the action
+space of an environment and the table in the documentation. Nothing here knows Optuna or Gymnasium.
+
+Example:
+    >>> class Epipolar(Settings):
+    ...     threshold_px: float = tunable(1.0, low=0.1, high=5.0, scale="log", unit="px", online=True,
+    ...                                   meaning="distance to the epipolar line above which a point is dynamic")
+    >>> class Tracker(Settings):
+    ...     epipolar: Epipolar = Epipolar()
+    >>> apply_overrides(Tracker(), {"epipolar.threshold_px": "1.5"}).epipolar.threshold_px
+    1.5
+"""
+
+from __future__ import annotations
+
+import json
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from .errors import SettingsError, did_you_mean
+
+S = TypeVar("S", bound="Settings")
+Scalar = bool | int | float | str
+_KEY = "tunable"
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, JSON-able, unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One tunable setting, described without reference to any optimiser.
+
+    Attributes:
+        name: Dotted path from the root settings, e.g. ``epipolar.threshold_px``.
+        kind: What values it takes.
+        default: Its default value.
+        low: Lower end of the range (int and float), inclusive.
+        high: Upper end of the range (int and float), inclusive.
+        scale: How the range is to be sampled.
+        choices: The values of a categorical.
+        unit: Physical unit, empty for none.
+        online: Whether it may change in mid-episode.
+        meaning: One line.
+        when: Conditions ``(dotted name, values)`` that must all hold for the parameter to have an effect.
+    """
+
+    name: str
+    kind: Literal["float", "int", "bool", "categorical"]
+    default: Scalar
+    low: float | None = None
+    high: float | None = None
+    scale: Literal["linear", "log"] = "linear"
+    choices: tuple[Scalar, ...] = ()
+    unit: str = ""
+    online: bool = False
+    meaning: str = ""
+    when: tuple[tuple[str, tuple[Scalar, ...]], ...] = ()
+
+
+def tunable(
+    default: Any,
+    *,
+    meaning: str,
+    low: float | None = None,
+    high: float | None = None,
+    scale: Literal["linear", "log"] = "linear",
+    limits: tuple[float | None, float | None] | None = None,
+    unit: str = "",
+    online: bool = False,
+    when: Mapping[str, Sequence[Scalar]] | None = None,
+) -> Any:
+    """A field that studies may tune.
+
+    Args:
+        default: The default value; bool and ``Literal`` fields take no range.
+        meaning: One line for the documentation table.
+        low: Lower end of the search range, inclusive.
+        high: Upper end of the search range, inclusive.
+        scale: ``log`` for values whose ratio matters; needs ``low > 0``.
+        limits: What validation accepts, where that is wider than the search range; None leaves an end open.
+        unit: Physical unit, e.g. ``px``.
+        online: True if the field may change in mid-episode.
+        when: Conditions on sibling fields (names relative to the model that holds this field).
+    """
+    annotation = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online,
+                  "when": {key: list(values) for key, values in (when or {}).items()}}  # fmt: skip
+    if scale == "log" and (low is None or low <= 0):
+        raise ValueError(f"a log scale needs low > 0, got {low=}")
+    accepted = limits if limits is not None else (low, high)
+    bounds: dict[str, Any] = {}
+    if accepted[0] is not None:
+        bounds["ge"] = accepted[0]
+    if accepted[1] is not None:
+        bounds["le"] = accepted[1]
+    return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, **bounds)
+
+
+def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:
+    """Validate a nested mapping into settings.
+
+    Raises:
+        SettingsError: One line naming the first offending field by its dotted path, its value and what is expected.
+    """
+    try:
+        return cls.model_validate(dict(values or {}))
+    except ValidationError as error:
+        raise _explain(cls, error) from None
+
+
+def apply_overrides(settings: S, overrides: Mapping[str, Any]) -> S:
+    """Copy settings with some fields replaced.
+
+    Args:
+        settings: The settings to start from.
+        overrides: Dotted name to value; strings are parsed by the field's type (``"0.5"``, ``"true"``, ``"[1,2]"``).
+
+    Raises:
+        SettingsError: Unknown name (with a did-you-mean), or a value that does not fit.
+    """
+    values = settings.model_dump()
+    known = set(field_names(type(settings)))
+    for name, value in overrides.items():
+        node, *rest = _walk(values, name.split("."))
+        if name not in known or rest:
+            if any(field.startswith(f"{name}.") for field in known):
+                raise SettingsError(f"setting '{name}' is a group", f"set one of {name}.*")
+            raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, known))
+        node[name.split(".")[-1]] = _parse(value)
+    return build(type(settings), values)
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
+    """Split ``a.b=1`` strings of the command line.
+
+    Raises:
+        SettingsError: An assignment has no ``=`` or no name.
+    """
+    result = {}
+    for text in assignments:
+        name, separator, value = text.partition("=")
+        if not separator or not name.strip():
+            raise SettingsError(f"'{text}' is not an assignment", "write it as --set name=value")
+        result[name.strip()] = value.strip()
+    return result
+
+
+def flatten(settings: Settings) -> dict[str, Any]:
+    """Dotted name to value of every leaf field."""
+    return {name: _get(settings, name) for name in field_names(type(settings))}
+
+
+def field_names(cls: type[Settings]) -> list[str]:
+    """Dotted names of every leaf field, tunable or not, in order of definition."""
+    return [name for name, _ in _leaves(cls)]
+
+
+def parameters(cls: type[Settings], *, online_only: bool = False) -> list[Parameter]:
+    """The tunable fields of a settings class, in order of definition."""
+    found = [_describe(name, field) for name, field in _leaves(cls) if _annotation(field) is not None]
+    return [parameter for parameter in found if parameter.online or not online_only]
+
+
+def settings_table(cls: type[Settings]) -> str:
+    """Markdown table of every leaf field: name, default, range, unit, online, meaning."""
+    described = {parameter.name: parameter for parameter in parameters(cls)}
+    rows = ["| setting | default | range | unit | online | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+    for name, field in _leaves(cls):
+        p = described.get(name)
+        span = "" if p is None else _span(p)
+        default = json.dumps(field.get_default(call_default_factory=True), default=str)
+        rows.append(
+            f"| `{name}` | `{default}` | {span} | {p.unit if p else ''} | {'yes' if p and p.online else ''} "
+            f"| {field.description or ''} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def _span(p: Parameter) -> str:
+    if p.kind == "categorical":
+        return ", ".join(f"`{choice}`" for choice in p.choices)
+    if p.kind == "bool":
+        return "`false`, `true`"
+    return f"{p.low:g} to {p.high:g}{' (log)' if p.scale == 'log' else ''}"
+
+
+def _leaves(cls: type[Settings], prefix: str = "") -> Iterable[tuple[str, FieldInfo]]:
+    for key, field in cls.model_fields.items():
+        nested = _nested(field)
+        if nested is not None:
+            yield from _leaves(nested, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", field
+
+
+def _nested(field: FieldInfo) -> type[Settings] | None:
+    annotation = field.annotation
+    return annotation if isinstance(annotation, type) and issubclass(annotation, Settings) else None
+
+
+def _annotation(field: FieldInfo) -> dict[str, Any] | None:
+    extra = field.json_schema_extra
+    return typing.cast("dict[str, Any]", extra[_KEY]) if isinstance(extra, dict) and _KEY in extra else None
+
+
+def _describe(name: str, field: FieldInfo) -> Parameter:
+    note = _annotation(field)
+    assert note is not None
+    prefix = name.rpartition(".")[0]
+    when = tuple((f"{prefix}.{key}" if prefix else key, tuple(values)) for key, values in note["when"].items())
+    common: dict[str, Any] = {
+        "name": name, "default": field.default, "unit": note["unit"], "online": note["online"],
+        "meaning": field.description or "", "when": when,
+    }  # fmt: skip
+    base = _strip_optional(field.annotation)
+    if base is bool:
+        return Parameter(kind="bool", choices=(False, True), **common)
+    if typing.get_origin(base) is Literal:
+        return Parameter(kind="categorical", choices=typing.get_args(base), **common)
+    if base not in (int, float) or note["low"] is None or note["high"] is None:
+        raise TypeError(f"tunable field '{name}' of type {base} needs low and high, or a bool or Literal type")
+    kind: Literal["int", "float"] = "int" if base is int else "float"
+    return Parameter(kind=kind, low=note["low"], high=note["high"], scale=note["scale"], **common)
+
+
+def _strip_optional(annotation: Any) -> Any:
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        inner = [part for part in typing.get_args(annotation) if part is not type(None)]
+        if len(inner) == 1:
+            return inner[0]
+    return annotation
+
+
+def _walk(values: dict[str, Any], path: list[str]) -> tuple[Any, ...]:
+    """The deepest mapping along the path, followed by the part of the path that was not found."""
+    node: Any = values
+    for depth, key in enumerate(path[:-1]):
+        if not isinstance(node, dict) or key not in node:
+            return (node, *path[depth:])
+        node = node[key]
+    return (node,) if isinstance(node, dict) else (node, path[-1])
+
+
+def _get(settings: Settings, name: str) -> Any:
+    node: Any = settings
+    for key in name.split("."):
+        node = getattr(node, key)
+    return node
+
+
+def _parse(value: Any) -> Any:
+    """Strings of the command line become JSON values where they are; everything else stays as it is."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return json.loads(value)
+    except json.JSONDecodeError:
+        return value
+
+
+def _explain(cls: type[Settings], error: ValidationError) -> SettingsError:
+    first = error.errors()[0]
+    name = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        return SettingsError(f"unknown setting '{name}'", did_you_mean(name, field_names(cls)))
+    message = first["msg"][0].lower() + first["msg"][1:]
+    return SettingsError(f"setting '{name}' is {first['input']!r}: {message}")

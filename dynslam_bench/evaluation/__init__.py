@@ -1,0 +1,1 @@
+"""Protocol, association, alignment, trajectory errors, coverage and mask quality."""

@@ -1,0 +1,1 @@
+"""Keypoints and descriptors (ORB by default), and their matching."""

@@ -1,0 +1,46 @@
+"""Keypoints with binary descriptors, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Features of one image, one row each.
+
+    Attributes:
+        xy: float32 ``[N, 2]``, pixels of the image as given (distorted, full resolution).
+        octave: int32 ``[N]``, pyramid level, 0 is full resolution.
+        angle: float32 ``[N]``, orientation in degrees, [0, 360).
+        response: float32 ``[N]``, corner strength.
+        descriptors: uint8 ``[N, B]``, packed bits (ORB: B = 32).
+    """
+
+    xy: NDArray[np.float32]
+    octave: NDArray[np.int32]
+    angle: NDArray[np.float32]
+    response: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def select(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Keypoints:
+        """The keypoints at an index or mask."""
+        return Keypoints(
+            self.xy[index], self.octave[index], self.angle[index], self.response[index], self.descriptors[index]
+        )
+
+
+@runtime_checkable
+class FeatureExtractor(Protocol):
+    """Finds keypoints; deterministic."""
+
+    def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
+        """The keypoints of a uint8 ``[H, W]`` image; none is an empty result."""
+        ...

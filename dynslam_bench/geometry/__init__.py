@@ -1,0 +1,1 @@
+"""Camera model, SE(3), and trajectories with their file formats."""

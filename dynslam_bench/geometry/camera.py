@@ -1,0 +1,109 @@
+"""The pinhole camera with radial-tangential distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole intrinsics of a colour camera to which the depth image is registered.
+
+    Attributes:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        fx: Focal length along x in pixels.
+        fy: Focal length along y in pixels.
+        cx: Principal point x in pixels (centre of the top-left pixel is 0).
+        cy: Principal point y in pixels.
+        distortion: Radial-tangential coefficients ``(k1, k2, p1, p2, k3)``, OpenCV's order.
+        depth_factor: Raw 16-bit depth units a metre (5000 in TUM files).
+        baseline_m: Baseline of the (virtual) stereo pair that turns depth into a right coordinate, in metres.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_factor: float = 5000.0
+    baseline_m: float = 0.075
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 calibration matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether any distortion coefficient differs from zero."""
+        return any(self.distortion)
+
+    def undistorted(self) -> Camera:
+        """The same pinhole without distortion."""
+        return replace(self, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the image resized to `width` x `height` pixels; the intrinsics are scaled along.
+
+        Pixel centres are at integer coordinates, as in `cv2.resize`: ``u' = (u + 0.5) * s - 0.5``.
+        """
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+        )
+
+    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project points ``[..., 3]`` of the camera frame (metres) to undistorted pixels ``[..., 2]``.
+
+        Points with z <= 0 give inf or nan; the caller selects.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = points[..., :2] / points[..., 2:3]
+        return xy * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def unproject(self, pixels: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Points ``[..., 3]`` of the camera frame (metres) at undistorted pixels ``[..., 2]`` and z-depth ``[...]``."""
+        pixels = np.asarray(pixels, dtype=np.float64)
+        depth = np.asarray(depth, dtype=np.float64)
+        rays = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        return np.concatenate([rays * depth[..., None], depth[..., None]], axis=-1)
+
+    def undistort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Undistorted pixels ``[N, 2]`` of the distorted pixels ``[N, 2]``, same intrinsics."""
+        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        if not self.is_distorted or not len(pixels):
+            return pixels
+        import cv2
+
+        coefficients = np.asarray(self.distortion)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
+        undistorted = cv2.undistortPointsIter(
+            pixels[:, None], self.matrix, coefficients, np.eye(3), self.matrix, criteria
+        ) if hasattr(cv2, "undistortPointsIter") else cv2.undistortPoints(
+            pixels[:, None], self.matrix, coefficients, None, self.matrix, criteria=criteria
+        )  # fmt: skip
+        return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+
+    def distort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Distorted pixels ``[N, 2]`` of the undistorted pixels ``[N, 2]``; the inverse of `undistort_points`."""
+        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = ((pixels - (self.cx, self.cy)) / (self.fx, self.fy)).T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([xd * self.fx + self.cx, yd * self.fy + self.cy], axis=-1)

@@ -1,0 +1,107 @@
+"""SE(3): exponential and logarithm, inverse, quaternions. Poses are 4x4 float64 matrices, batched along leading axes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def hat(v: Array) -> Array:
+    """Skew-symmetric matrices ``[..., 3, 3]`` of vectors ``[..., 3]``."""
+    x, y, z = np.moveaxis(np.asarray(v, dtype=np.float64), -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+
+
+def exp(xi: Array) -> Array:
+    """Poses ``[..., 4, 4]`` of twists ``[..., 6]`` = (translation rho, rotation phi in rad)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    rho, phi = xi[..., :3], xi[..., 3:]
+    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = theta < 1e-5
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1 - theta**2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta**2 / 24, (1 - np.cos(safe)) / safe**2)
+    c = np.where(small, 1 / 6 - theta**2 / 120, (safe - np.sin(safe)) / safe**3)
+    skew = hat(phi)
+    skew2 = skew @ skew
+    pose = np.zeros((*xi.shape[:-1], 4, 4))
+    pose[..., :3, :3] = np.eye(3) + a * skew + b * skew2
+    pose[..., :3, 3] = ((np.eye(3) + b * skew + c * skew2) @ rho[..., None])[..., 0]
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def log(pose: Array) -> Array:
+    """Twists ``[..., 6]`` = (rho, phi) of poses ``[..., 4, 4]``; rotation angles in [0, pi]."""
+    pose = np.asarray(pose, dtype=np.float64)
+    flat = pose.reshape(-1, 4, 4)
+    phi = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
+    theta = np.linalg.norm(phi, axis=-1)[:, None, None]
+    small = theta < 1e-5
+    safe = np.where(small, 1.0, theta)
+    half = safe / 2
+    factor = np.where(small, 1 / 12 + theta**2 / 720, (1 - half / np.tan(half)) / safe**2)
+    skew = hat(phi)
+    inverse_jacobian = np.eye(3) - 0.5 * skew + factor * (skew @ skew)
+    rho = (inverse_jacobian @ flat[:, :3, 3:])[..., 0]
+    return np.concatenate([rho, phi], axis=-1).reshape(*pose.shape[:-2], 6)
+
+
+def inverse(pose: Array) -> Array:
+    """Inverse poses, by transposition of the rotation."""
+    pose = np.asarray(pose, dtype=np.float64)
+    rotation_t = np.swapaxes(pose[..., :3, :3], -1, -2)
+    result = np.zeros_like(pose)
+    result[..., :3, :3] = rotation_t
+    result[..., :3, 3] = -(rotation_t @ pose[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def from_quaternion(translation: Array, quaternion: Array) -> Array:
+    """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and quaternions ``[..., 4]`` in TUM's order qx qy qz qw."""
+    translation = np.asarray(translation, dtype=np.float64)
+    quaternion = np.asarray(quaternion, dtype=np.float64)
+    pose = np.zeros((*translation.shape[:-1], 4, 4))
+    rotation = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
+    pose[..., :3, :3] = rotation.reshape(*translation.shape[:-1], 3, 3)
+    pose[..., :3, 3] = translation
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def to_quaternion(pose: Array) -> tuple[Array, Array]:
+    """Translations ``[..., 3]`` and unit quaternions ``[..., 4]`` (qx qy qz qw, qw >= 0) of poses ``[..., 4, 4]``."""
+    pose = np.asarray(pose, dtype=np.float64)
+    quaternion = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    return pose[..., :3, 3].copy(), quaternion.reshape(*pose.shape[:-2], 4)
+
+
+def rotation_angle(pose: Array) -> Array:
+    """Rotation angles ``[...]`` in rad, in [0, pi]; accurate for small angles too."""
+    pose = np.asarray(pose, dtype=np.float64)
+    angles = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).magnitude()
+    return np.asarray(angles).reshape(pose.shape[:-2])
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Points ``[N, 3]`` moved by one pose ``[4, 4]``."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def is_pose(pose: object, tolerance: float = 1e-4) -> bool:
+    """Whether the value is a finite 4x4 rigid transformation: orthonormal rotation, determinant 1, last row 0 0 0 1."""
+    if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or not np.issubdtype(pose.dtype, np.floating):
+        return False
+    if not np.isfinite(pose).all():
+        return False
+    rotation = pose[:3, :3]
+    return bool(
+        np.abs(rotation @ rotation.T - np.eye(3)).max() < tolerance
+        and np.linalg.det(rotation) > 0
+        and np.abs(pose[3] - (0, 0, 0, 1)).max() < tolerance
+    )

@@ -1,0 +1,1 @@
+"""Segmenters: who finds people and things in a frame (networks, recorded masks, exact masks)."""

@@ -1,0 +1,1 @@
+"""Frames and sequences: readers, catalogue, download, preprocessing and the synthetic renderer."""

@@ -1,0 +1,1 @@
+"""The renderer of dynamic RGB-D sequences with exact poses, depth, masks and flow."""

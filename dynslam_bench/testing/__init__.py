@@ -1,0 +1,1 @@
+"""Conformance checks for the authors of plug-ins."""

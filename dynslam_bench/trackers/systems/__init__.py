@@ -1,0 +1,1 @@
+"""Published systems as compositions of filters on the shared back end, one file each."""
