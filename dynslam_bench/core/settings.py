@@ -94,7 +94,7 @@ def tunable(
         online: True if the field may change in mid-episode.
         when: Conditions on sibling fields (names relative to the model that holds this field).
     """
-    annotation = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online,
+    annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online,
                   "when": {key: list(values) for key, values in (when or {}).items()}}  # fmt: skip
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")

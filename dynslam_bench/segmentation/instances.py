@@ -49,7 +49,7 @@ class Instances:
 
     def union(self) -> NDArray[np.bool_]:
         """Bool ``[H, W]``: pixels of any object."""
-        return self.masks.any(axis=0)
+        return np.asarray(self.masks.any(axis=0))
 
 
 @runtime_checkable
