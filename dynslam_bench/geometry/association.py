@@ -1,0 +1,82 @@
+"""One-to-one association of two lists of stamps, as the TUM RGB-D benchmark's ``associate.py`` does it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dynslam_bench.core.errors import TrajectoryError
+
+Index = NDArray[np.intp]
+
+
+def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: bool = True) -> tuple[Index, Index]:
+    """Greedy one-to-one association by absolute time difference.
+
+    All pairs closer than `max_dt` are taken in order of ``(|dt|, first stamp, second stamp)``; a pair counts if neither
+    stamp was used before (the rule of TUM's ``associate.py``, including its order on ties).
+
+    Args:
+        first: Stamps in seconds ``[N]``, in any order.
+        second: Stamps in seconds ``[M]``, in any order.
+        max_dt: Largest time difference in seconds.
+        strict: True for ``|dt| < max_dt`` (TUM), False for ``|dt| <= max_dt``.
+
+    Returns:
+        Indices into `first` and into `second` ``[K]`` each, in order of the first stamp.
+
+    Raises:
+        TrajectoryError: A stamp is not finite, or `max_dt` is negative or not a number.
+    """
+    a, order_a = _sorted_stamps(first)
+    b, order_b = _sorted_stamps(second)
+    if not max_dt >= 0:
+        raise TrajectoryError(f"the largest time difference is {max_dt!r}, not a number of seconds >= 0")
+    candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
+    free_a = np.ones(len(a), dtype=bool).tolist()
+    free_b = np.ones(len(b), dtype=bool).tolist()
+    matched: list[tuple[int, int]] = []
+    by_distance = np.lexsort((candidate_b, candidate_a, dt))
+    for i, j in zip(candidate_a[by_distance].tolist(), candidate_b[by_distance].tolist(), strict=True):
+        if free_a[i] and free_b[j]:
+            free_a[i] = free_b[j] = False
+            matched.append((i, j))
+    pairs = np.array(sorted(matched), dtype=np.intp).reshape(-1, 2)
+    return order_a[pairs[:, 0]], order_b[pairs[:, 1]]
+
+
+def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+    """Distance in seconds ``[N]`` of every stamp of `first` to the nearest of `second`; inf if `second` is empty."""
+    a = np.asarray(first, dtype=np.float64).reshape(-1)
+    b = np.sort(np.asarray(second, dtype=np.float64).reshape(-1))
+    if not len(b):
+        return np.full(len(a), np.inf)
+    at = np.searchsorted(b, a)
+    below = np.abs(a - b[np.clip(at - 1, 0, len(b) - 1)])
+    above = np.abs(b[np.clip(at, 0, len(b) - 1)] - a)
+    return np.minimum(below, above)
+
+
+def _sorted_stamps(stamps: ArrayLike) -> tuple[NDArray[np.float64], Index]:
+    values = np.asarray(stamps, dtype=np.float64).reshape(-1)
+    if not np.isfinite(values).all():
+        at = int(np.argmin(np.isfinite(values)))
+        raise TrajectoryError(f"stamp {at} of {len(values)} is {values[at]}, not a finite number of seconds")
+    order = np.argsort(values, kind="stable")
+    return values[order], order
+
+
+def _candidates(
+    a: NDArray[np.float64], b: NDArray[np.float64], max_dt: float, *, strict: bool
+) -> tuple[Index, Index, NDArray[np.float64]]:
+    """All pairs of indices within `max_dt` with their |dt|; both lists sorted."""
+    slack = 1e-9 + 4 * np.spacing(max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)))
+    low = np.searchsorted(b, a - max_dt - slack, side="left")
+    high = np.searchsorted(b, a + max_dt + slack, side="right")
+    count = high - low
+    index_a = np.repeat(np.arange(len(a)), count)
+    offset = np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count)
+    index_b = np.repeat(low, count) + offset
+    dt = np.abs(a[index_a] - b[index_b])
+    keep = dt < max_dt if strict else dt <= max_dt
+    return index_a[keep], index_b[keep], dt[keep]
