@@ -80,6 +80,7 @@ def tunable(
     unit: str = "",
     online: bool = False,
     when: Mapping[str, Sequence[Scalar]] | None = None,
+    choices: Sequence[Scalar] | None = None,
 ) -> Any:
     """A field that studies may tune.
 
@@ -93,9 +94,11 @@ def tunable(
         unit: Physical unit, e.g. ``px``.
         online: True if the field may change in mid-episode.
         when: Conditions on sibling fields (names relative to the model that holds this field).
+        choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
     annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online,
-                  "when": {key: list(values) for key, values in (when or {}).items()}}  # fmt: skip
+                  "when": {key: list(values) for key, values in (when or {}).items()},
+                  "choices": list(choices or ())}  # fmt: skip
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")
     accepted = limits if limits is not None else (low, high)
@@ -224,6 +227,8 @@ def _describe(name: str, field: FieldInfo) -> Parameter:
         "meaning": field.description or "", "when": when,
     }  # fmt: skip
     base = _strip_optional(field.annotation)
+    if note["choices"]:
+        return Parameter(kind="categorical", choices=tuple(note["choices"]), **common)
     if base is bool:
         return Parameter(kind="bool", choices=(False, True), **common)
     if typing.get_origin(base) is Literal:
