@@ -58,6 +58,7 @@ class KeyframeView:
         xy: float64 ``[N, 2]`` undistorted pixels.
         z: float32 ``[N]`` depth at the keypoints in metres, 0 missing.
         depth: float32 ``[H, W]`` metres, or None where the keyframe no longer keeps its image.
+        timestamp: Seconds; also the keyframe's identity for filters that cache.
     """
 
     T_world_cam: NDArray[np.float64]
@@ -65,6 +66,7 @@ class KeyframeView:
     xy: NDArray[np.float64]
     z: NDArray[np.float32]
     depth: NDArray[np.float32] | None
+    timestamp: float = 0.0
 
 
 @dataclass(eq=False)

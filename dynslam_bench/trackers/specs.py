@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from .adapters.specs import adapter_specs
 from .protocol import TrackerSpec
+from .systems import emfoa_oft, mask_rcnn, orb_slam2
 
 
 def all_specs() -> list[TrackerSpec]:
     """Every built-in tracker's spec."""
-    return []
+    return [orb_slam2.SPEC, mask_rcnn.SPEC, *emfoa_oft.SPECS, *adapter_specs()]

@@ -1,0 +1,150 @@
+"""B3: the epipolar test on optical flow (paper, Eq. 23-25), with a degeneracy guard."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry.camera import Camera
+
+from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .semantic import inside
+from .settings import EpipolarSettings
+
+MIN_MATCHES = 16  # twice the eight-point algorithm's minimum
+Points = NDArray[np.float64]
+
+_METHODS = {"ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS, "magsac": cv2.USAC_MAGSAC}
+
+
+def fundamental_matrix(first: Points, second: Points, settings: EpipolarSettings) -> NDArray[np.float64] | None:
+    """The matrix F with ``x2^T F x1 = 0`` (Eq. 24) for matched pixels, robustly.
+
+    Args:
+        first: Undistorted pixels x1, float64 ``[N, 2]``.
+        second: Undistorted pixels x2, float64 ``[N, 2]``.
+        settings: Estimator and thresholds.
+
+    Returns:
+        F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate, the estimator gave up).
+    """
+    if len(first) < MIN_MATCHES:
+        return None
+    try:
+        matrix, _ = cv2.findFundamentalMat(
+            first, second, _METHODS[settings.estimator], settings.inlier_px, settings.confidence, 2000
+        )
+    except cv2.error:  # OpenCV 5.0's MAGSAC raises "!model.empty()" where no model was found
+        return None
+    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return None
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points) -> NDArray[np.float64]:
+    """Distances ``[N]`` in pixels of x2 to the epipolar line of x1 (Eq. 25, with the root that the text lost)."""
+    lines = np.column_stack([first, np.ones(len(first))]) @ matrix.T
+    signed = (lines[:, :2] * second).sum(axis=1) + lines[:, 2]
+    return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
+
+
+def parallax(first: Points, second: Points, camera: Camera) -> tuple[float, float]:
+    """How much of the flow a pure rotation leaves unexplained, and how much one homography explains.
+
+    Args:
+        first: Undistorted pixels ``[N, 2]``.
+        second: Undistorted pixels ``[N, 2]``.
+        camera: Intrinsics.
+
+    Returns:
+        Median residual in pixels after the best rotation, and the share of points within 1 px of the best homography.
+    """
+    rays = [np.column_stack([(xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(xy))])
+            for xy in (first, second)]  # fmt: skip
+    rays = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
+    weight = np.ones(len(first))
+    residual = np.zeros(len(first))
+    for _ in range(3):  # iteratively reweighted, so that moving things do not turn the rotation
+        u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
+        weight = 1.0 / np.maximum(residual, 0.5)
+    matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=300, confidence=0.99)
+    share = 0.0 if matrix is None else float(np.mean(mask))
+    return float(np.median(residual)), share
+
+
+class EpipolarFilter(DynamicFilter):
+    """Drops points, or objects, whose flow leaves the epipolar line.
+
+    F comes from the flow of the points that earlier filters kept; the test covers all points with a valid flow.
+    Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``, ``homography_share``, ``degenerate`` (1 where
+    the guard skipped the test), ``moving_objects``.
+    """
+
+    name = "epipolar"
+    needs: frozenset[Need] = frozenset({"flow", "previous"})
+    provenance: Provenance = "faithful-paper"
+
+    def __init__(self, settings: EpipolarSettings) -> None:
+        self.settings = settings
+
+    def reset(self, camera: Camera) -> None:
+        """Nothing to forget."""
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Test the flow of this frame's keypoints to the previous image."""
+        stats = dict.fromkeys(
+            ("matches", "inliers", "parallax_px", "homography_share", "degenerate", "moving_objects"), 0.0
+        )
+        keep = np.ones(len(frame), dtype=bool)
+        flow = state.flow
+        if flow is None or state.previous is None:
+            return FilterResult.of(keep, **stats)
+        before = state.camera.undistort_points(flow.xy)
+        fit = flow.valid & state.keep
+        stats["matches"] = float(np.count_nonzero(fit))
+        if stats["matches"] < MIN_MATCHES:
+            return FilterResult.of(keep, **{**stats, "degenerate": 1.0})
+        stats["parallax_px"], stats["homography_share"] = parallax(before[fit], frame.xy[fit], state.camera)
+        degenerate = (
+            stats["parallax_px"] < self.settings.min_parallax_px
+            or stats["homography_share"] >= self.settings.homography_share
+        )
+        matrix = None if degenerate else fundamental_matrix(before[fit], frame.xy[fit], self.settings)
+        if matrix is None:
+            return FilterResult.of(keep, **{**stats, "degenerate": 1.0})
+        failing = np.zeros(len(frame), dtype=bool)
+        distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
+        failing[flow.valid] = distance > self.settings.threshold_px
+        stats["inliers"] = float(np.count_nonzero(fit & ~failing))
+        if self.settings.mode == "point":
+            return FilterResult.of(~failing, **stats)
+        keep, stats["moving_objects"] = vote_on_objects(frame, failing, flow.valid, self.settings.vote_share)
+        return FilterResult.of(keep, **stats)
+
+
+def vote_on_objects(
+    frame: FrameBundle, failing: NDArray[np.bool_], tested: NDArray[np.bool_], share: float
+) -> tuple[NDArray[np.bool_], float]:
+    """B11: an object moves if enough of its tested points fail; then all of its points are dropped.
+
+    Args:
+        frame: The frame with its instances; without any, nothing is dropped.
+        failing: bool ``[N]``, points that failed a test.
+        tested: bool ``[N]``, points that were tested.
+        share: Share of the tested points that must fail.
+
+    Returns:
+        bool ``[N]`` keep, and the number of moving objects.
+    """
+    keep = np.ones(len(frame), dtype=bool)
+    moving = 0
+    for mask in () if frame.instances is None else frame.instances.masks:
+        on_object = inside(mask, frame.keypoints.xy)
+        voters = on_object & tested
+        if voters.any() and failing[voters].mean() >= share:
+            keep &= ~on_object
+            moving += 1
+    return keep, float(moving)

@@ -1,0 +1,268 @@
+"""The way of one frame through a visual SLAM system for dynamic scenes (paper, Figure 2), top to bottom.
+
+Every published system runs this file; it differs only in its list of filters, its flow and its settings.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.seeding import derive_seed, stream
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.culling.ego_motion import refine_prediction
+from dynslam_bench.culling.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
+from dynslam_bench.culling.guard import restore_starved
+from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.features.keypoints import FeatureExtractor
+from dynslam_bench.flow.estimator import FlowEstimator, FlowResult
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.sequences.frame import Frame
+
+from .backend import RgbdBackend
+from .outputs import MapOutputs
+from .result import TrackResult
+
+KEYFRAMES_SHOWN = 20
+"""How many of the latest keyframes filters may look at (DynaSLAM's window)."""
+
+
+class MaskStage(Protocol):
+    """Gives each frame its instances: by a network, from a file, or carried over from an earlier frame."""
+
+    def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
+        """The objects in the frame; `keyframe` says that the previous frame asked for a fresh segmentation."""
+        ...
+
+
+class SlamPipeline:
+    """A tracker: features, masks, culling, flow, culling, tracking and mapping, one frame at a time.
+
+    Args:
+        extractor: Finds the keypoints.
+        masks: Segmentation stage; None for systems without semantics.
+        filters: Dynamic feature filters in the order of application.
+        flow: Flow of the keypoints that are left to the previous image; run before the first filter that needs it.
+        backend: Tracking and mapping.
+        guard: What the filters must leave.
+    """
+
+    def __init__(
+        self,
+        *,
+        extractor: FeatureExtractor,
+        masks: MaskStage | None,
+        filters: Sequence[DynamicFilter],
+        flow: FlowEstimator | None,
+        backend: RgbdBackend,
+        guard: GuardSettings,
+    ) -> None:
+        needing = [f.name for f in filters if "flow" in f.needs]
+        if needing and flow is None:
+            raise TrackerError(f"filter '{needing[0]}' needs an optical flow, the system has none")
+        self._extractor = extractor
+        self._masks = masks
+        self._filters = tuple(filters)
+        self._flow = flow
+        self._backend = backend
+        self._guard = guard
+        self._camera: Camera | None = None
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence."""
+        self._camera = camera
+        self._seed = derive_seed(rng)
+        self._backend.reset(camera, seed=self._seed)
+        for each in (*self._filters, self._masks):
+            if each is not None and hasattr(each, "reset"):
+                each.reset(camera)
+        self._previous: FrameBundle | None = None
+        self._previous_keep: NDArray[np.bool_] | None = None
+        self._previous_image: Any = None
+        self._previous_pose: NDArray[np.float64] | None = None
+        self._keyframe_due = True
+
+    def track(self, frame: Frame) -> TrackResult:
+        """Track one frame.
+
+        Raises:
+            TrackerError: `reset` was not called, or the frame's size is not the camera's.
+        """
+        camera = self._check(frame)
+        clock = _Clock()
+        with clock("features"):
+            bundle = self._extract(frame, camera)
+        with clock("segmentation"):
+            if self._masks is not None:
+                bundle.instances = self._masks.masks_for(frame, bundle.gray, keyframe=self._keyframe_due)
+        state = FilterState(
+            camera=camera,
+            keep=np.ones(len(bundle), dtype=bool),
+            previous=self._previous,
+            previous_keep=self._previous_keep,
+            T_world_prev=self._previous_pose,
+            T_world_pred=self._backend.predict(),
+            keyframes=self._backend.keyframe_views(KEYFRAMES_SHOWN),
+            map_points=self._backend.map_points(),
+            seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
+        )
+        image = None
+        verdicts: list[FilterResult] = []
+        stats: dict[str, float] = {"keypoints": float(len(bundle))}
+        for each in self._filters:
+            if "flow" in each.needs and image is None and self._flow is not None:
+                with clock("flow"):
+                    image = self._flow.prepare(bundle.gray)
+                    state.flow = self._flow_to_previous(bundle, image, state)
+                with clock("ego_motion"):
+                    state.T_world_pred = refine_prediction(bundle, state)
+            with clock(f"culling_{each.name}"):
+                verdict = each.apply(bundle, state)
+            verdicts.append(verdict)
+            state.keep = state.keep & verdict.keep
+            stats |= {f"{each.name}_{key}": value for key, value in verdict.stats.items()}
+        keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard)
+        if not verdicts:
+            keep = state.keep
+        used = verdicts[: len(verdicts) - undone]
+        mask = _union([verdict.mask for verdict in used])
+        weight = np.prod([verdict.weight for verdict in used], axis=0, dtype=np.float32) if used else None
+        result = self._backend.track(bundle, keep, np.ones(len(bundle), np.float32) if weight is None else weight, mask)
+        stats |= {
+            "culled": float(np.count_nonzero(~keep)),
+            "guard_undone": float(undone),
+            "mask_fraction": 0.0 if mask is None else float(mask.mean()),
+        }
+        if state.flow is not None:
+            stats |= {f"flow_{key}": value for key, value in state.flow.stats.items()}
+        elif self._flow is not None:
+            stats["flow_valid"] = 0.0
+        self._remember(bundle, keep, image, result)
+        return replace(
+            result,
+            stats=dict(result.stats) | stats,
+            timings=clock.seconds | dict(result.timings),
+            dynamic_mask=mask,
+            keypoints_xy=bundle.keypoints.xy,
+            keypoints_keep=keep,
+        )
+
+    def finalize(self) -> Trajectory:
+        """The trajectory after the last optimisation of the map."""
+        return self._backend.finalize()
+
+    def map_outputs(self) -> MapOutputs:
+        """Keyframes and map points, for ``keyframes.csv``, ``map.ply`` and the sheet."""
+        return self._backend.outputs()
+
+    def update_settings(self, settings: Settings) -> None:
+        """Put new values of online settings into force from the next frame on.
+
+        Each part takes the group of the settings that bears its name: filters their own, ``flow``, ``backend``,
+        ``guard`` and ``segmentation``.
+        """
+        self._guard = getattr(settings, "guard", self._guard)
+        parts: list[tuple[str, Any]] = [(getattr(each, "group", each.name), each) for each in self._filters]
+        parts += [("flow", self._flow), ("backend", self._backend), ("segmentation", self._masks)]
+        for group, part in parts:
+            if part is not None and hasattr(part, "settings") and hasattr(settings, group):
+                part.settings = getattr(settings, group)
+
+    def _check(self, frame: Frame) -> Camera:
+        if self._camera is None:
+            raise TrackerError("track() was called before reset()")
+        expected = (self._camera.height, self._camera.width)
+        if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
+            raise TrackerError(
+                f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
+                f"the camera is {self._camera.width}x{self._camera.height}"
+            )
+        return self._camera
+
+    def _extract(self, frame: Frame, camera: Camera) -> FrameBundle:
+        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        keypoints = self._extractor.extract(gray)
+        column, row = np.rint(keypoints.xy).astype(np.intp).T
+        z = frame.depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+        z = np.where(np.isfinite(z) & (z > 0), z, 0).astype(np.float32)
+        return FrameBundle(
+            index=frame.index, timestamp=frame.timestamp, rgb=frame.rgb, gray=gray, depth=frame.depth,
+            keypoints=keypoints, xy=camera.undistort_points(keypoints.xy), z=z,
+        )  # fmt: skip
+
+    def _flow_to_previous(self, bundle: FrameBundle, image: Any, state: FilterState) -> FlowResult | None:
+        """Flow of the keypoints that are left, in rows of all keypoints; None on the first frame."""
+        assert self._flow is not None
+        if self._previous is None:
+            return None
+        if self._previous_image is None:
+            self._previous_image = self._flow.prepare(self._previous.gray)
+        chosen = np.flatnonzero(state.keep)
+        result = self._flow.track(
+            image, self._previous_image, bundle.keypoints.xy[chosen],
+            guess=predicted_flow(bundle, state)[chosen], seed=state.seed,
+        )  # fmt: skip
+        xy = np.full((len(bundle), 2), np.nan, np.float32)
+        valid = np.zeros(len(bundle), bool)
+        cost = np.full(len(bundle), np.inf, np.float32)
+        xy[chosen], valid[chosen], cost[chosen] = result.xy, result.valid, result.cost
+        return FlowResult(xy, valid, cost, result.stats)
+
+    def _remember(self, bundle: FrameBundle, keep: NDArray[np.bool_], image: Any, result: TrackResult) -> None:
+        self._previous, self._previous_keep, self._previous_image = bundle, keep, image
+        self._previous_pose = result.T_world_cam if result.state == "ok" else None
+        self._keyframe_due = result.state != "ok" or result.stats.get("keyframe", 0.0) > 0
+
+
+def predicted_flow(bundle: FrameBundle, state: FilterState) -> NDArray[np.float32]:
+    """Where the motion model expects this frame's keypoints in the previous image.
+
+    Args:
+        bundle: The current frame.
+        state: With the previous pose and the predicted one.
+
+    Returns:
+        Raw pixels float32 ``[N, 2]``; NaN where depth or a prediction is missing.
+    """
+    guess = np.full((len(bundle), 2), np.nan, np.float32)
+    known = bundle.z > 0
+    if state.T_world_prev is None or state.T_world_pred is None or not known.any():
+        return guess
+    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
+    points = se3.transform(T_prev_cur, state.camera.unproject(bundle.xy[known], bundle.z[known]))
+    ahead = points[:, 2] > 0.05
+    pixels = np.full((len(points), 2), np.nan)
+    pixels[ahead] = state.camera.distort_points(state.camera.project(points[ahead]))
+    guess[known] = pixels
+    return guess
+
+
+def _union(masks: list[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:
+    given = [mask for mask in masks if mask is not None]
+    return np.logical_or.reduce(given) if given else None
+
+
+class _Clock:
+    """Wall-clock seconds by stage, in the order of first use."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start

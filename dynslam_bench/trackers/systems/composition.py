@@ -1,0 +1,72 @@
+"""How a system is put together: one back end for all, a list of filters of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.slam.settings import BackendSettings
+
+from ..protocol import TrackerContext
+
+if TYPE_CHECKING:
+    from dynslam_bench.culling.filter import DynamicFilter
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class SystemSettings(Settings):
+    """What every system on our back end has."""
+
+    features: FeatureSettings = FeatureSettings()
+    backend: BackendSettings = BackendSettings()
+    guard: GuardSettings = GuardSettings()
+
+
+class SemanticSystemSettings(SystemSettings):
+    """A system that uses masks or boxes."""
+
+    segmentation: SegmentationSettings = SegmentationSettings()
+
+
+def compose(
+    settings: SystemSettings,
+    context: TrackerContext,
+    filters: Sequence[DynamicFilter] = (),
+    flow: FlowSettings | None = None,
+) -> SlamPipeline:
+    """The pipeline of a system.
+
+    Args:
+        settings: Its settings; a `SemanticSystemSettings` brings a segmentation stage.
+        context: Where it runs.
+        filters: Its dynamic feature filters, in the order of application.
+        flow: Settings of its optical flow; None for a system without one.
+
+    Raises:
+        SegmentationError: The semantic source is not available.
+    """
+    from dynslam_bench.features.build import build_extractor
+    from dynslam_bench.flow.build import build_flow
+    from dynslam_bench.segmentation.schedule import build_mask_stage
+    from dynslam_bench.slam.backend import RgbdBackend
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+    masks = None
+    if isinstance(settings, SemanticSystemSettings):
+        masks = build_mask_stage(
+            settings.segmentation, sequence_id=context.sequence_id, masks=context.masks, device=context.device,
+            threads=context.threads,
+        )  # fmt: skip
+    return SlamPipeline(
+        extractor=build_extractor(settings.features),
+        masks=masks,
+        filters=filters,
+        flow=None if flow is None else build_flow(flow, device=context.device, threads=context.threads),
+        backend=RgbdBackend(settings.backend),
+        guard=settings.guard,
+    )

@@ -1,0 +1,122 @@
+"""EMFOA-OFT-SLAM (the paper) and its ablations.
+
+Masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised by the elite moth-flame
+algorithm, matches the remaining ORB points with the previous image; the fundamental matrix of those matches culls what
+leaves its epipolar line; the shared back end tracks and maps with what is left.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, MotionSettings
+from dynslam_bench.flow.settings import FlowSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.culling.filter import DynamicFilter
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class EmfoaOftSettings(SemanticSystemSettings):
+    """Settings of the paper's system."""
+
+    flow: FlowSettings = FlowSettings()
+    epipolar: EpipolarSettings = EpipolarSettings()
+    motion: MotionSettings = MotionSettings()
+    free_space: FreeSpaceSettings = FreeSpaceSettings()
+
+
+def build(settings: EmfoaOftSettings, context: TrackerContext) -> SlamPipeline:
+    """Mask culling, EMFOA-optimised flow, epipolar culling, depth consistency, the shared back end."""
+    return _build(settings, context)
+
+
+def build_without_flow(settings: EmfoaOftSettings, context: TrackerContext) -> SlamPipeline:
+    """Ablation: mask culling only."""
+    return _build(settings, context, geometry=False)
+
+
+def build_object_mode(settings: EmfoaOftSettings, context: TrackerContext) -> SlamPipeline:
+    """Ablation: no mask culling; an object goes if the epipolar vote of its points says that it moves (step 3)."""
+    return _build(settings, context, semantic=False)
+
+
+def _build(
+    settings: EmfoaOftSettings, context: TrackerContext, *, semantic: bool = True, geometry: bool = True
+) -> SlamPipeline:
+    from dynslam_bench.culling.epipolar import EpipolarFilter
+    from dynslam_bench.culling.free_space import FreeSpaceFilter
+    from dynslam_bench.culling.motion import MotionFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
+
+    filters: list[DynamicFilter] = []
+    if semantic and settings.segmentation.source != "none":
+        filters.append(SemanticFilter(settings.segmentation))
+    if geometry:
+        filters.append(EpipolarFilter(settings.epipolar))
+        if settings.motion.enabled:
+            filters.append(MotionFilter(settings.motion))
+        if settings.free_space.enabled:
+            filters.append(FreeSpaceFilter(settings.free_space))
+    return compose(settings, context, filters, settings.flow if geometry else None)
+
+
+def _spec(name: str, summary: str, defaults: dict[str, Any], factory: str = "build") -> TrackerSpec:
+    settings = EmfoaOftSettings
+    if defaults:
+        settings = _variant(name, defaults)
+    return TrackerSpec(
+        id=name,
+        entry_point=f"{__name__}:{factory}",
+        label="EMFOA-OFT-SLAM (our back end)" if name == "emfoa-oft" else f"{name} (ablation)",
+        settings=settings,
+        summary=summary,
+        provenance="faithful-paper",
+        ranked=name == "emfoa-oft",
+        license="MIT",
+        citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/method.md",
+        assumptions=(
+            "epipolar threshold 1 px and RANSAC (not stated in the paper)",
+            "weights and truncations of Eq. 1 (not stated)",
+            "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)",
+        ),
+    )
+
+
+def _variant(name: str, defaults: dict[str, Any]) -> type[EmfoaOftSettings]:
+    """A settings class with other defaults, given as dotted names."""
+    from pydantic import create_model
+
+    from dynslam_bench.core.settings import apply_overrides
+
+    base = apply_overrides(EmfoaOftSettings(), defaults)
+    fields: dict[str, Any] = {
+        group: (EmfoaOftSettings.model_fields[group].annotation, getattr(base, group))
+        for group in {dotted.split(".")[0] for dotted in defaults}
+    }
+    title = "".join(part.capitalize() for part in name.replace("+", "-").split("-"))
+    return create_model(f"{title}Settings", __base__=EmfoaOftSettings, __module__=__name__, **fields)
+
+
+NO_DEPTH_TEST = {"motion.enabled": False, "free_space.enabled": False}
+
+SPECS = [
+    _spec("emfoa-oft", "the paper's system: masks, EMFOA-optimised DAISY Filter Flow, epipolar culling", {}),
+    _spec("emfoa-oft-paper", "as printed: no depth-consistency test beyond the paper", NO_DEPTH_TEST),
+    _spec("emfoa-oft-no-masks", "ablation: geometry alone", {"segmentation.source": "none"}),
+    _spec(
+        "emfoa-oft-paper-no-masks", "ablation: the paper's epipolar test alone",
+        {"segmentation.source": "none", **NO_DEPTH_TEST},
+    ),
+    _spec("emfoa-oft-no-flow", "ablation: masks alone", {}, "build_without_flow"),
+    _spec("emfoa-oft-lk", "ablation: Lucas-Kanade instead of DAISY Filter Flow", {"flow.method": "lucas-kanade"}),
+    _spec("emfoa-oft-patchmatch", "ablation: PatchMatch instead of EMFOA", {"flow.search": "patchmatch"}),
+    _spec("emfoa-oft-literal", "ablation: the moth-flame equations as printed", {"flow.search": "emfoa-literal"}),
+    _spec(
+        "emfoa-oft-object", "ablation: objects go by the vote of their points, not by class",
+        {"epipolar.mode": "object", **NO_DEPTH_TEST}, "build_object_mode",
+    ),
+]  # fmt: skip
