@@ -1,4 +1,4 @@
-"""SE(3): exponential and logarithm, inverse, quaternions; poses are 4x4 float64 matrices, batched along leading axes."""
+"""SE(3): exponential, logarithm, inverse, quaternions; poses are 4x4 float64 matrices, batched along leading axes."""
 
 from __future__ import annotations
 

@@ -1,0 +1,190 @@
+"""Trajectory files of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw``, one pose a line.
+
+Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like spaces, lines with NaN
+or with an all-zero quaternion are skipped, quaternions are normalised, lines may come in any order, and of several
+lines with one stamp the last holds. Whatever is not taken as it stands is counted in `FileNotes`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import TrajectoryError
+from dynslam_bench.core.records import write_atomic
+
+from . import se3
+from .trajectory import Trajectory
+
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_ZERO_NORM = 1e-8
+_UNIT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class FileNotes:
+    """What a file held that was not taken as it stands.
+
+    Attributes:
+        lines: Lines with a pose, skipped ones included.
+        not_finite: Lines skipped for NaN or infinity.
+        zero_quaternions: Lines skipped for an all-zero quaternion.
+        duplicates: Lines replaced by a later line with the same stamp.
+        out_of_order: Lines whose stamp is before the previous line's; they were sorted.
+        renormalised: Quaternions whose norm was off by more than 1 %.
+    """
+
+    lines: int = 0
+    not_finite: int = 0
+    zero_quaternions: int = 0
+    duplicates: int = 0
+    out_of_order: int = 0
+    renormalised: int = 0
+
+    def describe(self) -> list[str]:
+        """One phrase for every count that is not zero, e.g. ``3 of 800 lines skipped: not finite``."""
+        of = f"of {self.lines} lines"
+        phrases = [
+            (self.not_finite, f"{self.not_finite} {of} skipped: not finite"),
+            (self.zero_quaternions, f"{self.zero_quaternions} {of} skipped: all-zero quaternion"),
+            (self.duplicates, f"{self.duplicates} {of} replaced by a later line with the same stamp"),
+            (self.out_of_order, f"{self.out_of_order} {of} out of order, sorted"),
+            (self.renormalised, f"{self.renormalised} {of} with a quaternion far from unit norm, normalised"),
+        ]
+        return [phrase for count, phrase in phrases if count]
+
+
+@dataclass(frozen=True, eq=False)
+class TumFile:
+    """A trajectory and the notes on the file it came from."""
+
+    trajectory: Trajectory
+    notes: FileNotes
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
+
+    Raises:
+        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number) or no valid pose.
+    """
+    return load_tum(path).trajectory
+
+
+def load_tum(path: str | Path) -> TumFile:
+    """Read a TUM trajectory file together with the counts of skipped, sorted and replaced lines.
+
+    Raises:
+        TrajectoryError: As `read_tum`.
+    """
+    path = Path(path)
+    values = read_table(path, 8, _COLUMNS)
+    finite = np.isfinite(values).all(axis=1)
+    norm = np.linalg.norm(np.where(np.isfinite(values), values, 0.0)[:, 4:8], axis=1)
+    valid = finite & (norm >= _ZERO_NORM)
+    counted = {
+        "lines": len(values),
+        "not_finite": int((~finite).sum()),
+        "zero_quaternions": int((finite & (norm < _ZERO_NORM)).sum()),
+        "renormalised": int((np.abs(norm[valid] - 1) > _UNIT_TOLERANCE).sum()),
+    }
+    if not valid.any():
+        raise TrajectoryError(f"{path} holds no valid pose", "; ".join(FileNotes(**counted).describe()) or _hint(8))
+    kept = values[valid]
+    order = np.argsort(kept[:, 0], kind="stable")
+    stamps = kept[order, 0]
+    last_of_stamp = np.append(np.diff(stamps) > 0, True)
+    chosen = kept[order][last_of_stamp]
+    notes = FileNotes(
+        **counted,
+        duplicates=int((~last_of_stamp).sum()),
+        out_of_order=int((np.diff(kept[:, 0]) < 0).sum()),
+    )
+    return TumFile(Trajectory(chosen[:, 0], se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8])), notes)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:
+    """Write a trajectory with six-decimal stamps; the file appears whole or not at all.
+
+    Args:
+        path: Target file.
+        trajectory: Camera-to-world poses; may be empty.
+        comment: Written behind ``#`` above the header, line by line.
+
+    Raises:
+        TrajectoryError: Two stamps are equal at six decimals.
+        DynslamError: The file cannot be written.
+    """
+    write_atomic(Path(path), format_tum(trajectory, comment=comment))
+
+
+def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
+    """The text of a TUM trajectory file.
+
+    Raises:
+        TrajectoryError: Two stamps are equal at six decimals.
+    """
+    stamps = [f"{stamp:.6f}" for stamp in trajectory.timestamps.tolist()]
+    same = [a for a, b in pairwise(stamps) if a == b]
+    if same:
+        raise TrajectoryError(f"{len(same)} stamps are equal at six decimals, the first is {same[0]}")
+    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
+    rows = np.concatenate([position, quaternion], axis=1).tolist()
+    lines = [f"# {line}" for line in comment.splitlines()] + [f"# {_COLUMNS}"]
+    for stamp, row in zip(stamps, rows, strict=True):
+        lines.append(f"{stamp} " + " ".join(f"{value:.9f}" for value in row))
+    return "\n".join(lines) + "\n"
+
+
+def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
+    """Numbers ``[N, columns]`` of a text file; comments and blank lines are left out.
+
+    Raises:
+        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        parts = line.partition("#")[0].replace(",", " ").replace("\t", " ").split()
+        if not parts:
+            continue
+        if len(parts) != columns:
+            raise TrajectoryError(
+                f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(len(parts))
+            )
+        try:
+            rows.append([float(part) for part in parts])
+        except ValueError:
+            bad = next(part for part in parts if not _is_number(part))
+            raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
+    if not rows:
+        raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
+    return np.array(rows)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise TrajectoryError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path} is not a text file: byte {error.start} is no UTF-8") from error
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _hint(found: int) -> str:
+    if found == 12:
+        return "12 values a line are KITTI's format"
+    if found == 2:
+        return "this looks like a list of images"
+    return f"expected lines of '{_COLUMNS}'"

@@ -1,0 +1,166 @@
+"""TUM and KITTI trajectory files: round trips, what is skipped and counted, and one-line errors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import DynslamError, TrajectoryError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.kitti_file import read_kitti, write_kitti
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.tum_file import format_tum, load_tum, read_tum, write_tum
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def random_trajectory(n=50, seed=0, start=1305031102.175304):
+    rng = np.random.default_rng(seed)
+    stamps = np.round(start + np.cumsum(rng.uniform(0.01, 0.05, n)), 6)
+    return Trajectory(stamps, se3.exp(rng.normal(0, 1, (n, 6))))
+
+
+def write(tmp_path, text, name="trajectory.txt"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def test_tum_round_trip(tmp_path):
+    original = random_trajectory()
+    write_tum(tmp_path / "a.txt", original, comment="first\nsecond")
+    again = read_tum(tmp_path / "a.txt")
+    assert np.array_equal(again.timestamps, original.timestamps)  # six decimals hold a TUM stamp exactly
+    assert np.allclose(again.T_world_cam, original.T_world_cam, atol=5e-9)
+    lines = (tmp_path / "a.txt").read_text().splitlines()
+    assert lines[:3] == ["# first", "# second", "# timestamp tx ty tz qx qy qz qw"]
+    assert lines[3].split()[0] == f"{original.timestamps[0]:.6f}"
+    assert not load_tum(tmp_path / "a.txt").notes.describe()
+
+
+def test_tum_quaternion_order_is_xyzw(tmp_path):
+    path = write(tmp_path, "1.0 0.1 0.2 0.3 0 0 0.7071067811865476 0.7071067811865476\n")
+    pose = read_tum(path).T_world_cam[0]
+    assert np.allclose(pose[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert np.allclose(pose[:3, 3], [0.1, 0.2, 0.3])
+
+
+def test_tum_agrees_with_evo(tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    original = random_trajectory(seed=3)
+    write_tum(tmp_path / "a.txt", original)
+    evo = file_interface.read_tum_trajectory_file(str(tmp_path / "a.txt"))
+    ours = read_tum(tmp_path / "a.txt")
+    assert np.array_equal(evo.timestamps, ours.timestamps)
+    assert np.allclose(np.array(evo.poses_se3), ours.T_world_cam, atol=1e-9)
+
+
+def test_tum_skips_and_counts_like_the_official_tools(tmp_path):
+    path = write(
+        tmp_path,
+        "# comment\n\n"
+        "3.0 3 0 0 0 0 0 1\n"
+        "1.0,1,0,0,0,0,0,1\r\n"  # commas, Windows line end, out of order
+        "2.0\t2 0 0 0 0 0 2\n"  # tab, quaternion of norm 2
+        "2.5 nan 0 0 0 0 0 1\n"
+        "nan 0 0 0 0 0 0 1\n"
+        "2.6 inf 0 0 0 0 0 1\n"
+        "2.7 0 0 0 0 0 0 0\n"
+        "3.0 9 0 0 0 0 0 1 # the later line with this stamp holds\n",
+    )
+    file = load_tum(path)
+    assert file.trajectory.timestamps.tolist() == [1.0, 2.0, 3.0]
+    assert file.trajectory.positions[:, 0].tolist() == [1.0, 2.0, 9.0]
+    assert np.allclose(file.trajectory.T_world_cam[1, :3, :3], np.eye(3))
+    notes = file.notes
+    assert (notes.lines, notes.not_finite, notes.zero_quaternions) == (8, 3, 1)
+    assert (notes.duplicates, notes.out_of_order, notes.renormalised) == (1, 1, 1)
+    assert notes.describe()[0] == "3 of 8 lines skipped: not finite"
+    assert len(notes.describe()) == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "holds no poses"),
+        ("# only\n# comments\n", "holds no poses"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 0\n", "line 2 has 4 values"),
+        ("# c\n1 0 0 x 0 0 0 1\n", "line 2: 'x' is not a number"),
+        ("1 0 0 0 0 0 0 0 0 0 0 1\n", "KITTI"),
+        ("1305031102.175304 rgb/1305031102.175304.png\n", "list of images"),
+        ("1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "no valid pose .1 of 2 lines skipped: not finite; 1 of 2"),
+    ],
+)
+def test_tum_bad_files_are_one_clear_line(tmp_path, text, expected):
+    path = write(tmp_path, text)
+    with pytest.raises(TrajectoryError, match=expected) as caught:
+        read_tum(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_tum_missing_folder_and_binary_files(tmp_path):
+    with pytest.raises(TrajectoryError, match="No such file"):
+        read_tum(tmp_path / "missing.txt")
+    with pytest.raises(TrajectoryError, match="directory"):
+        read_tum(tmp_path)
+    (tmp_path / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
+    with pytest.raises(TrajectoryError, match="not a text file"):
+        read_tum(tmp_path / "image.png")
+
+
+def test_tum_refuses_to_write_colliding_stamps_and_leaves_nothing(tmp_path):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    with pytest.raises(TrajectoryError, match=r"1 stamps are equal at six decimals, the first is 1\.000000"):
+        write_tum(tmp_path / "a.txt", Trajectory(np.array([1.0, 1.0000001]), poses))
+    assert not list(tmp_path.iterdir())
+
+
+def test_tum_unwritable_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DynslamError, match="cannot write"):
+        write_tum(tmp_path / "file" / "a.txt", random_trajectory(3))
+
+
+def test_empty_trajectory_formats_to_its_header():
+    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    assert format_tum(empty) == "# timestamp tx ty tz qx qy qz qw\n"
+
+
+def test_kitti_round_trip_and_evo(tmp_path):
+    original = random_trajectory(seed=5, start=0.0)
+    write_kitti(tmp_path / "poses.txt", original, tmp_path / "times.txt")
+    again = read_kitti(tmp_path / "poses.txt", tmp_path / "times.txt")
+    assert np.array_equal(again.timestamps, original.timestamps)
+    assert np.allclose(again.T_world_cam, original.T_world_cam, atol=1e-8)
+    assert np.allclose(read_kitti(tmp_path / "poses.txt", fps=4.0).timestamps, np.arange(50) / 4)
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    evo = file_interface.read_kitti_poses_file(str(tmp_path / "poses.txt"))
+    assert np.allclose(np.array(evo.poses_se3), again.T_world_cam, atol=1e-8)
+
+
+def test_kitti_bad_files(tmp_path):
+    good = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+    with pytest.raises(TrajectoryError, match="pose 1 of 2 is no rigid transformation"):
+        read_kitti(write(tmp_path, good + "2 0 0 0 0 1 0 0 0 0 1 0\n"))
+    with pytest.raises(TrajectoryError, match="line 1 has 8 values"):
+        read_kitti(write(tmp_path, "1 0 0 0 0 0 0 1\n"))
+    with pytest.raises(TrajectoryError, match=r"has 2 poses but .* has 1 stamps"):
+        read_kitti(write(tmp_path, good * 2), write(tmp_path, "0.0\n", "times.txt"))
+    with pytest.raises(TrajectoryError, match="frame rate"):
+        read_kitti(write(tmp_path, good * 2), fps=0.0)
+
+
+@pytest.mark.parametrize("path", sorted(SHARED.glob("*/*/groundtruth.txt")), ids=lambda path: path.parent.name)
+def test_real_ground_truth_reads_whole(path):
+    file = load_tum(path)
+    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    assert len(file.trajectory) + file.notes.duplicates == len(lines) == file.notes.lines
+    assert file.notes.renormalised == 0
+    assert file.trajectory.path_length_m > 0.1
+
+
+def test_real_ground_truth_is_present_or_named():
+    if not SHARED.is_dir():
+        pytest.skip(f"no {SHARED}")
+    assert list(SHARED.glob("*/*/groundtruth.txt"))
