@@ -37,9 +37,14 @@ def fundamental_matrix(first: Points, second: Points, settings: EpipolarSettings
         )
     except cv2.error:  # OpenCV 5.0's MAGSAC raises "!model.empty()" where no model was found
         return None
-    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        return None
-    return np.asarray(matrix, dtype=np.float64)
+    for _ in range(2):  # the minimal sample's F is noisy at the image's fringe: refit it to all that agree
+        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            return None
+        agree = epipolar_distance(matrix, first, second) < settings.inlier_px
+        if np.count_nonzero(agree) < MIN_MATCHES:
+            return None
+        matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
+    return None if matrix is None or matrix.shape != (3, 3) else np.asarray(matrix, dtype=np.float64)
 
 
 def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points) -> NDArray[np.float64]:

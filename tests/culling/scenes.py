@@ -1,0 +1,99 @@
+"""Constructed scenes: exact flow and depth of static and moving points seen by a moving camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynslam_bench.culling.filter import FilterState, FrameBundle, KeyframeView
+from dynslam_bench.features.keypoints import Keypoints
+from dynslam_bench.flow.estimator import FlowResult
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.instances import Instances
+
+CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+@dataclass
+class Scene:
+    frame: FrameBundle
+    state: FilterState
+    moving: np.ndarray
+
+
+def keypoints(xy: np.ndarray) -> Keypoints:
+    n = len(xy)
+    return Keypoints(
+        xy.astype(np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32), np.ones(n, np.float32),
+        np.zeros((n, 32), np.uint8),
+    )  # fmt: skip
+
+
+def bundle(xy: np.ndarray, z: np.ndarray, depth: np.ndarray, timestamp: float) -> FrameBundle:
+    gray = np.zeros(depth.shape, np.uint8)
+    return FrameBundle(
+        0, timestamp, np.zeros((*depth.shape, 3), np.uint8), gray, depth, keypoints(xy), xy, z.astype(np.float32)
+    )
+
+
+def splat(xy: np.ndarray, z: np.ndarray, background: float = 0.0) -> np.ndarray:
+    """A depth image that has each point's depth on a 7x7 patch, the nearer ones on top."""
+    depth = np.full((CAMERA.height, CAMERA.width), background, np.float32)
+    for i in np.argsort(-z):
+        column, row = np.rint(xy[i]).astype(int)
+        depth[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = z[i]
+    return depth
+
+
+def on_top(xy: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Which points no other point's patch covers."""
+    gap = np.abs(xy[:, None] - xy[None]).max(axis=2)
+    return ~((gap < 5) & (z[None] < z[:, None])).any(axis=1)
+
+
+def scene(
+    T_prev_cur: np.ndarray, *, n_static: int = 300, n_moving: int = 60, motion: np.ndarray | None = None,
+    noise_px: float = 0.1, seed: int = 0,
+) -> Scene:  # fmt: skip
+    """Static points all over the image, moving ones inside x 200..330, y 100..380 at 1.5 m.
+
+    `motion` [3] is the moving points' displacement between the frames, metres, in the previous camera frame.
+    """
+    rng = np.random.default_rng(seed)
+    xy = np.concatenate(
+        [rng.uniform((20, 20), (620, 460), (n_static, 2)), rng.uniform((200, 100), (330, 380), (n_moving, 2))]
+    )
+    z = np.concatenate([rng.uniform(1.0, 4.0, n_static), rng.uniform(1.45, 1.55, n_moving)])
+    moving = np.arange(len(xy)) >= n_static
+    previous_points = se3.transform(T_prev_cur, CAMERA.unproject(xy, z))
+    if motion is not None:
+        previous_points[moving] -= motion
+    before = CAMERA.project(previous_points) + rng.normal(0, noise_px, xy.shape)
+    visible = (before > 5).all(axis=1) & (before < (634, 474)).all(axis=1)
+    visible &= on_top(xy, z) & on_top(before, previous_points[:, 2])
+    xy, z, moving, before, previous_points = (each[visible] for each in (xy, z, moving, before, previous_points))
+    frame = bundle(xy, z, splat(xy, z), 1.0)
+    previous = bundle(before, previous_points[:, 2], splat(before, previous_points[:, 2]), 1.0 - 1 / 30)
+    state = FilterState(
+        camera=CAMERA,
+        keep=np.ones(len(xy), bool),
+        previous=previous,
+        previous_keep=np.ones(len(xy), bool),
+        T_world_prev=np.eye(4),
+        T_world_pred=T_prev_cur,
+        flow=FlowResult(before.astype(np.float32), np.ones(len(xy), bool), np.zeros(len(xy), np.float32)),
+    )
+    return Scene(frame, state, moving)
+
+
+def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> Instances:
+    mask = np.zeros((1, CAMERA.height, CAMERA.width), bool)
+    mask[0, y0:y1, x0:x1] = True
+    return Instances(mask, np.array([[x0, y0, x1, y1]], np.float32), (name,), np.ones(1, np.float32))
+
+
+def keyframe(T_world_cam: np.ndarray, depth: np.ndarray, timestamp: float) -> KeyframeView:
+    empty = np.zeros((0, 2))
+    return KeyframeView(T_world_cam, keypoints(empty), empty, np.zeros(0, np.float32), depth, timestamp)
