@@ -1,0 +1,291 @@
+"""Every sequence by its id: the public data sets, the rendered ones, plug-ins, and folders of the user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from pydantic import Field
+
+from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.settings import Settings, build
+from dynslam_bench.geometry.camera import Camera
+
+from ._toml import read_toml
+from .cameras import CAMERAS, find_camera
+from .datasets import DATASETS, DatasetSpec
+from .frame import Sequence, SequenceView
+from .roots import find_data_root
+from .settings import PreprocessingSettings
+
+Tag = Literal["static", "low-dynamic", "high-dynamic"]
+Split = Literal["tune", "held-out", ""]
+SYNTHETIC_MOTIONS = tuple(
+    f"{people}_{motion}" for people in ("walking", "sitting") for motion in ("xyz", "static", "halfsphere", "rpy")
+)
+_FILES = ("tum.toml", "bonn.toml")
+
+
+class CatalogueEntry(Settings):
+    """One public sequence.
+
+    A number or checksum that is not known is None, never a guess.
+    """
+
+    id: str = Field(description="for example tum/fr3/walking_xyz")
+    folder: str = Field(description="published folder name, an alias of the id")
+    camera: str = Field(description="name of the camera, see dynslam_bench.sequences.cameras")
+    url: str = Field(description="archive")
+    page: str = Field(default="", description="web page of the data set")
+    size_bytes: int | None = Field(default=None, description="exact size of the archive")
+    size_stated: str = Field(default="", description="size as the data set's page states it")
+    sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", description="checksum of the archive")
+    license: str = Field(description="licence of the data")
+    citation: str = Field(description="what to cite")
+    ground_truth: bool = Field(default=True, description="whether the ground truth is public")
+    tags: tuple[Tag, ...] = Field(default=(), description="how much of the scene moves")
+    split: Split = Field(default="", description="whether studies may tune on it")
+    fps: float = Field(default=30.0, gt=0, description="nominal frame rate in Hz")
+    remark: str = Field(default="", description="anything else worth knowing")
+
+    @property
+    def dataset(self) -> str:
+        """First part of the id, ``tum`` or ``bonn``."""
+        return self.id.partition("/")[0]
+
+    def folders(self, data_root: Path) -> tuple[Path, ...]:
+        """Where the sequence may lie below a data root, the place `fetch` puts it first."""
+        inside = data_root / self.dataset
+        places = (inside / self.folder, data_root / self.folder, data_root / self.id)
+        return (*places, data_root / self.folder.removeprefix("rgbd_")) if data_root.name == self.dataset else places
+
+    def find(self, data_root: Path) -> Path | None:
+        """The folder in which the sequence lies, None if it does not."""
+        for folder in self.folders(data_root):
+            if (folder / "rgb.txt").is_file():
+                return folder
+        return None
+
+    def size_text(self) -> str:
+        """The archive's size for people."""
+        if self.size_bytes is not None:
+            return f"{self.size_bytes / 1e9:.2f} GB"
+        return self.size_stated or "size unknown"
+
+    def intrinsics(self) -> Camera:
+        """The camera."""
+        return CAMERAS[self.camera]
+
+
+@cache
+def catalogue() -> dict[str, CatalogueEntry]:
+    """All public sequences by id, in the order of the data files."""
+    entries: dict[str, CatalogueEntry] = {}
+    for name in _FILES:
+        document = read_toml(Path(__file__).parent / name)
+        common: dict[str, Any] = document["common"]
+        for row in document["sequence"]:
+            values = {**common, **row}
+            values["url"] = values["url"].format(**values)
+            entry = build(CatalogueEntry, values)
+            entries[entry.id] = entry
+    return entries
+
+
+def entry_of(name: str) -> CatalogueEntry | None:
+    """The catalogue's entry of an id or published folder name, None if there is none."""
+    entries = catalogue()
+    return entries.get(name) or _aliases().get(name)
+
+
+def sequence_ids() -> list[str]:
+    """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins."""
+    return [name for found in DATASETS.all() for name in found.spec.sequences]
+
+
+def builtin_datasets() -> Iterator[DatasetSpec]:
+    """The data sets that come with the package."""
+    by_dataset: dict[str, list[CatalogueEntry]] = {}
+    for entry in catalogue().values():
+        by_dataset.setdefault(entry.dataset, []).append(entry)
+    for name, summary in (("tum", "TUM RGB-D benchmark"), ("bonn", "Bonn RGB-D Dynamic Dataset")):
+        entries = by_dataset[name]
+        yield DatasetSpec(
+            name, f"{__name__}:open_public", tuple(entry.id for entry in entries), summary,
+            entries[0].license, entries[0].citation,
+        )  # fmt: skip
+    yield DatasetSpec(
+        "synthetic", "dynslam_bench.sequences.synthetic:open_synthetic",
+        tuple(f"synthetic/{motion}" for motion in SYNTHETIC_MOTIONS), "rendered rooms with exact poses, masks and flow",
+        "MIT", "dynslam-bench",
+    )  # fmt: skip
+
+
+def open_sequence(
+    name: str | Path,
+    *,
+    data_root: str | Path | None = None,
+    camera: str | Path | Camera | None = None,
+    frames: tuple[int, int | None] | str | None = None,
+    stride: int = 1,
+    preprocessing: PreprocessingSettings | None = None,
+) -> Sequence:
+    """Open a sequence.
+
+    Args:
+        name: An id (``tum/fr3/walking_xyz``, ``bonn/crowd``, ``synthetic/walking_xyz@0?frames=150``), a published
+            folder name (``rgbd_dataset_freiburg3_walking_xyz``) or the path of a folder in TUM layout.
+        data_root: Folder of the sequences; default ``DYNSLAM_BENCH_DATA``, else the user's cache folder.
+        camera: In place of what the catalogue or the folder says: ``tum-fr1``, ``tum-fr2``, ``tum-fr3``, ``bonn`` or a
+            ``camera.toml``.
+        frames: Part of the sequence, ``(first, one past the last or None)`` or ``"A:B"``.
+        stride: Take every `stride`-th frame of that part.
+        preprocessing: What to do with the frames; nothing by default.
+
+    Returns:
+        The sequence; nothing but its first frame was decoded.
+
+    Raises:
+        SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path and the command that
+            fetches it), damaged, or no frame in the part asked for.
+    """
+    settings = preprocessing or PreprocessingSettings()
+    root = find_data_root(data_root)
+    sequence = _open_whole(str(name), root, camera, settings)
+    if settings.changes_images:
+        from .preprocessing import Preprocessed
+
+        sequence = cast("Sequence", Preprocessed(sequence, settings))
+    return _part(sequence, frames, stride)
+
+
+def open_public(sequence_id: str, *, data_root: Path, **how: Any) -> Sequence:
+    """Open a sequence of the catalogue.
+
+    Args:
+        sequence_id: Its id.
+        data_root: Folder of the sequences.
+        **how: See `open_folder`.
+
+    Raises:
+        SequenceError: Unknown id, or it is not below the data root.
+    """
+    entry = entry_of(sequence_id)
+    if entry is None:
+        raise SequenceError(f"unknown sequence '{sequence_id}'", did_you_mean(sequence_id, sequence_ids()))
+    folder = entry.find(data_root)
+    if folder is None:
+        raise SequenceError(
+            f"sequence '{entry.id}' ({entry.size_text()}, {entry.url}) is not at {entry.folders(data_root)[0]}",
+            f"fetch it with: dynslam-bench sequences fetch {entry.id}",
+        )
+    return open_folder(folder, entry=entry, **how)
+
+
+def open_folder(
+    folder: Path,
+    *,
+    entry: CatalogueEntry | None = None,
+    camera: str | Path | Camera | None = None,
+    settings: PreprocessingSettings | None = None,
+) -> Sequence:
+    """Open a folder in TUM layout.
+
+    Args:
+        folder: The folder.
+        entry: What the catalogue says of it; looked up by the folder's name if not given.
+        camera: In place of what the catalogue or the folder says.
+        settings: Tolerance of the pairing, and whether images will be resized.
+
+    Raises:
+        SequenceError: It cannot be opened, or its camera is not known.
+    """
+    from .tum import Description, TumSequence
+
+    settings = settings or PreprocessingSettings()
+    entry = entry or entry_of(folder.resolve().name)
+    intrinsics, fps = find_camera(folder, camera)
+    if entry is None:
+        description = Description(f"folder/{folder.resolve().name}", intrinsics, fps)
+    else:
+        description = Description(
+            entry.id, intrinsics, fps or entry.fps, entry.license, entry.citation, frozenset(entry.tags), entry.split
+        )
+    return TumSequence(
+        folder,
+        description,
+        max_time_difference_s=settings.max_time_difference_s,
+        any_depth_size=settings.width is not None,
+    )
+
+
+def _open_whole(
+    name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
+) -> Sequence:
+    path = Path(name).expanduser()
+    entry = None if _is_path(name) else entry_of(name)
+    if entry is not None:
+        return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
+    prefix = name.partition("/")[0]
+    datasets = {found.spec.id: found.spec for found in DATASETS.all()}
+    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in ("tum", "bonn"):
+        if camera is not None:
+            raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
+        return cast("Sequence", load_object(datasets[prefix].entry_point)(name, data_root=data_root))
+    if path.is_dir():
+        return open_folder(path, camera=camera, settings=settings)
+    if _is_path(name):
+        raise SequenceError(f"there is no sequence folder {path.absolute()}", "a path names a folder in TUM layout")
+    known = [*sequence_ids(), *_aliases()]
+    raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, known))
+
+
+def _is_path(name: str) -> bool:
+    return name.startswith((".", "/", "~", "\\"))
+
+
+def _part(sequence: Sequence, frames: tuple[int, int | None] | str | None, stride: int) -> Sequence:
+    start, stop = parse_frames(frames)
+    if stride < 1:
+        raise SequenceError(f"stride is {stride}, expected at least 1")
+    if (start, stop, stride) == (0, None, 1):
+        return sequence
+    view = SequenceView(sequence, start, stop, stride)
+    if not len(view):
+        end = "" if stop is None else stop
+        raise SequenceError(f"frames {start}:{end} hold none of the {len(sequence)} frames of '{sequence.id}'")
+    return cast("Sequence", view)
+
+
+def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int | None]:
+    """First frame and one past the last (None: to the end) of ``"A:B"``, ``"A:"``, ``":B"`` or a pair.
+
+    Raises:
+        SequenceError: It is no such range.
+    """
+    if frames is None:
+        return 0, None
+    first: int | str
+    last: int | str | None
+    if isinstance(frames, str):
+        first, separator, last = frames.partition(":")
+        if not separator:
+            raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B")
+    else:
+        first, last = frames
+    try:
+        start = int(first) if first != "" else 0
+        stop = None if last is None or last == "" else int(last)
+    except ValueError:
+        raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B") from None
+    if start < 0 or (stop is not None and stop <= start):
+        raise SequenceError(f"frames {start}:{'' if stop is None else stop} is no range of frames", "0 <= A < B")
+    return start, stop
+
+
+@cache
+def _aliases() -> dict[str, CatalogueEntry]:
+    return {entry.folder: entry for entry in catalogue().values()}

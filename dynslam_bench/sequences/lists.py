@@ -1,0 +1,158 @@
+"""Read ``rgb.txt`` and ``depth.txt``: stamps and file names, with a count of every line that was not used."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import SequenceError
+
+
+@dataclass(frozen=True, eq=False)
+class ImageList:
+    """Stamped image files in order of time.
+
+    Attributes:
+        stamps: Seconds, float64 ``[N]``, strictly increasing.
+        files: Paths relative to the sequence's folder.
+        bad_stamps: Lines whose stamp was not finite; dropped.
+        duplicate_stamps: Lines whose stamp occurred again later; dropped, as the last one wins in TUM's tools.
+        unsorted: Lines whose stamp was below the one before; put in order.
+        unnamed: Lines without a file name; dropped.
+    """
+
+    stamps: NDArray[np.float64]
+    files: tuple[str, ...]
+    bad_stamps: int = 0
+    duplicate_stamps: int = 0
+    unsorted: int = 0
+    unnamed: int = 0
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
+def read_image_list(path: Path) -> ImageList:
+    """Read lines ``timestamp filename``; ``#`` starts a comment, commas and tabs separate as well.
+
+    Raises:
+        SequenceError: The file is missing or no text, or a stamp is not a number.
+    """
+    return make_image_list([(stamp, " ".join(rest)) for stamp, rest in read_stamped_lines(path)], described=str(path))
+
+
+def read_associations(path: Path) -> tuple[ImageList, ImageList]:
+    """Read lines ``timestamp colour timestamp depth``, images that are paired already.
+
+    Raises:
+        SequenceError: The file is missing or no text, or a line does not have these four parts.
+    """
+    colour: dict[float, tuple[str, float, str]] = {}
+    rows = read_stamped_lines(path)
+    for number, (stamp, rest) in enumerate(rows):
+        if len(rest) != 3:
+            raise SequenceError(
+                f"entry {number + 1} of {path} has {len(rest) + 1} parts, expected 4: timestamp colour timestamp depth"
+            )
+        colour[stamp] = (rest[0], _number(rest[1], path), rest[2])
+    good = {stamp: row for stamp, row in colour.items() if math.isfinite(stamp) and math.isfinite(row[1])}
+    order = sorted(good)
+    counts = {
+        "bad_stamps": len(colour) - len(good),
+        "duplicate_stamps": len(rows) - len(colour),
+        "unsorted": _count_unsorted([stamp for stamp, _ in rows]),
+    }
+    first = ImageList(np.array(order, dtype=np.float64), tuple(good[stamp][0] for stamp in order), **counts)
+    depth_stamps = np.array([good[stamp][1] for stamp in order], dtype=np.float64)
+    return first, ImageList(depth_stamps, tuple(good[stamp][2] for stamp in order))
+
+
+def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
+    """The images of a folder without a list file, stamped by their names.
+
+    A name with a decimal point is a stamp in seconds; a whole number is a frame number, which `fps` turns into seconds.
+
+    Raises:
+        SequenceError: The folder does not exist, or a name gives no stamp.
+    """
+    images = folder / name
+    if not images.is_dir():
+        raise SequenceError(
+            f"{folder} has neither {name}.txt nor a folder {name}",
+            "a sequence in TUM layout holds rgb.txt, depth.txt, the images, and groundtruth.txt where there is one",
+        )
+    rows: list[tuple[float, str]] = []
+    for path in sorted(images.iterdir()):
+        if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp") or path.name.startswith("."):
+            continue
+        digits = path.stem.lstrip("0123456789")
+        if digits == "" and fps is None:
+            raise SequenceError(
+                f"{name}/{path.name} of {folder} is named by a frame number, which has no time",
+                f"write {name}.txt with lines 'timestamp {name}/{path.name}', or 'fps = 30' into camera.toml",
+            )
+        stamp = int(path.stem) / fps if digits == "" and fps is not None else _number(path.stem, images)
+        rows.append((stamp, f"{name}/{path.name}"))
+    return make_image_list(sorted(rows), described=str(images))
+
+
+def make_image_list(rows: list[tuple[float, str]], *, described: str) -> ImageList:
+    """Sort, drop what has no usable stamp or name, and count it.
+
+    Raises:
+        SequenceError: Nothing is left.
+    """
+    named = [(stamp, name) for stamp, name in rows if name]
+    finite = [(stamp, name) for stamp, name in named if math.isfinite(stamp)]
+    unique = dict(finite)  # the last of several equal stamps wins, as in TUM's associate.py
+    if not unique:
+        raise SequenceError(
+            f"{described} lists no image ({len(rows)} lines, {len(named) - len(finite)} without a stamp)"
+        )
+    order = sorted(unique)
+    return ImageList(
+        np.array(order, dtype=np.float64),
+        tuple(unique[stamp] for stamp in order),
+        bad_stamps=len(named) - len(finite),
+        duplicate_stamps=len(finite) - len(unique),
+        unsorted=_count_unsorted([stamp for stamp, _ in finite]),
+        unnamed=len(rows) - len(named),
+    )
+
+
+def read_stamped_lines(path: Path) -> list[tuple[float, list[str]]]:
+    """Lines of a TUM list file, split at white space and commas, with the first part as seconds.
+
+    Raises:
+        SequenceError: The file cannot be read, or a first part is not a number; names the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SequenceError(
+            f"{path} is not a text file (byte {error.start} is {error.object[error.start]:#x})"
+        ) from error
+    except OSError as error:
+        raise SequenceError(f"cannot read {path}: {error.strerror}") from error
+    rows: list[tuple[float, list[str]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        parts = line.replace(",", " ").split()
+        if parts and not parts[0].startswith("#"):
+            rows.append((_number(parts[0], f"{path} line {number}"), parts[1:]))
+    return rows
+
+
+def _number(text: str, where: object) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise SequenceError(f"{where}: '{text}' is not a timestamp in seconds") from None
+
+
+def _count_unsorted(stamps: list[float]) -> int:
+    return sum(later < earlier for earlier, later in pairwise(stamps))

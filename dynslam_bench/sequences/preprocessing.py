@@ -1,0 +1,142 @@
+"""The paper's preprocessing: undistort, resize to a common resolution, normalise brightness and contrast."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.records import digest
+from dynslam_bench.geometry.camera import Camera
+
+from .frame import Frame, FrameMasks, MaskSource, Sequence
+from .settings import PreprocessingSettings
+
+Image = NDArray[np.integer | np.floating]
+
+
+class Preprocessed:
+    """A sequence whose images are undistorted, resized and normalised when they are read; the camera follows.
+
+    Args:
+        base: The sequence as recorded. Its depth images may differ in size from its colour images if a common
+            resolution is asked for.
+        settings: What to do.
+    """
+
+    def __init__(self, base: Sequence, settings: PreprocessingSettings) -> None:
+        self.base = base
+        self.settings = settings
+        self._camera = preprocessed_camera(base.camera, settings)
+        self._maps: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("__") or name in ("base", "settings", "_camera", "_maps"):  # not yet set while unpickling
+            raise AttributeError(name)
+        return getattr(self.base, name)
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the images after preprocessing."""
+        return self._camera
+
+    @property
+    def masks(self) -> MaskSource | None:
+        """Masks of the base sequence, undistorted and resized like the depth image."""
+        source = self.base.masks
+        return None if source is None else _PreprocessedMasks(source, self)
+
+    def digest(self) -> str:
+        """Digest of the base sequence and of the settings."""
+        return digest([self.base.digest(), self.settings.model_dump()])
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self.base[index]
+        rgb = normalise(self._geometry(frame.rgb, colour=True), self.settings)
+        return Frame(frame.index, frame.timestamp, rgb, self._geometry(frame.depth, colour=False))
+
+    def _geometry(self, image: Image, *, colour: bool) -> Any:
+        if self.settings.undistort and self.base.camera.is_distorted:
+            maps = self._undistortion((image.shape[1], image.shape[0]))
+            interpolation = cv2.INTER_LINEAR if colour else cv2.INTER_NEAREST
+            image = cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return resize(image, self._camera.width, self._camera.height, colour=colour)
+
+    def _undistortion(self, size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        if size not in self._maps:
+            camera = self.base.camera.resized(*size)
+            map_x, map_y = cv2.initUndistortRectifyMap(
+                camera.matrix, np.asarray(camera.distortion), np.eye(3), camera.matrix, size, cv2.CV_32FC1
+            )
+            self._maps[size] = (np.asarray(map_x, dtype=np.float32), np.asarray(map_y, dtype=np.float32))
+        return self._maps[size]
+
+
+class _PreprocessedMasks:
+    def __init__(self, source: MaskSource, owner: Preprocessed) -> None:
+        self._source = source
+        self._owner = owner
+
+    def __getitem__(self, index: int) -> FrameMasks:
+        masks = self._source[index]
+        kind = masks.instances.dtype
+        narrow = kind if kind in (np.uint8, np.int16, np.uint16) else np.int16  # what OpenCV can remap
+        instances = self._owner._geometry(masks.instances.astype(narrow), colour=False).astype(kind)
+        return FrameMasks(instances, masks.class_names, masks.moving)
+
+
+def preprocessed_camera(camera: Camera, settings: PreprocessingSettings) -> Camera:
+    """The camera after preprocessing: without distortion if it is removed, with the intrinsics scaled along."""
+    if settings.undistort:
+        camera = camera.undistorted()
+    if settings.width is not None and settings.height is not None:
+        camera = camera.resized(settings.width, settings.height)
+    return camera
+
+
+def resize(image: Image, width: int, height: int, *, colour: bool) -> Any:
+    """Resize with pixel centres aligned: colour by area (smaller) or bilinear (larger), else nearest neighbour.
+
+    Depth and masks are never averaged, so that no depth appears between foreground and background.
+    """
+    if image.shape[:2] == (height, width):
+        return image
+    smaller = width * height < image.shape[0] * image.shape[1]
+    interpolation = (cv2.INTER_AREA if smaller else cv2.INTER_LINEAR) if colour else cv2.INTER_NEAREST_EXACT
+    return cv2.resize(image, (width, height), interpolation=interpolation)
+
+
+def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArray[np.uint8]:
+    """Normalise the brightness and contrast of a uint8 ``[H, W, 3]`` image; the hue stays.
+
+    The luminance (Y of YCrCb) is changed: ``equalise`` spreads its histogram, ``clahe`` does so by tiles with limited
+    contrast, ``mean-std`` moves it to a given mean and standard deviation. An image of one brightness only has no
+    contrast to spread and keeps it under ``mean-std`` (it moves to the mean).
+    """
+    if settings.normalisation == "none":
+        return rgb
+    luminance, *chroma = cv2.split(cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb))
+    if settings.normalisation == "equalise":
+        luminance = cv2.equalizeHist(luminance)
+    elif settings.normalisation == "clahe":
+        tiles = (settings.clahe_tiles, settings.clahe_tiles)
+        luminance = cv2.createCLAHE(settings.clahe_clip, tiles).apply(luminance)
+    else:
+        mean, std = cv2.meanStdDev(luminance)
+        gain = 255 * settings.target_std / std.item() if std.item() > 0 else 1.0
+        luminance = cv2.convertScaleAbs(
+            np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255)
+        )  # fmt: skip
+    merged = cv2.merge([luminance, *chroma])
+    return np.asarray(cv2.cvtColor(merged, cv2.COLOR_YCrCb2RGB), dtype=np.uint8)
+
+
+def intensity(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Grey values in [0, 1], float32 ``[H, W]``, of a uint8 image ``[H, W]`` or ``[H, W, 3]`` (red first)."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    return np.asarray(gray, dtype=np.float32) / np.float32(255)
