@@ -1,0 +1,282 @@
+"""TUM-layout folders: what is read, and one clear line for everything that is wrong with them."""
+
+import numpy as np
+import pytest
+from sequence_folders import SHARED, make_folder, needs_shared, rewrite
+
+from dynslam_bench.core.errors import SequenceError, TrajectoryError
+from dynslam_bench.sequences import Sequence, SequenceView, open_sequence
+
+
+def test_reads_what_was_written(tmp_path):
+    folder, rgb, depth = make_folder(tmp_path / "seq", frames=4)
+    sequence = open_sequence(folder)
+    assert isinstance(sequence, Sequence)
+    assert sequence.id == "folder/seq"
+    assert len(sequence) == 4
+    assert (sequence.camera.width, sequence.camera.height) == (32, 24)
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, 100.0 + 2 / 30)
+    assert frame.rgb.dtype == np.uint8 and (frame.rgb == rgb[2]).all()
+    assert frame.depth.dtype == np.float32
+    assert np.allclose(frame.depth, depth[2] / 5000, rtol=1e-6) and (frame.depth[depth[2] == 0] == 0).all()
+    assert sequence[-1].index == 3
+    with pytest.raises(IndexError):
+        sequence[4]
+    assert np.array_equal(sequence.ground_truth.timestamps, sequence.timestamps)
+    assert sequence.fps == 30 and sequence.masks is None
+    assert sequence.dropped.describe().startswith("4 frames of 4 colour and 4 depth images (|dt| < 0.02 s)")
+    assert not sequence.dropped.any
+    assert sequence.verify() == []
+
+
+def test_fps_follows_from_the_stamps_where_nothing_states_it(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq", frames=5, rate=10, fps=None)
+    assert open_sequence(folder).fps == pytest.approx(10)
+
+
+def test_digest_tells_contents_apart_and_survives_moving(tmp_path):
+    folder, *_ = make_folder(tmp_path / "a", frames=3)
+    before = open_sequence(folder).digest()
+    moved = folder.rename(tmp_path / "b")
+    assert open_sequence(moved).digest() == before
+    rewrite(moved / "groundtruth.txt", lambda lines: lines[:-1])
+    assert open_sequence(moved).digest() != before
+
+
+def test_frames_and_stride(tmp_path):
+    folder, rgb, _ = make_folder(tmp_path / "seq", frames=7)
+    view = open_sequence(folder, frames="1:6", stride=2)
+    assert isinstance(view, SequenceView) and isinstance(view, Sequence)
+    assert len(view) == 3 and [view[i].index for i in range(3)] == [0, 1, 2]
+    assert (view[1].rgb == rgb[3]).all()
+    assert view.dropped.pairs == 7
+    assert len(open_sequence(folder, frames=(2, None))) == 5
+    for bad, words in (("3", "no range"), ("a:b", "no range"), ("5:5", "no range"), ("-2:", "no range")):
+        with pytest.raises(SequenceError, match=words):
+            open_sequence(folder, frames=bad)
+    with pytest.raises(SequenceError, match="hold none of the 7 frames"):
+        open_sequence(folder, frames="7:9")
+    with pytest.raises(SequenceError, match="stride is 0"):
+        open_sequence(folder, stride=0)
+
+
+def test_one_frame_opens(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq", frames=1, fps=None)
+    sequence = open_sequence(folder)
+    assert len(sequence) == 1 and sequence.fps == 30
+
+
+def test_no_ground_truth(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq")
+    (folder / "groundtruth.txt").unlink()
+    sequence = open_sequence(folder)
+    assert sequence.ground_truth is None
+    assert "no ground truth" in sequence.dropped.describe()
+
+
+def test_ground_truth_hole_and_bad_lines_are_counted(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq", frames=30)
+    rewrite(folder / "groundtruth.txt", lambda lines: [*lines[:11], "100.4 nan 0 0 0 0 0 1", *lines[21:]])
+    dropped = open_sequence(folder).dropped
+    assert dropped.frames_without_ground_truth == 10
+    assert dropped.largest_hole_s == pytest.approx(11 / 30)
+    assert "1 of 21 lines skipped: not finite" in dropped.describe()
+    assert "10 frames without ground truth within 0.02 s (largest hole 0.37 s)" in dropped.describe()
+
+
+def test_empty_ground_truth_is_an_error(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq")
+    (folder / "groundtruth.txt").write_text("# nothing\n")
+    with pytest.raises(TrajectoryError, match="holds no poses"):
+        open_sequence(folder)
+
+
+def test_pairing_is_strict_one_to_one_and_counted(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq", frames=5)
+    stamps = [100.0, 100.1, 100.2, 100.3, 100.4]
+    shifted = [100.019, 100.121, 100.1999, 100.2001, 100.4]  # near, too far, near, spare, equal
+    rewrite(folder / "rgb.txt", lambda _: [f"{s:.4f} rgb/{i}.png" for i, s in enumerate(stamps)])
+    rewrite(folder / "depth.txt", lambda _: [f"{s:.4f} depth/{i}.png" for i, s in enumerate(shifted)])
+    sequence = open_sequence(folder)
+    assert sequence.timestamps.tolist() == [100.0, 100.2, 100.4]
+    assert (sequence.dropped.colour_unpaired, sequence.dropped.depth_unpaired) == (2, 2)
+    assert "2 colour images without depth; 2 depth images unused" in sequence.dropped.describe()
+
+
+def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
+    folder, rgb, _ = make_folder(tmp_path / "seq", frames=6)
+
+    def disorder(lines):
+        stamp = lines[3].split()[0]
+        return ["# comment", lines[1], lines[0], *lines[2:], "nan rgb/0.png", f"{stamp} rgb/0.png", "101.5", ""]
+
+    rewrite(folder / "rgb.txt", disorder)
+    sequence = open_sequence(folder)
+    assert (np.diff(sequence.timestamps) > 0).all() and len(sequence) == 6
+    assert (sequence[0].rgb == rgb[0]).all()
+    assert (sequence[3].rgb == rgb[0]).all()  # the last of two equal stamps wins, as in TUM's associate.py
+    dropped = sequence.dropped
+    assert (dropped.bad_stamps, dropped.duplicate_stamps, dropped.unnamed, dropped.unsorted) == (1, 1, 1, 2)
+    for words in ("1 stamps not finite", "1 duplicate stamps", "2 stamps out of order", "1 lines without a file name"):
+        assert words in dropped.describe()
+
+
+def test_other_separators(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq", frames=3)
+    rewrite(folder / "rgb.txt", lambda lines: [line.replace(" ", ",") for line in lines])
+    rewrite(folder / "depth.txt", lambda lines: [line.replace(" ", "\t") + "\r" for line in lines])
+    assert len(open_sequence(folder)) == 3
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda f: rewrite(f / "rgb.txt", lambda _: []), "lists no image"),
+        (lambda f: rewrite(f / "rgb.txt", lambda _: ["abc rgb/0.png"]), "line 1: 'abc' is not a timestamp"),
+        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "not a text file"),
+        (lambda f: rewrite(f / "depth.txt", lambda ls: [f"9{line}" for line in ls]), "none of the 4 colour images"),
+        (lambda f: (f / "rgb" / "1.png").unlink(), "1 of 4 colour images .* are missing, the first is rgb/1.png"),
+        (lambda f: (f / "depth" / "1.png").write_bytes(b""), r"1 of 4 depth images .* are empty \(0 bytes\)"),
+    ],
+)
+def test_damaged_lists(tmp_path, damage, words):
+    folder, *_ = make_folder(tmp_path / "seq", frames=4)
+    damage(folder)
+    with pytest.raises(SequenceError, match=words) as caught:
+        open_sequence(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_image_is_found_by_verify_and_on_reading(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq", frames=4)
+    image = folder / "rgb" / "2.png"
+    image.write_bytes(image.read_bytes()[:-20])
+    sequence = open_sequence(folder)
+    with pytest.raises(SequenceError, match=r"2\.png is truncated \(\d+ bytes\)"):
+        sequence[2]
+    assert len(sequence.verify()) == 1 and sequence.verify()[0].startswith("frame 2: image")
+
+
+def test_garbage_instead_of_an_image(tmp_path, capfd):
+    folder, *_ = make_folder(tmp_path / "seq")
+    (folder / "rgb" / "0.png").write_bytes(b"<html>404</html>")
+    with pytest.raises(SequenceError, match="cannot be decoded"):
+        open_sequence(folder)
+
+
+def test_eight_bit_depth(tmp_path):
+    import cv2
+
+    folder, *_ = make_folder(tmp_path / "seq")
+    cv2.imwrite(str(folder / "depth" / "0.png"), np.full((24, 32), 77, np.uint8))
+    with pytest.raises(SequenceError, match=r"1 channel\(s\) of 8 bits \(values 77 to 77\), expected 1 of 16 bits"):
+        open_sequence(folder)
+
+
+def test_swapped_lists(tmp_path):
+    folder, *_ = make_folder(tmp_path / "seq")
+    rgb, depth = (folder / "rgb.txt").read_text(), (folder / "depth.txt").read_text()
+    (folder / "rgb.txt").write_text(depth)
+    (folder / "depth.txt").write_text(rgb)
+    with pytest.raises(SequenceError, match="has 16 bits a channel, expected 8"):
+        open_sequence(folder)
+
+
+def test_wrong_sizes(tmp_path):
+    import cv2
+
+    from dynslam_bench.sequences import PreprocessingSettings
+
+    folder, *_ = make_folder(tmp_path / "seq")
+    with pytest.raises(SequenceError, match="is 32x24, but the camera of folder/seq is 640x480"):
+        open_sequence(folder, camera="tum-fr1")
+    for i in range(4):
+        cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.full((12, 16), 9000, np.uint16))
+    with pytest.raises(SequenceError, match="is 16x12, but its colour image is 32x24"):
+        open_sequence(folder)
+    frame = open_sequence(folder, preprocessing=PreprocessingSettings(width=32, height=24))[0]
+    assert frame.depth.shape == frame.rgb.shape[:2] == (24, 32)
+
+
+def test_associations_file(tmp_path):
+    folder, rgb, _ = make_folder(tmp_path / "seq", frames=3)
+    for name in ("rgb.txt", "depth.txt"):
+        (folder / name).unlink()
+    rows = [f"{100 + i} rgb/{i}.png {107 + i} depth/{i}.png" for i in (2, 0, 1)]
+    (folder / "associations.txt").write_text("\n".join(rows))
+    sequence = open_sequence(folder)
+    assert sequence.timestamps.tolist() == [100, 101, 102] and sequence.dropped.unsorted == 1
+    assert (sequence[0].rgb == rgb[0]).all()
+    (folder / "associations.txt").write_text("100 rgb/0.png depth/0.png")
+    with pytest.raises(SequenceError, match="has 3 parts, expected 4"):
+        open_sequence(folder)
+
+
+def test_folders_without_lists(tmp_path):
+    folder, rgb, _ = make_folder(tmp_path / "seq", frames=3, fps=None)
+    for name in ("rgb.txt", "depth.txt"):
+        (folder / name).unlink()
+    with pytest.raises(SequenceError, match="named by a frame number, which has no time"):
+        open_sequence(folder)
+    with (folder / "camera.toml").open("a") as file:
+        file.write("fps = 25.0\n")
+    sequence = open_sequence(folder)
+    assert sequence.timestamps.tolist() == [0, 0.04, 0.08] and (sequence[1].rgb == rgb[1]).all()
+    for kind in ("rgb", "depth"):
+        for i in range(3):
+            (folder / kind / f"{i}.png").rename(folder / kind / f"{50 + i}.5.png")
+    assert open_sequence(folder).timestamps.tolist() == [50.5, 51.5, 52.5]
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    (folder / "depth").rmdir()
+    with pytest.raises(SequenceError, match=r"neither depth.txt nor a folder depth"):
+        open_sequence(folder)
+
+
+def test_grey_and_alpha_images_become_rgb(tmp_path):
+    import cv2
+
+    folder, *_ = make_folder(tmp_path / "seq", frames=2)
+    cv2.imwrite(str(folder / "rgb" / "0.png"), np.full((24, 32), 90, np.uint8))
+    cv2.imwrite(str(folder / "rgb" / "1.png"), np.dstack([np.full((24, 32), v, np.uint8) for v in (1, 2, 3, 200)]))
+    sequence = open_sequence(folder)
+    assert sequence[0].rgb.shape == (24, 32, 3) and (sequence[0].rgb == 90).all()
+    assert sequence[1].rgb[0, 0].tolist() == [3, 2, 1]
+
+
+@needs_shared
+@pytest.mark.parametrize(
+    ("name", "frames", "camera"),
+    [("bonn/crowd", 200, "bonn"), ("tum/fr1/xyz", 95, "tum-fr1"), ("tum/fr1/rpy", 40, "tum-fr1")],
+)
+def test_real_excerpts(name, frames, camera):
+    from dynslam_bench.sequences.cameras import CAMERAS
+
+    sequence = open_sequence(name, data_root=SHARED / "data")
+    assert len(sequence) == frames == sequence.dropped.pairs
+    assert sequence.camera == CAMERAS[camera] and sequence.fps == 30
+    assert sequence.ground_truth is not None and sequence.id == name
+    frame = sequence[0]
+    assert frame.rgb.shape == (480, 640, 3) and 0.3 < np.median(frame.depth[frame.depth > 0]) < 5
+    assert open_sequence(sequence.folder).digest() == sequence.digest()
+
+
+@needs_shared
+@pytest.mark.parametrize("name", ["bonn/rgbd_bonn_crowd", "tum/rgbd_dataset_freiburg1_xyz"])
+def test_pairing_equals_the_rule_of_tums_script(name):
+    """The rule of associate.py, written out: all pairs below the tolerance by |dt|, each stamp used once."""
+    folder = SHARED / "data" / name
+    lists = []
+    for kind in ("rgb", "depth"):
+        lines = (folder / f"{kind}.txt").read_text().splitlines()
+        lists.append([float(line.split()[0]) for line in lines if line and not line.startswith("#")])
+    candidates = sorted((abs(a - b), a, b) for a in lists[0] for b in lists[1] if abs(a - b) < 0.02)
+    free = [set(lists[0]), set(lists[1])]
+    expected = []
+    for _, a, b in candidates:
+        if a in free[0] and b in free[1]:
+            free[0].remove(a)
+            free[1].remove(b)
+            expected.append(a)
+    assert open_sequence(folder).timestamps.tolist() == sorted(expected)
