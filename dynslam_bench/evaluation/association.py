@@ -1,0 +1,159 @@
+"""Association of an estimate with the ground truth, with the reasons for what was dropped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.geometry.association import associate, nearest_gap
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .protocol import Protocol
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """Which estimated pose is compared with which true pose.
+
+    Attributes:
+        estimate: Indices into the estimate ``[K]``, ascending.
+        ground_truth: Indices into the ground truth ``[K]``.
+        n_estimate: Poses of the estimate.
+        n_ground_truth: Poses of the ground truth.
+        outside: Estimated poses dropped because they lie before the first or behind the last true pose.
+        in_holes: Estimated poses dropped because they lie in a hole of the ground truth.
+        taken: Estimated poses dropped because a closer one had already taken their true pose (or, for evo's rule,
+            because the ground truth is the shorter trajectory and no pose of it chose them).
+        median_dt: Median |dt| of the pairs in seconds.
+        largest_hole: Largest distance in seconds between true poses within the time of the estimate.
+        hole_at: Stamp at which that hole begins.
+    """
+
+    estimate: Index
+    ground_truth: Index
+    n_estimate: int
+    n_ground_truth: int
+    outside: int
+    in_holes: int
+    taken: int
+    median_dt: float
+    largest_hole: float
+    hole_at: float
+
+    def __len__(self) -> int:
+        return len(self.estimate)
+
+    def describe(self, max_dt: float) -> str:
+        """One line with the measured numbers; empty if nothing was dropped."""
+        dropped = self.n_estimate - len(np.unique(self.estimate))
+        if not dropped:
+            return ""
+        reasons = [
+            (self.outside, f"{self.outside} outside the ground truth's time"),
+            (self.in_holes, f"{self.in_holes} in holes of it"),
+            (self.taken, f"{self.taken} not chosen, a closer one was there"),
+        ]
+        return (
+            f"no ground truth within {max_dt:g} s for {dropped} of {self.n_estimate} poses ("
+            + ", ".join(text for count, text in reasons if count)
+            + f"; largest hole {self.largest_hole:.2f} s at t={self.hole_at:.6f}; median |dt| {self.median_dt:.4f} s)"
+        )
+
+
+def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> Association:
+    """Associate two trajectories under a protocol.
+
+    Raises:
+        EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
+    """
+    for name, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
+        if not len(trajectory):
+            raise EvaluationError(f"the {name} holds no poses")
+    if protocol.one_to_one:
+        index_gt, index_est = associate(
+            ground_truth.timestamps, estimate.timestamps, protocol.max_dt, strict=protocol.strict
+        )
+        order = np.argsort(index_est, kind="stable")
+        index_gt, index_est = index_gt[order], index_est[order]
+    elif len(estimate) > len(ground_truth):  # evo starts from the shorter one, and from the second of equal ones
+        index_gt, index_est = nearest_match(ground_truth.timestamps, estimate.timestamps, protocol)
+    else:
+        index_est, index_gt = nearest_match(estimate.timestamps, ground_truth.timestamps, protocol)
+    if not len(index_est):
+        raise _nothing_matched(estimate, ground_truth, protocol)
+    return _report(estimate, ground_truth, index_est, index_gt, protocol)
+
+
+def nearest_match(stamps: NDArray[np.float64], others: NDArray[np.float64], protocol: Protocol) -> tuple[Index, Index]:
+    """For every stamp the nearest of the others, the earlier on a tie (evo's rule: stamps may be used repeatedly).
+
+    Args:
+        stamps: Seconds ``[N]``, ascending.
+        others: Seconds ``[M]``, ascending, not empty.
+        protocol: Gives the tolerance and whether it is strict.
+
+    Returns:
+        Indices into both lists ``[K]``, in order of `stamps`.
+    """
+    right = np.clip(np.searchsorted(others, stamps, side="right"), 0, len(others) - 1)
+    left = np.maximum(right - 1, 0)
+    right_dt = others[right] - stamps
+    left_dt = np.where(right > 0, stamps - others[left], np.inf)
+    chosen = np.where(right_dt < left_dt, right, left)
+    dt = np.minimum(right_dt, left_dt)
+    keep = dt < protocol.max_dt if protocol.strict else dt <= protocol.max_dt
+    inside = (stamps >= others[0] - protocol.max_dt) & (stamps <= others[-1] + protocol.max_dt)
+    keep &= inside
+    return np.flatnonzero(keep), chosen[keep]
+
+
+def _report(
+    estimate: Trajectory, ground_truth: Trajectory, index_est: Index, index_gt: Index, protocol: Protocol
+) -> Association:
+    t_est, t_gt = estimate.timestamps, ground_truth.timestamps
+    unmatched = np.ones(len(t_est), dtype=bool)
+    unmatched[index_est] = False
+    gap = nearest_gap(t_est, t_gt)
+    far = gap >= protocol.max_dt if protocol.strict else gap > protocol.max_dt
+    outside = far & ((t_est < t_gt[0]) | (t_est > t_gt[-1]))
+    hole, hole_at = largest_hole(t_gt, t_est[0], t_est[-1])
+    return Association(
+        estimate=index_est,
+        ground_truth=index_gt,
+        n_estimate=len(t_est),
+        n_ground_truth=len(t_gt),
+        outside=int((unmatched & outside).sum()),
+        in_holes=int((unmatched & far & ~outside).sum()),
+        taken=int((unmatched & ~far).sum()),
+        median_dt=float(np.median(np.abs(t_est[index_est] - t_gt[index_gt]))),
+        largest_hole=hole,
+        hole_at=hole_at,
+    )
+
+
+def largest_hole(stamps: NDArray[np.float64], start: float, stop: float) -> tuple[float, float]:
+    """Length and beginning, in seconds, of the largest gap between stamps within ``[start, stop]``."""
+    inside = stamps[(stamps > start) & (stamps < stop)]
+    edges = np.concatenate([[start], inside, [stop]])
+    gaps = np.diff(edges)
+    at = int(np.argmax(gaps))
+    return float(gaps[at]), float(edges[at])
+
+
+def _nothing_matched(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> EvaluationError:
+    t_est, t_gt = estimate.timestamps, ground_truth.timestamps
+    gap = nearest_gap(t_est, t_gt)
+    message = (
+        f"none of {len(t_est)} poses has ground truth within {protocol.max_dt:g} s: the nearest is {gap.min():.3f} s "
+        f"away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
+        f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s"
+    )
+    ratio = np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9)
+    if ratio > 1e5 or ratio < 1e-5:
+        return EvaluationError(message, "are the stamps of one file in nanoseconds or frame numbers?")
+    return EvaluationError(message, "check that the files belong together and that their clocks agree")

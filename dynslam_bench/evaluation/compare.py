@@ -1,0 +1,93 @@
+"""How much the protocol alone changes the numbers of one trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .evaluate import evaluate
+from .protocol import PROTOCOLS, Alignment, Protocol, RPESpec
+
+
+@dataclass(frozen=True)
+class ComparisonRow:
+    """One number under one protocol.
+
+    Attributes:
+        metric: ``ATE`` or ``RPE``, each an RMSE of translations.
+        label: What sets the row apart, e.g. ``SE(3)-aligned``.
+        rmse_m: The error in metres; None where it is not defined.
+        pairs: Poses or pairs of poses that it is taken over.
+        protocol: One-line description of the whole protocol.
+        note: Why the number is missing; empty otherwise.
+    """
+
+    metric: str
+    label: str
+    rmse_m: float | None
+    pairs: int
+    protocol: str
+    note: str = ""
+
+
+def compare_protocols(estimate: Trajectory, ground_truth: Trajectory) -> list[ComparisonRow]:
+    """ATE under every alignment and RPE under every habit of the field, of one and the same trajectory.
+
+    Args:
+        estimate: Estimated camera-to-world poses.
+        ground_truth: True poses.
+
+    Raises:
+        EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
+    """
+    evaluate(estimate, ground_truth, "tum-rgbd/v1")
+    rows = [_row("ATE", label, estimate, ground_truth, protocol) for label, protocol in _absolute()]
+    rows += [_row("RPE", label, estimate, ground_truth, protocol) for label, protocol in _relative()]
+    return rows
+
+
+def _absolute() -> list[tuple[str, Protocol]]:
+    base = PROTOCOLS["tum-rgbd/v1"].model_copy(update={"rpe": ()})
+    alignments: list[tuple[str, Alignment]] = [
+        ("not aligned", "none"),
+        ("origin-aligned", "origin"),
+        ("yaw-aligned", "yaw"),
+        ("SE(3)-aligned (TUM's ATE)", "se3"),
+        ("Sim(3)-aligned", "sim3"),
+    ]
+    rows = [
+        (label, base.model_copy(update={"id": f"tum-rgbd/{mode}", "alignment": mode})) for label, mode in alignments
+    ]
+    evo = PROTOCOLS["evo-default"].model_copy(update={"id": "evo -a", "alignment": "se3", "rpe": ()})
+    return [*rows, ("evo_ape -a", evo), ("VSLAM-LAB", PROTOCOLS["vslam-lab"])]
+
+
+def _relative() -> list[tuple[str, Protocol]]:
+    tum, evo = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS["evo-default"]
+
+    def variant(base: Protocol, name: str, spec: RPESpec) -> Protocol:
+        return base.model_copy(update={"id": name, "rpe": (spec,)})
+
+    return [
+        ("TUM, 1 frame, fixed delta", variant(tum, "tum-rgbd/1f", RPESpec(delta=1, unit="f"))),
+        ("TUM, 1 s, fixed delta", variant(tum, "tum-rgbd/1s", RPESpec(delta=1, unit="s"))),
+        ("TUM's default, random pairs", PROTOCOLS["tum-rgbd/v1-random-pairs"]),
+        ("evo_rpe, 1 frame", evo),
+        ("evo_rpe, 30 frames", variant(evo, "evo 30f", RPESpec(delta=30, unit="f", pairs="consecutive"))),
+        ("evo_rpe, 30 frames, all pairs", variant(evo, "evo 30f all", RPESpec(delta=30, unit="f", pairs="all"))),
+    ]
+
+
+def _row(metric: str, label: str, estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> ComparisonRow:
+    try:
+        result = evaluate(estimate, ground_truth, protocol)
+    except EvaluationError as error:
+        return ComparisonRow(metric, label, None, 0, protocol.describe(), str(error))
+    if metric == "ATE":
+        return ComparisonRow(metric, label, result.metrics["ate_rmse_m"], result.n_pairs, protocol.describe())
+    key = protocol.rpe[0].key
+    rmse = result.metrics.get(f"rpe_{key}_trans_rmse_m")
+    note = "" if rmse is not None else f"the trajectory has no pair {protocol.rpe[0].describe()} apart"
+    return ComparisonRow(metric, label, rmse, result.n_pairs_rpe[key], protocol.describe(), note)

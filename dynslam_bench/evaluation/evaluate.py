@@ -1,0 +1,309 @@
+"""One trajectory against the ground truth under one protocol."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core.records import Record
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.tum_file import load_tum
+
+from . import frames
+from .alignment import Similarity, align
+from .ape import absolute_errors
+from .association import Association, match
+from .never_move import never_move
+from .protocol import Alignment, Protocol, get_protocol
+from .rpe import RelativeErrors, evo_relative_errors, tum_relative_errors
+from .segments import segment_errors
+from .statistics import named, statistics
+
+SCHEMA_VERSION = 1
+
+
+class AlignmentRecord(Record):
+    """The alignment that was applied: ``p_gt = scale * R p_est + t``."""
+
+    mode: Alignment
+    rotation: list[list[float]]
+    translation_m: list[float]
+    scale: float
+    degenerate: bool
+
+
+class AssociationRecord(Record):
+    """What was compared and what was dropped; see `Association`."""
+
+    n_estimate: int
+    n_ground_truth: int
+    outside: int
+    in_holes: int
+    taken: int
+    median_dt_s: float
+    largest_hole_s: float
+    hole_at_s: float
+
+
+class Evaluation(Record):
+    """The errors of one trajectory, with the protocol that they hold under.
+
+    Attributes:
+        schema_version: Of this record.
+        protocol_id: Id of the protocol.
+        protocol_digest: Its digest; numbers of different digests are not comparable.
+        protocol: Its one-line description.
+        metrics: Plain floats. Absolute errors ``ate_<statistic>_m`` (translation) and ``ape_rot_<statistic>_deg``,
+            relative ones ``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg``, KITTI's
+            ``kitti_trans_percent`` and ``kitti_rot_deg_per_m``, and ``never_move_ate_rmse_m``: what a camera that
+            does not move scores under the same alignment. The statistics are rmse, mean, median, std, min, max, sse.
+        n_pairs: Pairs of poses that the absolute error is taken over.
+        n_pairs_rpe: The same for each relative error.
+        n_input: Input frames; None where they are not known.
+        n_tracked: Input frames with a tracked pose; None where the input frames are not known.
+        coverage: Their ratio.
+        alignment: How the estimate was aligned.
+        association: What was associated and what was dropped.
+        diagnostics: One line for everything that a reader of the numbers ought to know.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    protocol_id: str
+    protocol_digest: str
+    protocol: str
+    metrics: dict[str, float]
+    n_pairs: int
+    n_pairs_rpe: dict[str, int]
+    n_input: int | None = None
+    n_tracked: int | None = None
+    coverage: float | None = None
+    alignment: AlignmentRecord
+    association: AssociationRecord
+    diagnostics: list[str]
+
+    def summary(self) -> str:
+        """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""
+        covered = ""
+        if self.coverage is not None:
+            covered = f", {100 * self.coverage:.1f} % of {self.n_input} frames tracked"
+        return (
+            f"ATE (rmse) {self.metrics['ate_rmse_m']:.4f} m over {self.n_pairs} poses{covered} "
+            f"[{self.protocol_id} {self.protocol_digest}]"
+        )
+
+
+def evaluate(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    input_timestamps: ArrayLike | None = None,
+) -> Evaluation:
+    """Absolute and relative pose errors of a trajectory.
+
+    Args:
+        estimate: Camera-to-world poses of the tracked frames, in any world frame that the protocol's alignment undoes.
+        ground_truth: True camera-to-world poses at their own stamps; may have holes.
+        protocol: A protocol or the id of a registered one.
+        input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the lost-frame policies
+            ``hold`` and ``fail``.
+
+    Returns:
+        Every metric that is defined. A relative error whose delta is longer than the trajectory is left out and the
+        diagnostics say so.
+
+    Raises:
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), the policy needs the input
+            frames, or a frame was lost where the policy allows none.
+    """
+    protocol = get_protocol(protocol)
+    diagnostics: list[str] = []
+    n_input = n_tracked = None
+    if input_timestamps is not None:
+        n_input = len(np.asarray(input_timestamps).reshape(-1))
+        n_tracked = int(frames.tracked_frames(estimate, input_timestamps).sum())
+    estimate = _apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
+    association = match(estimate, ground_truth, protocol)
+    if len(association) < 2:
+        raise EvaluationError(
+            f"only {len(association)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s, "
+            "at least 2 are needed",
+            association.describe(protocol.max_dt),
+        )
+    dropped = association.describe(protocol.max_dt)
+    if dropped:
+        diagnostics.append(dropped)
+
+    matched = estimate.T_world_cam[association.estimate]
+    truth = ground_truth.T_world_cam[association.ground_truth]
+    similarity = align(matched, truth, protocol.alignment)
+    if similarity.degenerate:
+        diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
+    aligned = similarity.apply(matched)
+    translation, rotation = absolute_errors(aligned, truth)
+    metrics = {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
+    relative, counts = _relative_metrics(estimate, ground_truth, association, aligned, similarity, protocol)
+    for key, count in counts.items():
+        if not count:
+            diagnostics.append(f"no pair of poses for the relative error over {key}; it is left out")
+    metrics.update(relative)
+    if protocol.segments_m:
+        metrics.update(_segment_metrics(aligned, truth, protocol, diagnostics))
+    metrics["never_move_ate_rmse_m"] = _never_move(ground_truth, association, protocol, input_timestamps)
+    return Evaluation(
+        protocol_id=protocol.id,
+        protocol_digest=protocol.digest(),
+        protocol=protocol.describe(),
+        metrics=metrics,
+        n_pairs=len(association),
+        n_pairs_rpe=counts,
+        n_input=n_input,
+        n_tracked=n_tracked,
+        coverage=None if n_tracked is None or not n_input else n_tracked / n_input,
+        alignment=AlignmentRecord(
+            mode=protocol.alignment,
+            rotation=similarity.rotation.tolist(),
+            translation_m=similarity.translation.tolist(),
+            scale=similarity.scale,
+            degenerate=similarity.degenerate,
+        ),
+        association=AssociationRecord(
+            n_estimate=association.n_estimate,
+            n_ground_truth=association.n_ground_truth,
+            outside=association.outside,
+            in_holes=association.in_holes,
+            taken=association.taken,
+            median_dt_s=association.median_dt,
+            largest_hole_s=association.largest_hole,
+            hole_at_s=association.hole_at,
+        ),
+        diagnostics=diagnostics,
+    )
+
+
+def evaluate_files(
+    estimate: str | Path, ground_truth: str | Path, protocol: Protocol | str = "tum-rgbd/v1"
+) -> Evaluation:
+    """Evaluate a trajectory file against a ground-truth file, both in TUM format.
+
+    What the files held in disorder (skipped, sorted and replaced lines) is added to the diagnostics.
+
+    Raises:
+        TrajectoryError: A file cannot be read.
+        EvaluationError: As `evaluate`.
+    """
+    loaded = {"estimate": load_tum(estimate), "ground truth": load_tum(ground_truth)}
+    result = evaluate(loaded["estimate"].trajectory, loaded["ground truth"].trajectory, protocol)
+    notes = [f"{name}: {note}" for name, file in loaded.items() for note in file.notes.describe()]
+    return result.model_copy(update={"diagnostics": notes + result.diagnostics})
+
+
+def pose_errors(
+    estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol | str = "tum-rgbd/v1"
+) -> tuple[Trajectory, Trajectory, dict[str, np.ndarray]]:
+    """The aligned estimate, its true counterparts, and the absolute error of every associated pose, for plots.
+
+    Returns:
+        Aligned estimated poses and true poses (both at the estimate's stamps), and the series ``trans_m``,
+        ``rot_deg`` ``[K]`` each.
+
+    Raises:
+        EvaluationError: Nothing can be associated.
+    """
+    protocol = get_protocol(protocol)
+    association = match(estimate, ground_truth, protocol)
+    matched = estimate.T_world_cam[association.estimate]
+    truth = ground_truth.T_world_cam[association.ground_truth]
+    aligned = align(matched, truth, protocol.alignment).apply(matched)
+    translation, rotation = absolute_errors(aligned, truth)
+    stamps, first = np.unique(estimate.timestamps[association.estimate], return_index=True)
+    return (
+        Trajectory(stamps, aligned[first]),
+        Trajectory(stamps, truth[first]),
+        {"trans_m": translation[first], "rot_deg": rotation[first]},
+    )
+
+
+def _apply_policy(
+    estimate: Trajectory,
+    protocol: Protocol,
+    input_timestamps: ArrayLike | None,
+    n_input: int | None,
+    n_tracked: int | None,
+    diagnostics: list[str],
+) -> Trajectory:
+    if input_timestamps is None or n_input is None or n_tracked is None:
+        if protocol.lost_frames != "exclude":
+            raise EvaluationError(
+                f"protocol {protocol.id} ({protocol.lost_frames}) needs the stamps of the input frames",
+                "pass input_timestamps, or use a protocol that excludes lost frames",
+            )
+        return estimate
+    lost = n_input - n_tracked
+    if not lost:
+        return estimate
+    percent = f"coverage {100 * n_tracked / n_input:.1f} %"
+    if protocol.lost_frames == "fail":
+        raise EvaluationError(f"{lost} of {n_input} frames were lost ({percent}), {protocol.id} allows none")
+    if protocol.lost_frames == "hold":
+        diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and held at the last tracked pose")
+        return frames.hold(estimate, input_timestamps)
+    diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and take no part")
+    return estimate
+
+
+def _relative_metrics(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    association: Association,
+    aligned: np.ndarray,
+    similarity: Similarity,
+    protocol: Protocol,
+) -> tuple[dict[str, float], dict[str, int]]:
+    metrics: dict[str, float] = {}
+    counts: dict[str, int] = {}
+    for spec in protocol.rpe:
+        errors: RelativeErrors
+        if spec.pairs in ("tum-fixed", "tum-random"):
+            errors = tum_relative_errors(estimate, ground_truth, spec, scale=similarity.scale)
+        else:
+            errors = evo_relative_errors(
+                estimate.timestamps[association.estimate],
+                aligned,
+                ground_truth.T_world_cam[association.ground_truth],
+                spec,
+            )
+        counts[spec.key] = len(errors.pairs)
+        metrics.update(named(f"rpe_{spec.key}_trans", errors.translation_m, "m"))
+        metrics.update(named(f"rpe_{spec.key}_rot", errors.rotation_deg, "deg"))
+    return metrics, counts
+
+
+def _segment_metrics(
+    aligned: np.ndarray, truth: np.ndarray, protocol: Protocol, diagnostics: list[str]
+) -> dict[str, float]:
+    translation, rotation = segment_errors(aligned, truth, protocol.segments_m)
+    if not len(translation):
+        length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+        diagnostics.append(f"the path of {length:.1f} m is shorter than a segment of {min(protocol.segments_m):g} m")
+        return {}
+    return {
+        "kitti_trans_percent": statistics(translation)["mean"],
+        "kitti_rot_deg_per_m": statistics(rotation)["mean"],
+    }
+
+
+def _never_move(
+    ground_truth: Trajectory, association: Association, protocol: Protocol, input_timestamps: ArrayLike | None
+) -> float:
+    """What not moving scores under the protocol's alignment, over the input frames where they are known."""
+    if input_timestamps is None:
+        selected = ground_truth.select(np.unique(association.ground_truth))
+        errors = never_move(selected)
+    else:
+        errors = never_move(ground_truth, input_timestamps, protocol.max_dt)
+    joined = protocol.alignment in ("none", "origin")
+    return errors["first_rmse_m" if joined else "constant_rmse_m"]

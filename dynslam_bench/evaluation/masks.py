@@ -1,0 +1,80 @@
+"""Quality of masks: overlap with the true moving (or labelled) pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import EvaluationError
+
+
+@dataclass(frozen=True)
+class MaskCounts:
+    """Pixel counts of one or, added up, of many masks.
+
+    Attributes:
+        true_positive: Pixels in both masks.
+        false_positive: Pixels in the predicted mask only.
+        false_negative: Pixels in the true mask only.
+        true_negative: Pixels in neither.
+    """
+
+    true_positive: int = 0
+    false_positive: int = 0
+    false_negative: int = 0
+    true_negative: int = 0
+
+    def __add__(self, other: MaskCounts) -> MaskCounts:
+        return MaskCounts(
+            self.true_positive + other.true_positive,
+            self.false_positive + other.false_positive,
+            self.false_negative + other.false_negative,
+            self.true_negative + other.true_negative,
+        )
+
+    @property
+    def iou(self) -> float | None:
+        """Intersection over union; None where both masks are empty (nothing to find, nothing found)."""
+        return _ratio(self.true_positive, self.true_positive + self.false_positive + self.false_negative)
+
+    @property
+    def precision(self) -> float | None:
+        """Share of the predicted pixels that are true; None where nothing was predicted."""
+        return _ratio(self.true_positive, self.true_positive + self.false_positive)
+
+    @property
+    def recall(self) -> float | None:
+        """Share of the true pixels that were predicted; None where there are none."""
+        return _ratio(self.true_positive, self.true_positive + self.false_negative)
+
+
+def compare_masks(
+    predicted: NDArray[np.bool_], truth: NDArray[np.bool_], valid: NDArray[np.bool_] | None = None
+) -> MaskCounts:
+    """Count the pixels on which two masks ``[H, W]`` agree and differ; counts of frames can be added.
+
+    Args:
+        predicted: True where a pixel is held for dynamic.
+        truth: True where it is.
+        valid: Pixels that count; None for all.
+
+    Raises:
+        EvaluationError: The masks differ in shape.
+    """
+    shapes = [np.shape(predicted), np.shape(truth)] + ([np.shape(valid)] if valid is not None else [])
+    if len(set(shapes)) != 1:
+        raise EvaluationError(f"masks differ in shape: {' and '.join(map(str, shapes))}")
+    p, t = np.asarray(predicted, dtype=bool), np.asarray(truth, dtype=bool)
+    counted = np.ones(p.shape, dtype=bool) if valid is None else np.asarray(valid, dtype=bool)
+    return MaskCounts(
+        int((p & t & counted).sum()),
+        int((p & ~t & counted).sum()),
+        int((~p & t & counted).sum()),
+        int((~p & ~t & counted).sum()),
+    )
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

@@ -1,0 +1,110 @@
+"""Causal pose error, frame by frame, for environments and for ``frames.csv``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OnlineSample:
+    """The pose error at one frame that has ground truth.
+
+    Attributes:
+        trans_m: Cumulative translational error in metres, estimate and truth joined at the first frame that has both.
+        rot_deg: Cumulative rotational error in degrees.
+        frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None where the frame
+            before has no ground truth.
+        frame_rot_deg: Frame-to-frame rotational error in degrees, likewise.
+    """
+
+    trans_m: float
+    rot_deg: float
+    frame_trans_m: float | None
+    frame_rot_deg: float | None
+
+
+class OnlineError:
+    """Follows the pose error of a running tracker; what is known at a frame never changes later.
+
+    A frame that is lost counts as not having moved: cumulatively it stays at the last tracked pose, and frame to frame
+    an interval with a lost frame at either end is charged with the whole true motion, so that getting lost never pays.
+    Until a first pose is tracked the camera counts as standing at the first true pose.
+
+    Args:
+        ground_truth: True camera-to-world poses at their own stamps, possibly with holes; None if there are none.
+        max_dt: A frame has ground truth if a true pose is closer in time than this, in seconds.
+    """
+
+    def __init__(self, ground_truth: Trajectory | None, max_dt: float = 0.02) -> None:
+        self._truth = ground_truth if ground_truth is not None and len(ground_truth) else None
+        self._max_dt = max_dt
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin again at the first frame."""
+        self._align: Array | None = None
+        self._held: Array | None = None
+        self._previous_truth: Array | None = None
+        self._previous_pose: Array | None = None
+
+    def truth_at(self, timestamp: float) -> Array | None:
+        """The true pose ``[4, 4]`` nearest in time, or None in a hole."""
+        if self._truth is None:
+            return None
+        stamps = self._truth.timestamps
+        right = min(int(np.searchsorted(stamps, timestamp)), len(stamps) - 1)
+        left = max(right - 1, 0)
+        nearest = left if abs(stamps[left] - timestamp) <= abs(stamps[right] - timestamp) else right
+        if not abs(stamps[nearest] - timestamp) < self._max_dt:
+            return None
+        return np.array(self._truth.T_world_cam[nearest])
+
+    def update(self, timestamp: float, T_world_cam: Array | None, ok: bool) -> OnlineSample | None:
+        """Take in the next frame.
+
+        Args:
+            timestamp: Seconds, the frame's stamp.
+            T_world_cam: Estimated camera-to-world pose ``[4, 4]``; None if there is none.
+            ok: Whether the frame was tracked; a pose given with False is a prediction and counts for nothing.
+
+        Returns:
+            The error at this frame, or None where there is no ground truth.
+        """
+        pose = np.array(T_world_cam, dtype=np.float64) if ok and T_world_cam is not None else None
+        truth = self.truth_at(timestamp)
+        sample = None if truth is None else self._sample(truth, pose)
+        if pose is not None and self._align is not None:
+            self._held = self._align @ pose
+        self._previous_truth = truth
+        self._previous_pose = pose
+        return sample
+
+    def _sample(self, truth: Array, pose: Array | None) -> OnlineSample:
+        if pose is not None and self._align is None:
+            self._align = truth @ se3.inverse(pose)
+        if pose is not None and self._align is not None:
+            self._held = self._align @ pose
+        if self._held is None:
+            self._held = truth.copy()
+        error = se3.inverse(truth) @ self._held
+        frame_trans = frame_rot = None
+        if self._previous_truth is not None:
+            moved = se3.inverse(self._previous_truth) @ truth
+            estimated = np.eye(4)
+            if pose is not None and self._previous_pose is not None:
+                estimated = se3.inverse(self._previous_pose) @ pose
+            frame_trans, frame_rot = _size(se3.inverse(moved) @ estimated)
+        return OnlineSample(*_size(error), frame_trans, frame_rot)
+
+
+def _size(error: Array) -> tuple[float, float]:
+    """Length of the translation in metres and rotation angle in degrees."""
+    return float(np.linalg.norm(error[:3, 3])), float(np.rad2deg(se3.rotation_angle(error)))

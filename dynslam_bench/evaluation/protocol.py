@@ -1,0 +1,159 @@
+"""The evaluation protocol: everything besides the two trajectories that an error depends on.
+
+The same trajectory scores tenfold different numbers under two options of one official script; therefore a metric is
+stored with its protocol's digest, and tables refuse to mix digests.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from dynslam_bench.core.errors import EvaluationError, did_you_mean
+from dynslam_bench.core.records import digest
+
+Alignment = Literal["none", "origin", "se3", "sim3", "yaw"]
+DeltaUnit = Literal["f", "s", "m", "rad", "deg"]
+PairMode = Literal["tum-fixed", "tum-random", "consecutive", "all"]
+
+_UNIT_NAMES = {"f": "frame", "s": "s", "m": "m", "rad": "rad", "deg": "deg"}
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class RPESpec(_Frozen):
+    """Which pairs of poses the relative pose error (the paper's Eq. 26) is taken over.
+
+    Attributes:
+        delta: Distance between the poses of a pair; ignored by ``tum-random``.
+        unit: Its unit: ``f`` frames, ``s`` seconds, ``m`` metres of path, ``rad`` or ``deg`` of rotation.
+        pairs: ``tum-fixed``: for every pose the one closest to `delta` further along the estimate, unless that is the
+            last pose. ``tum-random``: `max_pairs` seeded random pairs (every pair of a trajectory shorter than the
+            square root of that). ``consecutive`` and ``all``: evo's non-overlapping and overlapping pairs.
+        tolerance: Relative tolerance of `delta` in mode ``all`` (evo's is 0.1).
+        max_pairs: At most so many pairs in the two TUM modes, a seeded sample of them; 0 for all.
+    """
+
+    delta: float = Field(default=1.0, gt=0)
+    unit: DeltaUnit = "f"
+    pairs: PairMode = "tum-fixed"
+    tolerance: float = Field(default=0.1, ge=0)
+    max_pairs: int = Field(default=10000, ge=0)
+
+    @model_validator(mode="after")
+    def _whole_frames(self) -> RPESpec:
+        if self.unit == "f" and self.delta != round(self.delta):
+            raise ValueError(f"a delta in frames is a whole number, got {self.delta:g}")
+        return self
+
+    @property
+    def key(self) -> str:
+        """Part of the metrics' names: ``1s`` in ``rpe_1s_trans_rmse_m``, or ``random``."""
+        return "random" if self.pairs == "tum-random" else f"{self.delta:g}{self.unit}"
+
+    def describe(self) -> str:
+        """For example ``1 s (TUM pairs)``."""
+        if self.pairs == "tum-random":
+            return f"{self.max_pairs} random pairs" if self.max_pairs else "all pairs"
+        plural = "s" if self.unit == "f" and self.delta != 1 else ""
+        kind = {"tum-fixed": "TUM pairs", "consecutive": "consecutive pairs", "all": "all pairs"}[self.pairs]
+        return f"{self.delta:g} {_UNIT_NAMES[self.unit]}{plural} ({kind})"
+
+
+class Protocol(_Frozen):
+    """A frozen evaluation protocol.
+
+    Attributes:
+        id: Name and version.
+        max_dt: Largest time difference in seconds between an estimated and a true pose.
+        strict: True for ``|dt| < max_dt``, False for ``<=``.
+        one_to_one: True for TUM's greedy one-to-one association; False for evo's nearest neighbour of every pose of
+            the shorter trajectory.
+        alignment: How the estimate is moved onto the ground truth before absolute errors are taken: ``none``,
+            ``origin`` (first associated pose), ``se3`` and ``sim3`` (least squares over the positions), ``yaw``
+            (translation and rotation about the world's z axis).
+        rpe: The relative pose errors.
+        segments_m: Lengths of KITTI's segments in metres; empty for none.
+        trajectory: Whether the online or the final trajectory of a run is evaluated.
+        lost_frames: ``exclude``: frames without a tracked pose take no part. ``hold``: the camera counts as not having
+            moved since the last tracked frame. ``fail``: any lost frame makes the evaluation an error.
+    """
+
+    id: str
+    max_dt: float = Field(default=0.02, ge=0)
+    strict: bool = True
+    one_to_one: bool = True
+    alignment: Alignment = "se3"
+    rpe: tuple[RPESpec, ...] = ()
+    segments_m: tuple[float, ...] = ()
+    trajectory: Literal["online", "final"] = "online"
+    lost_frames: Literal["exclude", "hold", "fail"] = "exclude"
+
+    def digest(self) -> str:
+        """Twelve hexadecimal digits that stand for every field; stored with every metric."""
+        return digest(self)
+
+    def describe(self) -> str:
+        """One line for captions: everything that the numbers depend on."""
+        alignment = {
+            "none": "no alignment",
+            "origin": "origin-aligned",
+            "se3": "SE(3)-aligned",
+            "sim3": "Sim(3)-aligned",
+            "yaw": "yaw- and position-aligned",
+        }
+        lost = {
+            "exclude": "lost frames excluded",
+            "hold": "lost frames held at the last pose",
+            "fail": "no lost frame allowed",
+        }
+        parts = [
+            alignment[self.alignment],
+            f"|dt| {'<' if self.strict else '<='} {self.max_dt:g} s {'one-to-one' if self.one_to_one else 'nearest'}",
+            *(["RPE over " + " and ".join(spec.describe() for spec in self.rpe)] if self.rpe else []),
+            *(["segments of " + ", ".join(f"{s:g}" for s in self.segments_m) + " m"] if self.segments_m else []),
+            f"{self.trajectory} trajectory",
+            lost[self.lost_frames],
+        ]
+        return f"{self.id}: " + ", ".join(parts) + f" [{self.digest()}]"
+
+
+PROTOCOLS: dict[str, Protocol] = {
+    protocol.id: protocol
+    for protocol in (
+        Protocol(id="tum-rgbd/v1", rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f"))),
+        Protocol(id="tum-rgbd/v1-random-pairs", rpe=(RPESpec(pairs="tum-random"),)),
+        Protocol(
+            id="evo-default",
+            max_dt=0.01,
+            strict=False,
+            one_to_one=False,
+            alignment="none",
+            rpe=(RPESpec(delta=1, unit="f", pairs="consecutive"),),
+        ),
+        # evo_ape -as with a tolerance of ten frames at 30 Hz, whatever the sensor
+        Protocol(id="vslam-lab", max_dt=1 / 3, strict=False, one_to_one=False, alignment="sim3"),
+        Protocol(
+            id="kitti",
+            alignment="origin",
+            rpe=(RPESpec(delta=1, unit="f", pairs="all"),),
+            segments_m=(100, 200, 300, 400, 500, 600, 700, 800),
+        ),
+    )
+}
+
+
+def get_protocol(name: str | Protocol) -> Protocol:
+    """A registered protocol by its id; a `Protocol` is returned as it is.
+
+    Raises:
+        EvaluationError: Unknown id, with a did-you-mean.
+    """
+    if isinstance(name, Protocol):
+        return name
+    if name not in PROTOCOLS:
+        raise EvaluationError(f"unknown protocol '{name}'", did_you_mean(name, PROTOCOLS))
+    return PROTOCOLS[name]
