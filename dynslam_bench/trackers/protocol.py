@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -86,6 +87,11 @@ class TrackerSpec:
         requires: Modules that must be importable, each with the command that installs it.
         reported: Published numbers: sequence id to metric to value.
         remarks: Name collisions and known limits, e.g. "marks nothing as lost".
+        parameter: Name of the setting that takes what follows the id in ``id:value`` (``replay:FILE``); empty if the
+            tracker takes none.
+        bound: Settings fixed by the way it was named, dotted name to value; ``TRACKERS.get("id:value")`` fills it in.
+        check: ``"module:function"``; the function returns an install hint if the tracker cannot run here although all
+            of `requires` can be imported, else an empty string.
     """
 
     id: str
@@ -105,9 +111,16 @@ class TrackerSpec:
     requires: Mapping[str, str] = field(default_factory=dict)
     reported: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     remarks: str = ""
+    parameter: str = ""
+    bound: Mapping[str, Any] = field(default_factory=dict)
+    check: str = ""
 
     def missing(self) -> list[str]:
-        """Install hints of required modules that are not importable; empty if the tracker can run."""
+        """Install hints of what is required but not there; empty if the tracker can run."""
         from importlib.util import find_spec
 
-        return [hint for module, hint in self.requires.items() if find_spec(module) is None]
+        hints = [hint for module, hint in self.requires.items() if find_spec(module) is None]
+        if hints or not self.check:
+            return hints
+        hint = load_object(self.check)()
+        return [hint] if hint else []

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError, TrackerError
+from dynslam_bench.core.errors import DynslamError, PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
 
@@ -19,16 +23,55 @@ def _builtin() -> Iterable[TrackerSpec]:
     return specs.all_specs()
 
 
-TRACKERS: Registry[TrackerSpec] = Registry("trackers", TrackerSpec, _builtin)
+class TrackerRegistry(Registry[TrackerSpec]):
+    """All trackers; an id may carry a parameter, as in ``replay:trajectory.txt``.
+
+    An exact id wins over ``id:value``, and that over ``module:Attr`` and ``file.py:Attr``: a name is read as
+    ``id:value`` only if the part before its first colon is the id of a tracker that takes a parameter.
+    """
+
+    def get(self, name: str) -> TrackerSpec:
+        """The spec of an id, of ``id:value``, or of ``module:Attr`` / ``file.py:Attr``.
+
+        Raises:
+            PluginError: Unknown id (with a did-you-mean), an empty value, or the named object is no spec.
+        """
+        known = {found.spec.id: found.spec for found in self.all()}
+        prefix, separator, value = name.partition(":")
+        if name in known or not separator or prefix not in known or not known[prefix].parameter:
+            return super().get(name)
+        return _bind(known[prefix], value)
+
+
+def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
+    """The spec of ``id:value``; a named file's content becomes part of the version, and so of a run's identity."""
+    if not value.strip():
+        raise PluginError(f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}")
+    version = spec.version
+    path = Path(value).expanduser()
+    if path.is_file():
+        version += "+" + sha256(path.read_bytes()).hexdigest()[:12]
+    return replace(
+        spec,
+        id=f"{spec.id}:{value}",
+        label=f"{spec.label}: {path.name if path.is_file() else value}",
+        bound={**spec.bound, spec.parameter: value},
+        version=version,
+        parameter="",
+    )
+
+
+TRACKERS: Registry[TrackerSpec] = TrackerRegistry("trackers", TrackerSpec, _builtin)
 
 
 def resolve_settings(spec: TrackerSpec, overrides: Mapping[str, Any] | None = None) -> Settings:
-    """The tracker's default settings with overrides (dotted name to value) applied.
+    """The tracker's default settings with what its name has bound, then the overrides (dotted name to value) applied.
 
     Raises:
         SettingsError: Unknown name or unfit value.
     """
-    return apply_overrides(spec.settings(), overrides or {})
+    bound = {name: json.dumps(value) for name, value in spec.bound.items()}  # as text, so that "5" stays a file's name
+    return apply_overrides(spec.settings(), {**bound, **(overrides or {})})
 
 
 def build_tracker(
@@ -37,7 +80,7 @@ def build_tracker(
     """Load and construct a tracker.
 
     Args:
-        spec: A spec, an id, ``module:Attr`` or ``file.py:Attr``.
+        spec: A spec, an id, ``id:value``, ``module:Attr`` or ``file.py:Attr``.
         settings: Its settings, or overrides of the defaults by dotted name.
         context: Where it runs.
 

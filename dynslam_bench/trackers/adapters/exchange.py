@@ -1,0 +1,97 @@
+"""How a foreign program gets the images: a memory-mapped file that is overwritten, or PNG files."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.frame import Frame
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+class ImageExchange:
+    """A private folder through which the frames reach a program; removed by `close`, at the latest with the object.
+
+    ``raw``: one file ``frame.raw`` of fixed size, in shared memory where the system has it. It holds the colour image
+    (uint8 ``[H, W, 3]``, red first, row by row) at `rgb_offset` and the depth (little-endian float32 ``[H, W]``,
+    metres, 0 = missing) at `depth_offset`, and is overwritten before each ``track``. ``png``: for each frame an 8-bit
+    colour PNG and a 16-bit depth PNG in units of ``1 / depth_factor`` metres, as in TUM's files; those of the frame
+    before are removed.
+
+    Args:
+        camera: Of the frames.
+        mode: ``raw`` or ``png``.
+    """
+
+    def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
+        base = SHARED_MEMORY if mode == "raw" and SHARED_MEMORY.is_dir() else None
+        try:
+            self.folder = Path(tempfile.mkdtemp(prefix="dynslam-bench-", dir=base))
+        except OSError:
+            self.folder = Path(tempfile.mkdtemp(prefix="dynslam-bench-"))
+        self._remove = weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+        self.camera, self.mode = camera, mode
+        self._last: tuple[Path, ...] = ()
+        colour = camera.height * camera.width * 3
+        self.depth_offset = -(-colour // 16) * 16
+        if mode == "raw":
+            size = self.depth_offset + camera.height * camera.width * 4
+            self._memory = np.memmap(self.folder / "frame.raw", np.uint8, "w+", shape=(size,))
+            self._rgb = self._memory[:colour].reshape(camera.height, camera.width, 3)
+            self._depth = self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
+
+    def announce(self) -> dict[str, Any]:
+        """What the program is told once, in ``reset``."""
+        if self.mode == "png":
+            return {"mode": "png", "depth_factor": self.camera.depth_factor}
+        return {
+            "mode": "raw",
+            "file": str(self.folder / "frame.raw"),
+            "rgb_offset": 0,
+            "depth_offset": self.depth_offset,
+            "bytes": int(self._memory.size),
+        }
+
+    def put(self, frame: Frame) -> dict[str, Any]:
+        """Hand over a frame; what the program is told of it in ``track``.
+
+        Raises:
+            TrackerError: The images do not have the camera's size.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
+            raise TrackerError(
+                f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
+                f"but the camera is {self.camera.width}x{self.camera.height}"
+            )
+        if self.mode == "raw":
+            np.copyto(self._rgb, frame.rgb)
+            np.copyto(self._depth, frame.depth)
+            return {}
+        return self._write_png(frame)
+
+    def _write_png(self, frame: Frame) -> dict[str, Any]:
+        rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
+        units = np.rint(np.nan_to_num(frame.depth) * self.camera.depth_factor).clip(0, 65535).astype(np.uint16)
+        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        for path, image in ((rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)), (depth, units)):
+            if not cv2.imwrite(str(path), image, fast):
+                raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
+        for old in self._last:
+            if old not in (rgb, depth):
+                old.unlink(missing_ok=True)
+        self._last = (rgb, depth)
+        return {"rgb": str(rgb), "depth": str(depth)}
+
+    def close(self) -> None:
+        """Remove the folder; may be called more than once."""
+        self._remove()

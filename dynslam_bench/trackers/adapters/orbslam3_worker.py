@@ -1,0 +1,77 @@
+"""The process in which ORB-SLAM3 runs: its crashes, its `exit()`, its threads and its chatter stay in here."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.trackers.adapters.serve import serve
+
+STATES = {"OK": "ok", "OK_KLT": "ok", "RECENTLY_LOST": "lost", "LOST": "lost"}
+
+
+class Worker:
+    """One ORB-SLAM3 system; states and poses as its bindings give them."""
+
+    def __init__(self) -> None:
+        self._slam: Any = None
+        self._stamps: list[float] = []
+
+    def reset(self, request: dict[str, Any]) -> None:
+        """Load the vocabulary and start ORB-SLAM3's threads."""
+        try:
+            import pyorbslam3
+        except ImportError as error:
+            raise RuntimeError(
+                f"pyorbslam3 cannot be imported: {error}; on Debian and Ubuntu: "
+                "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
+            ) from error
+        options = request["options"]
+        self._slam = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], pyorbslam3.Sensor.RGBD)
+
+    def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
+        """One frame."""
+        start = time.perf_counter()
+        result = self._slam.track_rgbd(np.ascontiguousarray(rgb), np.ascontiguousarray(depth), timestamp)
+        seconds = time.perf_counter() - start
+        self._stamps.append(timestamp)
+        state = STATES.get(result.state.name, "initialising")
+        pose = None if result.pose_wc is None or state == "initialising" else result.pose_wc.astype(float).tolist()
+        points = float(result.num_tracked_points)
+        return {
+            "state": "lost" if state == "ok" and pose is None else state,
+            "T_world_cam": pose,
+            "stats": {"keypoints": float(len(self._slam.tracked_keypoints())), "matches": points, "inliers": points},
+            "timings": {"tracking": seconds},
+        }
+
+    def finalize(self) -> list[list[float]]:
+        """Stop the threads; the poses of all frames that were not lost, after its last optimisation."""
+        self._slam.shutdown()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "final.txt"
+            self._slam.save_trajectory_tum(str(path))
+            rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
+        stamps = np.asarray(self._stamps)
+        for row in rows:  # the file rounds the stamps; give the frames' own back
+            row[0] = float(stamps[np.abs(stamps - row[0]).argmin()])
+        return rows
+
+
+def main() -> None:
+    """Serve one parent, then leave without ORB-SLAM3's destructors, which may wait for its threads for ever."""
+    worker = Worker()
+    serve(worker.reset, worker.track, worker.finalize)
+    sys.stderr.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

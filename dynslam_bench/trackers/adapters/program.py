@@ -1,0 +1,208 @@
+"""A foreign program that answers JSON lines: start, ask with a time limit, end; its death becomes one clear error."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import signal
+import subprocess
+import time
+import weakref
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dynslam_bench.core.errors import TrackerError
+
+KEPT_LINES = 40
+
+
+class Program:
+    """One run of a foreign program.
+
+    Requests go to its standard input, one JSON object a line; it answers each with one JSON object a line on its
+    standard output. Lines that do not begin with ``{`` are log output and skipped, as is all it writes to its standard
+    error; the last lines are kept for error messages. It has a session of its own, so that it is ended together with
+    whatever it started, and it should end by itself at the end of its standard input.
+
+    Args:
+        name: For messages.
+        command: Program and arguments.
+        folder: Its working folder; None for the current one.
+        environment: Variables to set beside the inherited ones.
+
+    Raises:
+        TrackerError: The program cannot be started.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        folder: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name = name
+        self._log: deque[str] = deque(maxlen=KEPT_LINES)
+        self._partial = {"out": b"", "err": b""}
+        self._answers: deque[str] = deque()
+        try:
+            self._process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                cwd=folder,
+                env={**os.environ, **(environment or {})},
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise TrackerError(f"{name}: cannot start '{command[0]}': {reason}", "check its path") from error
+        assert self._process.stdin and self._process.stdout and self._process.stderr
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            os.set_blocking(stream.fileno(), False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._process.stdout, selectors.EVENT_READ, "out")
+        self._selector.register(self._process.stderr, selectors.EVENT_READ, "err")
+        self._kill = weakref.finalize(self, _kill_group, self._process)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the program runs."""
+        return self._process.poll() is None
+
+    @property
+    def last_words(self) -> str:
+        """The last line that is not blank of what it wrote as log."""
+        partial = [part.decode(errors="replace") for part in self._partial.values()]
+        lines = [line for line in (*self._log, *partial) if line.strip()]
+        return lines[-1].strip()[:300] if lines else ""
+
+    def ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
+        """Send a request and wait for its answer.
+
+        Args:
+            request: JSON-able; ``op`` names what is asked.
+            timeout_s: Seconds until the program is given up and killed.
+            doing: For messages, e.g. ``at frame 12``.
+
+        Raises:
+            TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
+        """
+        self._answers.clear()
+        line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
+        text = self._exchange(line, timeout_s, doing)
+        try:
+            answer = json.loads(text)
+        except ValueError as error:
+            self.kill()
+            raise TrackerError(
+                f"{self.name} {doing}: answered no JSON: '{text[:80]}': {error}", "one JSON object a line"
+            ) from None
+        if answer.get("error"):
+            raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
+        return dict(answer)
+
+    def close(self, timeout_s: float) -> None:
+        """Ask it to end, wait, and kill it if it does not; may be called more than once."""
+        if self.alive:
+            assert self._process.stdin
+            with contextlib.suppress(OSError):
+                os.write(self._process.stdin.fileno(), b'{"op": "close"}\n')
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+            deadline = time.monotonic() + timeout_s
+            while self.alive and time.monotonic() < deadline:
+                if not self._read(0.02):
+                    time.sleep(0.005)
+        self.kill()
+
+    def kill(self) -> None:
+        """End it and everything it started, at once."""
+        self._kill()
+        self._selector.close()
+
+    def _exchange(self, line: memoryview, timeout_s: float, doing: str) -> str:
+        """Write the request, read until there is an answer."""
+        assert self._process.stdin
+        deadline = time.monotonic() + timeout_s
+        while line or not self._answers:
+            if line:
+                try:
+                    line = line[os.write(self._process.stdin.fileno(), line) :]
+                except BlockingIOError:
+                    pass  # its input is full: read what it says, then try again
+                except (OSError, ValueError):  # it has closed its input, or was killed before
+                    raise self._death(doing) from None
+            left = deadline - time.monotonic()
+            if left <= 0:
+                words = self.last_words
+                self.kill()
+                said = f"; its last line: '{words}'" if words else ""
+                raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{said}")
+            alive = self.alive
+            open_ = self._read(min(left, 0.01 if line else 0.5))
+            if not self._answers and not (alive and open_):
+                raise self._death(doing)
+        return self._answers.popleft()
+
+    def _read(self, wait: float) -> bool:
+        """Take in what it writes within `wait` seconds; False once its standard output has ended."""
+        if not self._selector.get_map():
+            return False
+        for key, _ in self._selector.select(wait):
+            channel = str(key.data)
+            data = os.read(key.fd, 1 << 16)
+            if not data:
+                self._selector.unregister(key.fileobj)
+            *lines, rest = (self._partial[channel] + data).split(b"\n")
+            self._partial[channel] = rest
+            for raw in lines:
+                text = raw.decode(errors="replace")
+                if channel == "out" and text.lstrip().startswith("{"):
+                    self._answers.append(text)
+                elif text.strip():
+                    self._log.append(text)
+        return any(key.data == "out" for key in self._selector.get_map().values())
+
+    def _death(self, doing: str) -> TrackerError:
+        try:
+            code = self._process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return TrackerError(f"{self.name} {doing}: closed its output without an answer")
+        for _ in range(64):  # the rest of its last words; a grandchild may hold the pipe open for ever
+            if not self._selector.get_map() or not self._selector.select(0.0):
+                break
+            self._read(0.0)
+        words = self.last_words
+        self.kill()
+        said = f"; its last line: '{words}'" if words else "; it wrote no message"
+        return TrackerError(f"{self.name} {doing}: the program {_describe(code)}{said}")
+
+
+def _describe(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was killed by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was killed by signal {-code}"
+
+
+def _kill_group(process: subprocess.Popen[bytes]) -> None:
+    """Kill the program with all that it started, and release its pipes."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=5.0)
+    for stream in (process.stdin, process.stdout, process.stderr):
+        if stream is not None:
+            with contextlib.suppress(OSError):
+                stream.close()

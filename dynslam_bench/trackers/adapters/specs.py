@@ -1,0 +1,114 @@
+"""Specs of the control trackers and of the adapters to foreign systems; imports neither torch nor OpenCV."""
+
+from __future__ import annotations
+
+from dynslam_bench.trackers.protocol import TrackerSpec
+
+from .settings import (
+    ConstantVelocitySettings,
+    Open3dOdometrySettings,
+    OpenCvOdometrySettings,
+    OrbSlam3Settings,
+    ReplaySettings,
+    SubprocessSettings,
+)
+
+_HERE = "dynslam_bench.trackers.adapters"
+
+NEVER_MOVE = TrackerSpec(
+    id="never-move",
+    entry_point=f"{_HERE}.never_move:NeverMove",
+    label="never move",
+    summary="Control: claims that the camera stands still, on every frame.",
+    provenance="control",
+    license="MIT",
+    remarks="Its error is the spread of the ground truth; a tracker above it is worse than none.",
+)
+
+CONSTANT_VELOCITY = TrackerSpec(
+    id="constant-velocity",
+    entry_point=f"{_HERE}.constant_velocity:ConstantVelocity",
+    label="constant velocity",
+    settings=ConstantVelocitySettings,
+    summary="Control: measures the camera's velocity over the first frames, then only extrapolates it.",
+    provenance="control",
+    license="MIT",
+    remarks="The motion model of a SLAM system without its measurements; drifts without bound.",
+)
+
+REPLAY = TrackerSpec(
+    id="replay",
+    entry_point=f"{_HERE}.replay:Replay",
+    label="replay",
+    settings=ReplaySettings,
+    summary="Gives each frame its pose in a trajectory file (TUM format): replay:FILE.",
+    provenance="external",
+    parameter="file",
+    remarks="A frame without a pose within the tolerance is lost; frame times mean nothing.",
+)
+
+SUBPROCESS = TrackerSpec(
+    id="subprocess",
+    entry_point=f"{_HERE}.subprocess_tracker:build",
+    label="program",
+    settings=SubprocessSettings,
+    summary="A tracker in a program of its own, in any language, over JSON lines: subprocess:COMMAND.",
+    deterministic=False,
+    provenance="external",
+    parameter="command",
+    remarks="Change the setting `version` when the program changes, or stored runs of the old one are reused.",
+)
+
+ORBSLAM3 = TrackerSpec(
+    id="orbslam3",
+    entry_point=f"{_HERE}.orbslam3:OrbSlam3",
+    label="ORB-SLAM3",
+    settings=OrbSlam3Settings,
+    summary="The real ORB-SLAM3 (RGB-D), untouched, in a process of its own.",
+    deterministic=False,
+    provenance="external",
+    license="GPL-3.0-only",
+    citation=(
+        "C. Campos, R. Elvira, J. J. Gomez Rodriguez, J. M. M. Montiel, J. D. Tardos, ORB-SLAM3: An Accurate "
+        "Open-Source Library for Visual, Visual-Inertial, and Multimap SLAM, IEEE T-RO 37(6), 2021"
+    ),
+    requires={"pyorbslam3": "pip install 'dynslam-bench[orbslam3]' (Linux x86-64)"},
+    remarks=(
+        "Assumes a static world and marks nothing as lost on dynamic scenes: it follows the people, coverage 100 %. "
+        "After a real loss it starts a new map with an origin of its own; its poses are taken as they come. Runs three "
+        "threads of its own whatever --threads says, so two runs of one seed differ. Needs an ORB vocabulary: "
+        "--set vocabulary=FILE or $DYNSLAM_BENCH_ORB_VOCABULARY."
+    ),
+)
+
+OPENCV_ODOMETRY = TrackerSpec(
+    id="opencv-odometry",
+    entry_point=f"{_HERE}.opencv_odometry:build",
+    label="OpenCV RGB-D odometry",
+    settings=OpenCvOdometrySettings,
+    summary="OpenCV's dense frame-to-frame RGB-D odometry.",
+    provenance="external",
+    license="Apache-2.0",
+    citation="F. Steinbruecker, J. Sturm, D. Cremers, Real-time visual odometry from dense RGB-D images, ICCV-W 2011",
+    requires={"cv2": "pip install opencv-python-headless"},
+    check=f"{_HERE}.opencv_odometry:unavailable",
+    remarks="No map and no loop closing: it drifts. Assumes a static world.",
+)
+
+OPEN3D_ODOMETRY = TrackerSpec(
+    id="open3d-odometry",
+    entry_point=f"{_HERE}.open3d_odometry:Open3dOdometry",
+    label="Open3D RGB-D odometry",
+    settings=Open3dOdometrySettings,
+    summary="Open3D's dense multi-scale frame-to-frame RGB-D odometry.",
+    provenance="external",
+    license="MIT",
+    citation="Q.-Y. Zhou, J. Park, V. Koltun, Open3D: A modern library for 3D data processing, arXiv:1801.09847",
+    requires={"open3d": "pip install 'dynslam-bench[open3d]'"},
+    remarks="No map and no loop closing: it drifts. Assumes a static world.",
+)
+
+
+def adapter_specs() -> list[TrackerSpec]:
+    """The control trackers and the adapters."""
+    return [NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, ORBSLAM3, OPENCV_ODOMETRY, OPEN3D_ODOMETRY]

@@ -1,0 +1,199 @@
+"""A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol)."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from dynslam_bench.core.errors import DynslamError, TrackerError
+from dynslam_bench.core.seeding import derive_seed
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.slam.result import TrackingState, TrackResult
+from dynslam_bench.trackers.protocol import TrackerContext
+
+from .exchange import ImageExchange
+from .program import Program
+from .settings import ProgramSettings, SubprocessSettings
+
+PROTOCOL = 1
+
+
+class ProgramTracker:
+    """Drives a `Program` through one sequence after the other; each `reset` starts it afresh.
+
+    Args:
+        name: For messages.
+        settings: Time limits and the way of the images.
+        context: Where it runs.
+        command: Program and arguments.
+        folder: Its working folder; None for the current one.
+        environment: Variables to set beside the inherited ones.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: ProgramSettings,
+        context: TrackerContext,
+        command: Sequence[str],
+        *,
+        folder: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name, self.limits, self.context = name, settings, context
+        self._command, self._folder, self._environment = list(command), folder, dict(environment or {})
+        self._program: Program | None = None
+        self._exchange: ImageExchange | None = None
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Start the program and tell it the camera.
+
+        Raises:
+            TrackerError: It cannot be started, dies, refuses, or does not answer in time.
+        """
+        self.close()
+        seed = derive_seed(rng)
+        threads = str(self.context.threads)
+        limits = {name: threads for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        self._exchange = ImageExchange(camera, self.limits.images)
+        self._program = Program(
+            self.name, self._command, folder=self._folder, environment={**limits, **self._environment}
+        )
+        request = {
+            "op": "reset",
+            "protocol": PROTOCOL,
+            "camera": {
+                "width": camera.width, "height": camera.height,
+                "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+                "distortion": list(camera.distortion), "baseline_m": camera.baseline_m, "fps": self.context.fps,
+            },
+            "images": self._exchange.announce(),
+            "seed": seed,
+            "threads": self.context.threads,
+            "device": self.context.device,
+            "sequence": self.context.sequence_id,
+            "options": self.options(camera, self._exchange.folder),
+        }  # fmt: skip
+        try:
+            self._program.ask(request, self.limits.start_timeout_s, "at reset")
+        except DynslamError:
+            self.close()
+            raise
+
+    def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
+        """What else the program is told at ``reset``; `folder` is a private one that lives as long as the sequence."""
+        return {}
+
+    def track(self, frame: Frame) -> TrackResult:
+        """Hand over one frame and wait for its pose.
+
+        ``timings`` are those that the program states, with the rest of the time as ``transfer``.
+
+        Raises:
+            TrackerError: It dies, hangs, or answers what is no pose.
+        """
+        program, exchange = self._running()
+        start = time.perf_counter()
+        doing = f"at frame {frame.index}"
+        images = exchange.put(frame)
+        request = {"op": "track", "index": frame.index, "timestamp": frame.timestamp, **images}
+        answer = program.ask(request, self.limits.frame_timeout_s, doing)
+        state = answer.get("state")
+        if state not in get_args(TrackingState):
+            known = ", ".join(get_args(TrackingState))
+            raise TrackerError(f"{self.name} {doing}: answered state {state!r}", f"known: {known}")
+        pose = self._pose(answer.get("T_world_cam"), doing)
+        if pose is None and state == "ok":
+            raise TrackerError(f"{self.name} {doing}: answered state 'ok' without T_world_cam")
+        stats = self._numbers(answer.get("stats"), "stats", doing)
+        timings = self._numbers(answer.get("timings"), "timings", doing)
+        timings["transfer"] = max(0.0, time.perf_counter() - start - sum(timings.values()))
+        return TrackResult(pose, cast(TrackingState, state), stats, timings)
+
+    def close(self) -> None:
+        """End the program (killed if it does not end by itself) and remove the exchanged files."""
+        if self._program is not None:
+            self._program.close(self.limits.close_timeout_s)
+            self._program = None
+        if self._exchange is not None:
+            self._exchange.close()
+            self._exchange = None
+
+    def _running(self) -> tuple[Program, ImageExchange]:
+        if self._program is None or self._exchange is None:
+            raise TrackerError(f"{self.name} was used before reset() or after close()")
+        return self._program, self._exchange
+
+    def _pose(self, value: Any, doing: str) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+        if value is None:
+            return None
+        try:
+            pose = np.asarray(value, dtype=np.float64).reshape(4, 4)
+        except (TypeError, ValueError):
+            raise TrackerError(
+                f"{self.name} {doing}: T_world_cam is not 16 numbers: {str(value)[:80]}", "row by row, camera to world"
+            ) from None
+        if not se3.is_pose(pose):
+            raise TrackerError(f"{self.name} {doing}: T_world_cam is no rigid pose: {pose.tolist()}")
+        return pose
+
+    def _numbers(self, value: Any, what: str, doing: str) -> dict[str, float]:
+        try:
+            return {str(key): float(number) for key, number in (value or {}).items()}
+        except (AttributeError, TypeError, ValueError):
+            raise TrackerError(f"{self.name} {doing}: {what} is not an object of numbers: {str(value)[:80]}") from None
+
+
+class FinalizingProgramTracker(ProgramTracker):
+    """A program that also answers ``finalize``."""
+
+    def finalize(self) -> Trajectory:
+        """The program's final trajectory; rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``, camera to world.
+
+        Raises:
+            TrackerError: It dies, hangs, or answers what is no trajectory.
+        """
+        program, _ = self._running()
+        answer = program.ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
+        try:
+            rows = np.asarray(answer.get("trajectory"), dtype=np.float64).reshape(-1, 8)
+            norms = np.linalg.norm(rows[:, 4:], axis=1)
+            if not (np.abs(norms - 1) < 1e-3).all():  # also catches NaN
+                raise TrackerError(
+                    f"{self.name} at finalize: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:g}"
+                )
+            return Trajectory(rows[:, 0], se3.from_quaternion(rows[:, 1:4], rows[:, 4:]))
+        except (TypeError, ValueError):
+            raise TrackerError(
+                f"{self.name} at finalize: 'trajectory' is not a list of rows of 8 numbers",
+                "timestamp tx ty tz qx qy qz qw",
+            ) from None
+        except DynslamError as error:
+            raise TrackerError(f"{self.name} at finalize: {error}") from error
+
+
+def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTracker:
+    """The tracker of ``subprocess:COMMAND``.
+
+    Raises:
+        TrackerError: No command was given, its quotes do not match, or its folder does not exist.
+    """
+    try:
+        command = shlex.split(settings.command)
+    except ValueError as error:
+        raise TrackerError(f"subprocess: cannot split the command '{settings.command}': {error}") from None
+    if not command:
+        raise TrackerError("subprocess needs a command", "write 'subprocess:PROGRAM ARGUMENTS' or --set command=...")
+    folder = Path(settings.folder).expanduser() if settings.folder else None
+    if folder is not None and not folder.is_dir():
+        raise TrackerError(f"subprocess: no folder {folder}")
+    kind = FinalizingProgramTracker if settings.final else ProgramTracker
+    return kind(Path(command[0]).name, settings, context, command, folder=folder)

@@ -1,0 +1,113 @@
+"""The DBoW2 text vocabulary that ORB-SLAM3 needs: found, decompressed into the cache, and checked before it is loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import lzma
+import os
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.records import write_atomic
+from dynslam_bench.sequences.roots import user_cache
+
+ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
+HINT = (
+    f"name ORBvoc.txt of the ORB-SLAM3 repository (or any ORB vocabulary in DBoW2's text format, .txt or .txt.xz) "
+    f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
+)
+TOKENS = 35  # parent, whether it is a leaf, 32 bytes of the descriptor, weight
+
+
+def find_vocabulary(setting: str) -> Path:
+    """The vocabulary as a checked ``.txt`` file.
+
+    Args:
+        setting: Path of a ``.txt`` or ``.txt.xz`` file; empty for the environment variable's.
+
+    Raises:
+        TrackerError: None is named, it is missing, cannot be read, or is no complete vocabulary.
+    """
+    named = setting.strip() or os.environ.get(ENVIRONMENT_VARIABLE, "").strip()
+    if not named:
+        raise TrackerError("orbslam3 needs an ORB vocabulary and none is named", HINT)
+    path = Path(named).expanduser().absolute()
+    if not path.is_file():
+        raise TrackerError(f"orbslam3: no vocabulary file {path}", HINT)
+    try:
+        stamp = path.stat()
+        return _prepared(path, stamp.st_size, stamp.st_mtime_ns)
+    except OSError as error:
+        raise TrackerError(f"orbslam3: cannot read the vocabulary {path}: {error.strerror}", HINT) from error
+
+
+@lru_cache(maxsize=8)
+def _prepared(path: Path, size: int, modified_ns: int) -> Path:
+    """Decompress if need be, check; once in a process as long as the file's size and time stay."""
+    if path.suffix != ".xz":
+        _check(path.read_bytes(), path)
+        return path
+    packed = path.read_bytes()
+    target = user_cache() / "vocabularies" / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
+    if target.is_file():
+        _check(target.read_bytes(), target)
+        return target
+    try:
+        text = lzma.decompress(packed)
+    except (lzma.LZMAError, EOFError) as error:
+        raise TrackerError(
+            f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file: {error}", HINT
+        ) from None
+    _check(text, path)
+    write_atomic(target, text)
+    return target
+
+
+def _check(text: bytes, path: Path) -> None:
+    """Whether the text is a complete vocabulary; its own loader would run on with whatever it finds.
+
+    Raises:
+        TrackerError: Names the first line that is wrong.
+    """
+    lines = text.splitlines()
+    header = lines[0].split() if lines else []
+    try:
+        branching, depth, _, _ = map(int, header)
+        fits = 2 <= branching <= 20 and 1 <= depth <= 10
+    except ValueError:
+        fits = False
+    if not fits:
+        shown = b" ".join(header)[:40].decode(errors="replace")
+        raise TrackerError(
+            f"orbslam3: {path} is no ORB vocabulary: line 1 is '{shown}', not '<branching> <depth> <score> <weight>'",
+            HINT,
+        )
+    nodes = lines[1:]
+    while nodes and not nodes[-1].strip():
+        nodes.pop()
+    fault = _first_fault(nodes)
+    if fault:
+        raise TrackerError(f"orbslam3: the vocabulary {path} ({len(lines)} lines) is damaged: {fault}", HINT)
+
+
+def _first_fault(nodes: Iterable[bytes]) -> str:
+    """What is wrong with the tree, or an empty string; node 0 is the root, node i stands in line i + 1."""
+    childless = {0}
+    leaves = 0
+    for node, line in enumerate(nodes, start=1):
+        tokens = line.split()
+        if len(tokens) != TOKENS or not b"".join(tokens[:-1]).isdigit():
+            return f"line {node + 1} is not a node of {TOKENS} numbers"
+        parent = int(tokens[0])
+        if parent >= node:
+            return f"line {node + 1} names parent {parent}, which has not come yet"
+        childless.discard(parent)
+        if tokens[1] == b"0":
+            childless.add(node)
+        else:
+            leaves += 1
+    if childless:
+        return f"{len(childless)} inner nodes have no children, as if its end were missing"
+    return "" if leaves else "it has no words"
