@@ -1,0 +1,116 @@
+"""Steering a tracker's online settings with a normalised action."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import SettingsError, did_you_mean
+from dynslam_bench.core.settings import Parameter, Scalar, Settings, apply_overrides, flatten, parameters
+
+
+class ActionMap:
+    """Maps actions to settings.
+
+    Without steered settings the action space is ``Discrete(1)``: the only action lets the tracker be. Otherwise it is
+    ``Box(-1, 1, (k,), float32)``, one coordinate a setting, in the order of `control`. With ``u = (a + 1) / 2``:
+
+    - float: ``low + u * (high - low)``, or ``low * (high / low) ** u`` on a log scale;
+    - int: the same, rounded to the nearest integer;
+    - bool and categorical: the ``floor(u * n)``-th of the n choices, each with an equal share of the axis.
+
+    Args:
+        settings: The settings of the episode; what is not steered stays as it is here.
+        control: Dotted names of online settings.
+
+    Raises:
+        SettingsError: A name is unknown, given twice, or its setting may not change in mid-episode.
+    """
+
+    def __init__(self, settings: Settings, control: Sequence[str]) -> None:
+        self.base = settings
+        self.parameters: tuple[Parameter, ...] = _select(settings, control)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Dotted names of the steered settings, in the order of the action's coordinates."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def space(self) -> spaces.Space[NDArray[np.float32]] | spaces.Discrete:
+        """The action space."""
+        if not self.parameters:
+            return spaces.Discrete(1)
+        return spaces.Box(-1.0, 1.0, (len(self.parameters),), np.float32)
+
+    def settings(self, action: object) -> Settings:
+        """The settings that an action asks for.
+
+        Args:
+            action: float ``[k]``; values beyond [-1, 1] are clipped.
+
+        Raises:
+            SettingsError: The action has the wrong shape or holds NaN.
+        """
+        if not self.parameters:
+            return self.base
+        return apply_overrides(self.base, self.values(action))
+
+    def values(self, action: object) -> dict[str, Scalar]:
+        """Dotted name to value of the steered settings under an action."""
+        vector = np.asarray(action, dtype=np.float64)
+        if vector.shape != (len(self.parameters),):
+            raise SettingsError(
+                f"the action has shape {vector.shape}, {len(self.parameters)} settings are steered: {self.names}"
+            )
+        if np.isnan(vector).any():
+            raise SettingsError(f"the action holds NaN: {vector.tolist()}")
+        shares = (np.clip(vector, -1.0, 1.0) + 1.0) / 2.0
+        return {p.name: _decode(p, float(u)) for p, u in zip(self.parameters, shares, strict=True)}
+
+    def encode(self, settings: Settings) -> NDArray[np.float32]:
+        """The action ``[k]`` that asks for given settings; values beyond the search range are clipped to its ends."""
+        flat = flatten(settings)
+        shares = [_encode(p, flat[p.name]) for p in self.parameters]
+        return np.asarray(np.clip(2.0 * np.array(shares, dtype=np.float64) - 1.0, -1.0, 1.0), dtype=np.float32)
+
+
+def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
+    if isinstance(control, str):
+        raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
+    tunable = {parameter.name: parameter for parameter in parameters(type(settings))}
+    online = {name: parameter for name, parameter in tunable.items() if parameter.online}
+    chosen = []
+    for name in control:
+        if name not in online:
+            if name in tunable or name in flatten(settings):
+                raise SettingsError(f"setting '{name}' may not change in mid-episode", did_you_mean(name, online))
+            hint = did_you_mean(name, online) or "this tracker has no online settings"
+            raise SettingsError(f"unknown setting '{name}' in control", hint)
+        if online[name] in chosen:
+            raise SettingsError(f"setting '{name}' is given twice in control")
+        chosen.append(online[name])
+    return tuple(chosen)
+
+
+def _decode(parameter: Parameter, share: float) -> Scalar:
+    if parameter.kind in ("bool", "categorical"):
+        return parameter.choices[min(int(share * len(parameter.choices)), len(parameter.choices) - 1)]
+    assert parameter.low is not None and parameter.high is not None
+    low, high = float(parameter.low), float(parameter.high)
+    value = low * (high / low) ** share if parameter.scale == "log" else low + share * (high - low)
+    value = min(max(value, low), high)  # rounding may carry a power a hair beyond its end
+    return round(value) if parameter.kind == "int" else value
+
+
+def _encode(parameter: Parameter, value: Scalar) -> float:
+    if parameter.kind in ("bool", "categorical"):
+        return (parameter.choices.index(value) + 0.5) / len(parameter.choices)
+    assert parameter.low is not None and parameter.high is not None
+    low, high, x = float(parameter.low), float(parameter.high), float(value)
+    if parameter.scale == "log":
+        return math.log(max(x, low) / low) / math.log(high / low)
+    return (x - low) / (high - low)

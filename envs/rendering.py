@@ -1,0 +1,213 @@
+"""The picture of one frame: features and masks on the image, the trajectory from above, and a line of numbers."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.geometry import se3
+from dynslam_bench.sequences.frame import Frame, Sequence
+from dynslam_bench.slam.result import TrackResult
+
+from .episode import Episode
+
+Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
+
+HEIGHT = 480
+STRIP = 64
+KEPT = (60, 220, 60)
+CULLED = (235, 50, 50)
+MASK = (255, 120, 0)
+TRUTH = (90, 90, 90)
+TRUTH_AHEAD = (205, 205, 205)
+ESTIMATE = (20, 90, 220)
+_INK = (30, 30, 30)
+_PAPER = (250, 250, 250)
+_STATE_COLOUR = {"ok": (30, 140, 30), "lost": (200, 30, 30), "initialising": (190, 120, 0), "dropped": (120, 120, 120)}
+
+
+class Canvas:
+    """Draws the frames of one episode; all pictures of a sequence have the same even size, as video encoders want.
+
+    Left: the image the tracker saw, with kept features in green, culled ones in red and the dynamic mask in orange.
+    Right: the estimated camera centres (blue) over the ground truth (grey), both in the first camera's frame, seen from
+    above: x to the right, z (forward) up, with a scale bar. Below: state, counts and errors.
+
+    Args:
+        sequence: The sequence of the episode.
+        label: Name of the tracker.
+    """
+
+    def __init__(self, sequence: Sequence, label: str) -> None:
+        camera = sequence.camera
+        self._scale = HEIGHT / camera.height
+        self._width = 2 * round(camera.width * self._scale / 2)
+        self._title = f"{label}  |  {sequence.id}"
+        self._frames = len(sequence)
+        self._truth = _truth_from_first(sequence)
+        self._plan = _Plan(self._truth)
+
+    def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
+        """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
+        picture = self._picture(frame, result)
+        plot = self._plan.draw(episode, self._truth)
+        body = np.concatenate([picture, plot], axis=1)
+        return np.concatenate([body, self._strip(result, episode, body.shape[1])], axis=0)
+
+    def _picture(self, frame: Frame, result: TrackResult) -> Image:
+        image = np.array(frame.rgb, dtype=np.uint8)
+        if result.dynamic_mask is not None and result.dynamic_mask.any():
+            mask = np.asarray(result.dynamic_mask, dtype=bool)
+            image[mask] = (0.6 * image[mask] + 0.4 * np.array(MASK)).astype(np.uint8)
+            outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+            cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
+        image = np.asarray(cv2.resize(image, (self._width, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if result.keypoints_xy is not None:
+            points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
+            kept = result.keypoints_keep
+            kept = np.ones(len(points), bool) if kept is None else np.asarray(kept, dtype=bool)
+            for flag, colour in ((True, KEPT), (False, CULLED)):
+                for x, y in (points[kept == flag] * self._scale).round().astype(int).tolist():
+                    cv2.circle(image, (x, y), 2, colour, -1, cv2.LINE_AA)
+        return image
+
+    def _strip(self, result: TrackResult, episode: Episode, width: int) -> Image:
+        strip = np.full((STRIP, width, 3), 235, np.uint8)
+        last = episode.outcomes[-1]
+        _text(strip, self._title, (10, 24), _INK, 0.5)
+        state = str(last.state)
+        _text(strip, state, (10, 50), _STATE_COLOUR[state], 0.5, 2)
+        stats = result.stats
+        parts = [f"frame {last.index + 1}/{self._frames}", f"t {last.timestamp - episode.outcomes[0].timestamp:.2f} s"]
+        for key, name in (("keypoints", "features"), ("culled", "culled"), ("inliers", "inliers"), ("keyframes", "kf")):
+            if key in stats:
+                parts.append(f"{name} {stats[key]:.0f}")
+        if last.error is not None:
+            parts.append(f"pose error {100 * last.error.trans_m:.1f} cm, {last.error.rot_deg:.2f} deg")
+            if last.error.frame_trans_m is not None:
+                parts.append(f"frame error {1000 * last.error.frame_trans_m:.1f} mm")
+        else:
+            parts.append("no ground truth here")
+        _text(strip, "   ".join(parts), (130, 50), _INK, 0.45)
+        x = width - 470
+        for name, colour in (("kept", KEPT), ("culled", CULLED), ("mask", MASK)):
+            cv2.circle(strip, (x, 19), 5, colour, -1, cv2.LINE_AA)
+            _text(strip, name, (x + 10, 24), _INK, 0.45)
+            x += 75
+        for name, colour in (("estimate", ESTIMATE), ("ground truth", TRUTH)):
+            cv2.line(strip, (x, 19), (x + 20, 19), colour, 3, cv2.LINE_AA)
+            _text(strip, name, (x + 26, 24), _INK, 0.45)
+            x += 110
+        return strip
+
+
+class _Plan:
+    """A square map of the trajectory seen from above."""
+
+    def __init__(self, truth: dict[int, Array]) -> None:
+        self._known = np.array([pose[[0, 2], 3] for _, pose in sorted(truth.items())]).reshape(-1, 2)
+
+    def draw(self, episode: Episode, truth: dict[int, Array]) -> Image:
+        plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
+        estimate, runs = _estimate_from_first(episode, truth)
+        to_pixel, metres_a_pixel = self._view(estimate)
+        _grid(plot, to_pixel, metres_a_pixel)
+        if len(self._known) > 1:
+            _polyline(plot, to_pixel(self._known), TRUTH_AHEAD, 1)
+        now = episode.outcomes[-1].index
+        seen = np.array([pose[[0, 2], 3] for index, pose in sorted(truth.items()) if index <= now]).reshape(-1, 2)
+        if len(seen) > 1:
+            _polyline(plot, to_pixel(seen), TRUTH, 2)
+        for run in runs:
+            _polyline(plot, to_pixel(estimate[run]), ESTIMATE, 2)
+        if len(estimate):
+            x, y = to_pixel(estimate[-1:])[0].round().astype(int).tolist()
+            cv2.circle(plot, (x, y), 5, ESTIMATE, -1, cv2.LINE_AA)
+        _scale_bar(plot, metres_a_pixel)
+        cv2.rectangle(plot, (0, 0), (HEIGHT - 1, HEIGHT - 1), (200, 200, 200), 1)
+        return plot
+
+    def _view(self, estimate: Array) -> tuple[_ToPixel, float]:
+        points = np.concatenate([self._known, estimate, np.zeros((1, 2))])
+        low, high = points.min(axis=0), points.max(axis=0)
+        extent = max(float((high - low).max()), 0.1)
+        metres_a_pixel = extent / (HEIGHT - 120)
+        return _ToPixel((low + high) / 2, metres_a_pixel), metres_a_pixel
+
+
+class _ToPixel:
+    def __init__(self, centre: Array, metres_a_pixel: float) -> None:
+        self.centre, self.metres_a_pixel = centre, metres_a_pixel
+
+    def __call__(self, points: Array) -> Array:
+        offset = (np.asarray(points).reshape(-1, 2) - self.centre) / self.metres_a_pixel
+        return np.stack([HEIGHT / 2 + offset[:, 0], HEIGHT / 2 - offset[:, 1]], axis=1)
+
+
+def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
+    """Ground truth of the frames, in the frame of the first of them."""
+    errors = OnlineError(sequence.ground_truth)
+    poses = {i: errors.truth_at(float(stamp)) for i, stamp in enumerate(sequence.timestamps)}
+    known = {i: pose for i, pose in poses.items() if pose is not None}
+    if not known:
+        return {}
+    origin = se3.inverse(known[min(known)])
+    return {i: origin @ pose for i, pose in known.items()}
+
+
+def _estimate_from_first(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice]]:
+    """Estimated centres (x, z), joined to the truth at the first frame that has both, and runs without a gap."""
+    tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
+    if not tracked:
+        return np.zeros((0, 2)), []
+    both = [(index, pose) for index, pose in tracked if index in truth]
+    join = truth[both[0][0]] @ se3.inverse(both[0][1]) if both else se3.inverse(tracked[0][1])
+    points = np.array([(join @ pose)[[0, 2], 3] for _, pose in tracked])
+    breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
+    bounds = [0, *breaks.tolist(), len(points)]
+    return points, [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+
+
+def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:
+    fixed = np.clip(points * 16, -(2**20), 2**20).round().astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(image, [fixed], False, colour, thickness, cv2.LINE_AA, 4)
+
+
+def _nice_length(metres: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten that is not above `metres`."""
+    power = 10.0 ** np.floor(np.log10(metres))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= metres * (1 + 1e-9)))
+
+
+def _grid(plot: Image, to_pixel: _ToPixel, metres_a_pixel: float) -> None:
+    step = _nice_length(metres_a_pixel * HEIGHT / 4)
+    half = HEIGHT / 2 * metres_a_pixel
+    for axis in (0, 1):
+        first = np.ceil((to_pixel.centre[axis] - half) / step) * step
+        for value in np.arange(first, to_pixel.centre[axis] + half, step):
+            point = np.array(to_pixel.centre, dtype=np.float64)
+            point[axis] = value
+            at = round(float(to_pixel(point)[0][axis]))
+            start, end = ((at, 0), (at, HEIGHT)) if axis == 0 else ((0, at), (HEIGHT, at))
+            cv2.line(plot, start, end, (232, 232, 232), 1)
+
+
+def _scale_bar(plot: Image, metres_a_pixel: float) -> None:
+    length = _nice_length(metres_a_pixel * 140)
+    pixels = round(length / metres_a_pixel)
+    y = HEIGHT - 18
+    cv2.line(plot, (16, y), (16 + pixels, y), _INK, 2)
+    for x in (16, 16 + pixels):
+        cv2.line(plot, (x, y - 4), (x, y + 4), _INK, 2)
+    name = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    _text(plot, name, (16, y - 10), _INK, 0.45)
+    _text(plot, "from above: x right, z up", (HEIGHT - 190, y + 5), (120, 120, 120), 0.42)
+
+
+def _text(
+    image: Image, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float, thickness: int = 1
+) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)

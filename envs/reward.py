@@ -1,0 +1,36 @@
+"""Named rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+from dynslam_bench.core.errors import SettingsError, did_you_mean
+from dynslam_bench.evaluation.online import OnlineSample
+
+RewardKind = Literal["neg_rpe", "neg_pose_error"]
+
+REWARDS: dict[str, Callable[[OnlineSample], float]] = {
+    "neg_rpe": lambda error: -(error.frame_trans_m or 0.0),
+    "neg_pose_error": lambda error: -error.trans_m,
+}
+"""Reward in metres of a frame that has ground truth, by name; other frames earn 0.
+
+- ``neg_rpe``: minus the translational error of the motion since the previous frame; needs no alignment and adds up.
+- ``neg_pose_error``: minus the causal translational pose error.
+
+A frame without a tracked pose earns what not moving would (see `OnlineError`). The sum over an episode is not the ATE,
+which the last step's ``episode_metrics`` give under the protocol.
+"""
+
+
+def reward_named(name: str) -> Callable[[OnlineSample | None], float]:
+    """The reward of a name, as a function of a frame's error (None where there is no ground truth).
+
+    Raises:
+        SettingsError: There is none of that name.
+    """
+    if name not in REWARDS:
+        raise SettingsError(f"unknown reward '{name}'", did_you_mean(name, REWARDS))
+    of_sample = REWARDS[name]
+    return lambda error: 0.0 if error is None else of_sample(error)

@@ -1,0 +1,414 @@
+"""The Gymnasium environment: one sequence is one episode, one step runs a whole tracker on one frame."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.seeding import derive_seed
+from dynslam_bench.core.settings import Settings, apply_overrides
+from dynslam_bench.evaluation.online import OnlineError, OnlineSample
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.sequences.frame import Sequence as FrameSequence
+from dynslam_bench.trackers.protocol import Tracker, TrackerContext, TrackerSpec
+from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
+
+from .contract import check_result, check_trajectory
+from .control import ActionMap
+from .device import resolve_device
+from .episode import Episode, FrameOutcome
+from .metrics import episode_metrics
+from .observation import (
+    ObservationContext,
+    ObservationKind,
+    rgbd_observation,
+    rgbd_space,
+    stats_observation,
+    stats_space,
+)
+from .reward import RewardKind, reward_named
+from .source import Frames, open_frames
+
+FrameTransform = Callable[[Frame], Frame]
+Array = NDArray[np.float64]
+
+
+class SlamEnv(gym.Env[Any, Any], EzPickle):
+    """Visual SLAM on one sequence as an environment.
+
+    `reset` tracks frame 0; every `step` runs the full pipeline on the next frame, so an episode of a sequence with N
+    frames has N - 1 steps. All randomness of the tracker comes from the environment's seed.
+
+    **Action.** ``Discrete(1)`` without `control` (pure evaluation); otherwise ``Box(-1, 1, (k,))`` over the named
+    online settings (see `ActionMap`), in force from the frame of the step on; an episode begins with `settings`.
+    The tracker then needs a method ``update_settings(settings)``, which takes the complete settings, of which only
+    online fields differ from those it was built with.
+
+    **Observation.** ``stats``: float32 ``[24]`` (see `observation.STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
+    ``depth`` and ``stats``. Neither holds anything of the ground truth.
+
+    **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`); frames without a tracked pose, and
+    all remaining ones when `lost_after` ends an episode, cost the error of not moving (see `OnlineError`).
+
+    **Info**: ``frame_index``, ``timestamp``, ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the
+    tracker's diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames;
+    ``pose_error_trans_m`` and ``pose_error_rot_deg`` (cumulative, causal: not an ATE), ``frame_error_trans_m`` and
+    ``frame_error_rot_deg`` (motion since the previous frame) where there is ground truth. The last step adds
+    ``episode_metrics`` under the protocol named by ``protocol``. What is not defined is left out, never NaN. Wall-clock
+    times are no part of it: see `timings`.
+
+    **End**: ``truncated`` at the end of the sequence, ``terminated`` after `lost_after` lost frames in a row.
+
+    Args:
+        sequence: Id, path of a folder in TUM layout, or an opened sequence.
+        tracker: Id, ``id:value``, ``module:Attr``, ``file.py:Attr``, or a spec.
+        settings: Overrides of the tracker's settings by dotted name, or its complete settings.
+        control: Dotted names of the online settings that actions steer.
+        observation: ``stats`` or ``rgbd``.
+        reward: ``neg_rpe`` or ``neg_pose_error``.
+        protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and ground truth.
+        frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
+        stride: Take every so many frames.
+        lost_after: End the episode after so many lost frames in a row; None never.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        render_mode: ``rgb_array`` or None.
+        data_root: Folder of the recorded sequences; None for the default one.
+        camera: Name or file of the camera for folders that do not say theirs; None to read it from the folder.
+        threads: Threads that the tracker may use.
+
+    Raises:
+        DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+    def __init__(
+        self,
+        sequence: str | FrameSequence,
+        tracker: str | TrackerSpec = "emfoa-oft",
+        *,
+        settings: Mapping[str, Any] | Settings | None = None,
+        control: Sequence[str] = (),
+        observation: ObservationKind = "stats",
+        reward: RewardKind = "neg_rpe",
+        protocol: str | Protocol = "tum-rgbd/v1",
+        frames: Frames = None,
+        stride: int = 1,
+        lost_after: int | None = None,
+        device: str = "auto",
+        render_mode: str | None = None,
+        data_root: str | Path | None = None,
+        camera: str | Path | None = None,
+        threads: int = 1,
+    ) -> None:
+        EzPickle.__init__(
+            self, sequence, tracker, settings=settings, control=control, observation=observation, reward=reward,
+            protocol=protocol, frames=frames, stride=stride, lost_after=lost_after, device=device,
+            render_mode=render_mode, data_root=data_root, camera=camera, threads=threads,
+        )  # fmt: skip
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise SettingsError(f"unknown render mode '{render_mode}'", "known: rgb_array")
+        if observation not in ("stats", "rgbd"):
+            raise SettingsError(f"unknown observation '{observation}'", "known: stats, rgbd")
+        if lost_after is not None and lost_after < 1:
+            raise SettingsError(f"lost_after is {lost_after}", "give a number of frames >= 1, or None")
+        if threads < 1:
+            raise SettingsError(f"threads is {threads}", "give a number >= 1")
+        self.render_mode = render_mode
+        self.protocol = get_protocol(protocol)
+        self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
+        self.frame_transforms: list[FrameTransform] = []
+        """Applied in order to every frame before the tracker sees it; wrappers add to it."""
+        self._observation: ObservationKind = observation
+        self._reward = reward_named(reward)
+        self._lost_after = lost_after
+        self._device = resolve_device(device)
+        self._threads = threads
+        self._open = lambda name: open_frames(name, data_root, camera, frames, stride)
+        self._control = tuple(control) if not isinstance(control, str) else control
+        self._tracker: Tracker | None = None
+        self._tracker_key: object = None
+        self._use_settings(settings)
+        self._use_sequence(sequence)
+        self.action_space = self._actions.space()
+        self.observation_space = (
+            stats_space() if observation == "stats" else rgbd_space(self.sequence.camera)
+        )  # fmt: skip
+        self.episode = Episode()
+        self._canvas: Any = None
+
+    # -- what users and runs look at -------------------------------------------------------------------------------
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Dotted names of the steered settings, in the order of the action's coordinates."""
+        return self._actions.names
+
+    @property
+    def neutral_action(self) -> Any:
+        """The action that keeps the settings the episode begins with."""
+        return self._actions.encode(self.settings) if self._actions.parameters else 0
+
+    @property
+    def timings(self) -> list[dict[str, float]]:
+        """Seconds by stage of every frame so far: ``read``, ``total`` and the tracker's stages (see `FrameOutcome`)."""
+        return [dict(outcome.timings) for outcome in self.episode.outcomes]
+
+    def online_trajectory(self) -> Trajectory:
+        """Poses of the frames that were tracked, each as it was when the frame came."""
+        return self.episode.trajectory()
+
+    def final_trajectory(self) -> Trajectory | None:
+        """The tracker's trajectory after loop closing and final optimisation; None if it has no ``finalize``.
+
+        Raises:
+            TrackerContractError: ``finalize`` returned something else.
+        """
+        if self._final is None and self._tracker is not None and hasattr(self._tracker, "finalize"):
+            self._final = check_trajectory(self._tracker.finalize(), self.tracker_spec.id)
+        return self._final
+
+    def map_outputs(self) -> Any:
+        """The tracker's keyframes and map points (``slam.outputs.MapOutputs``); None if it offers none."""
+        outputs = getattr(self._tracker, "map_outputs", None)
+        return outputs() if outputs is not None else None
+
+    # -- Gymnasium -------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:  # fmt: skip
+        """Begin an episode and track frame 0.
+
+        Args:
+            seed: Seed of everything random; None goes on from the previous episode.
+            options: ``sequence`` and ``settings`` replace those of the constructor from this episode on.
+
+        Raises:
+            DynslamError: Unknown option, or a new sequence whose images do not fit the observation space.
+            TrackerError: The tracker cannot be built or broke its contract.
+        """
+        super().reset(seed=seed)
+        self._apply_options(options or {})
+        tracker = self._ready_tracker()
+        tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
+        if self._actions.parameters:
+            self._steer(tracker, self.settings)
+        self.episode = Episode()
+        self._errors = OnlineError(self.sequence.ground_truth, self.protocol.max_dt)
+        self._final: Trajectory | None = None
+        self._canvas = None
+        self._track_next(tracker)
+        return self._observe(), self._info()
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Track the next frame.
+
+        Raises:
+            DynslamError: `reset` was not called, or the episode is over.
+            SettingsError: The action does not fit the action space.
+            TrackerError: The tracker broke its contract.
+        """
+        tracker = self._running_tracker()
+        if self._actions.parameters:
+            self._steer(tracker, self._actions.settings(action))
+        self._track_next(tracker)
+        reward = self.episode.outcomes[-1].reward
+        terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
+        truncated = self.episode.next_index == len(self.sequence)
+        if terminated:
+            stamps = self.sequence.timestamps[self.episode.next_index :]
+            reward += sum(self._reward(self._errors.update(float(stamp), None, False)) for stamp in stamps)
+        self.episode.over = terminated or truncated
+        info = self._info()
+        if self.episode.over:
+            info["episode_metrics"] = self.episode_metrics()
+            info["protocol"] = self.protocol.id
+        return self._observe(), float(reward), terminated, truncated, info
+
+    def drop_frames(self, count: int) -> float:
+        """Let the next `count` frames pass without tracking them, as a camera does while the tracker is busy.
+
+        Dropped frames count as not tracked. The last frame of the sequence is never dropped.
+
+        Returns:
+            The sum of their rewards: each costs the error of not moving.
+
+        Raises:
+            DynslamError: The episode is not running, or fewer frames are left.
+        """
+        self._running_tracker()
+        left = len(self.sequence) - 1 - self.episode.next_index
+        if not 0 <= count <= left:
+            raise DynslamError(f"cannot drop {count} frames, {left} are left before the last one")
+        total = 0.0
+        for _ in range(count):
+            index = self.episode.next_index
+            stamp = float(self.sequence.timestamps[index])
+            error = self._errors.update(stamp, None, False)
+            reward = self._reward(error)
+            self.episode.add(FrameOutcome(index, stamp, "dropped", None, {}, {}, error, reward))
+            total += reward
+        return total
+
+    def episode_metrics(self) -> dict[str, float]:
+        """The metrics of the frames so far under the protocol; only ``coverage`` and counts without ground truth."""
+        final = self.final_trajectory() if self.protocol.trajectory == "final" else None
+        trajectory = final if final is not None else self.online_trajectory()
+        due = self.sequence.timestamps if self.episode.over else self.sequence.timestamps[: self.episode.next_index]
+        return episode_metrics(self.protocol, trajectory, self.episode.tracked, due, self.sequence.ground_truth)
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The current frame with its features and masks beside the trajectory, uint8 ``[H, W, 3]``."""
+        if self.render_mode is None:
+            gym.logger.warn("render() was called without a render mode: make the environment with 'rgb_array'")
+            return None
+        if not self.episode.outcomes:
+            raise DynslamError("render() was called before reset()")
+        if self._canvas is None:
+            from .rendering import Canvas
+
+            self._canvas = Canvas(self.sequence, self.tracker_spec.label)
+        image: NDArray[np.uint8] = self._canvas.draw(self.frame, self.result, self.episode)
+        return image
+
+    def close(self) -> None:
+        """Close the tracker; the environment may be reset again."""
+        tracker, self._tracker, self._tracker_key = self._tracker, None, None
+        if tracker is not None and hasattr(tracker, "close"):
+            tracker.close()
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
+        if isinstance(settings, Settings):
+            if not isinstance(settings, self.tracker_spec.settings):
+                raise SettingsError(
+                    f"tracker '{self.tracker_spec.id}' takes {self.tracker_spec.settings.__name__}, "
+                    f"not {type(settings).__name__}"
+                )
+            self.settings: Settings = settings
+        else:
+            self.settings = resolve_settings(self.tracker_spec, settings)
+        self._actions = ActionMap(self.settings, self._control)
+
+    def _use_sequence(self, sequence: str | FrameSequence) -> None:
+        opened = self._open(sequence)
+        if len(opened) < 2:
+            raise SequenceError(f"'{opened.id}' has {len(opened)} frames here, an episode needs 2 or more")
+        self.sequence = opened
+
+    def _apply_options(self, options: Mapping[str, Any]) -> None:
+        unknown = sorted(set(options) - {"sequence", "settings"})
+        if unknown:
+            raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
+        if "settings" in options:
+            changes = options["settings"]
+            self._use_settings(
+                changes if isinstance(changes, Settings) else apply_overrides(self.settings, changes or {})
+            )  # fmt: skip
+        if "sequence" in options:
+            before = self.sequence
+            self._use_sequence(options["sequence"])
+            old, new = before.camera, self.sequence.camera
+            if self._observation == "rgbd" and (old.width, old.height) != (new.width, new.height):
+                self.sequence = before
+                raise SequenceError(
+                    f"images of {new.width}x{new.height} do not fit the observation space of {old.width}x{old.height}"
+                )
+
+    def _ready_tracker(self) -> Tracker:
+        """The tracker for the current settings and sequence; built anew only if one of them changed."""
+        key = (self.settings, self.sequence)
+        if self._tracker is None or self._tracker_key != key:
+            self.close()
+            context = TrackerContext(
+                sequence_id=self.sequence.id,
+                masks=self.sequence.masks,
+                device=self._device,
+                threads=self._threads,
+                fps=self.sequence.fps,
+            )
+            self._tracker = build_tracker(self.tracker_spec, self.settings, context)
+            self._tracker_key = key
+            if self._actions.parameters and not hasattr(self._tracker, "update_settings"):
+                raise TrackerError(
+                    f"tracker '{self.tracker_spec.id}' cannot be steered in mid-episode",
+                    "it has no update_settings(settings) method: leave control empty",
+                )
+        return self._tracker
+
+    def _steer(self, tracker: Tracker, settings: Settings) -> None:
+        tracker.update_settings(settings)  # type: ignore[attr-defined]
+
+    def _running_tracker(self) -> Tracker:
+        if self._tracker is None or not self.episode.outcomes:
+            raise DynslamError("step() was called before reset()")
+        if self.episode.over:
+            raise DynslamError(f"the episode is over after frame {self.episode.next_index - 1}", "call reset()")
+        return self._tracker
+
+    def _track_next(self, tracker: Tracker) -> None:
+        index = self.episode.next_index
+        began = time.perf_counter()
+        frame = self.sequence[index]
+        for transform in self.frame_transforms:
+            frame = transform(frame)
+        read = time.perf_counter()
+        result = tracker.track(frame)
+        total = time.perf_counter() - read
+        result = check_result(result, frame, self.tracker_spec.id)
+        pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
+        error = self._errors.update(frame.timestamp, pose, pose is not None)
+        own = {"read": read - began, "total": total}
+        timings = own | {stage: float(seconds) for stage, seconds in result.timings.items() if stage not in own}
+        self.frame, self.result = frame, result
+        self.episode.add(
+            FrameOutcome(
+                index, frame.timestamp, result.state, pose, result.stats, timings, error, self._reward(error)
+            )
+        )  # fmt: skip
+
+    def _observe(self) -> Any:
+        outcomes = self.episode.outcomes
+        here = outcomes[-1].T_world_cam
+        before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
+        motion = se3.inverse(before) @ here if here is not None and before is not None else None
+        context = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
+        make = stats_observation if self._observation == "stats" else rgbd_observation
+        return make(self.frame, self.result, context)
+
+    def _info(self) -> dict[str, Any]:
+        outcome = self.episode.outcomes[-1]
+        info: dict[str, Any] = {
+            "frame_index": outcome.index,
+            "timestamp": float(outcome.timestamp),
+            "tracking_state": str(outcome.state),
+            "stats": dict(outcome.stats),
+        }
+        if outcome.T_world_cam is not None:
+            info["pose"] = np.concatenate(se3.to_quaternion(outcome.T_world_cam))
+        return info | _defined(outcome.error)
+
+
+def _defined(error: OnlineSample | None) -> dict[str, float]:
+    if error is None:
+        return {}
+    named = {
+        "pose_error_trans_m": error.trans_m,
+        "pose_error_rot_deg": error.rot_deg,
+        "frame_error_trans_m": error.frame_trans_m,
+        "frame_error_rot_deg": error.frame_rot_deg,
+    }
+    return {name: float(value) for name, value in named.items() if value is not None}

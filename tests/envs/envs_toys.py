@@ -1,0 +1,227 @@
+"""A small world for the tests of environments and runs: a textured plane in TUM layout, and simple trackers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame, FrameMasks
+from dynslam_bench.slam.result import TrackResult
+from dynslam_bench.trackers.protocol import TrackerSpec
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+STEP_M = 0.01
+"""The toy camera moves so far along x from frame to frame, in its own frame."""
+
+
+def truth(frames: int) -> np.ndarray:
+    """Camera-to-world poses ``[N, 4, 4]``: a straight walk along x with a slow turn about y."""
+    step = se3.exp(np.array([STEP_M, 0, 0.002, 0, np.deg2rad(0.3), 0]))
+    poses = [np.eye(4)]
+    for _ in range(frames - 1):
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+class ToyMasks:
+    """A square that is a person, in every frame."""
+
+    def __getitem__(self, index: int) -> FrameMasks:
+        instances = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+        instances[40:80, 10 + index : 50 + index] = 1
+        return FrameMasks(instances, {1: "person"}, frozenset({1}))
+
+
+class ToySequence:
+    """Random textures in memory; frame i is a function of i only."""
+
+    id = "toy/walk"
+    camera = CAMERA
+    fps = 30.0
+    license = "MIT"
+    citation = "tests"
+
+    def __init__(self, frames: int = 12, *, has_truth: bool = True, hole: tuple[int, int] | None = None) -> None:
+        self.timestamps = 100.0 + np.arange(frames) / 30.0
+        keep = np.ones(frames, bool)
+        if hole is not None:
+            keep[hole[0] : hole[1]] = False
+        self.ground_truth = Trajectory(self.timestamps[keep], truth(frames)[keep]) if has_truth else None
+        self.masks = ToyMasks()
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> Frame:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        return Frame(index, float(self.timestamps[index]), *images(index))
+
+    def digest(self) -> str:
+        return f"toy{len(self)}"
+
+
+def images(index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and depth of frame `index`: a texture that slides along."""
+    texture = np.random.default_rng(7).integers(0, 255, (CAMERA.height, CAMERA.width + 400, 3), dtype=np.uint8)
+    rgb = np.ascontiguousarray(texture[:, index : index + CAMERA.width])
+    return rgb, np.full((CAMERA.height, CAMERA.width), 1.3, np.float32)
+
+
+def write_folder(folder: Path, frames: int = 12, *, has_truth: bool = True) -> Path:
+    """The toy sequence as a folder in TUM layout."""
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    lists: dict[str, list[str]] = {"rgb": [], "depth": []}
+    stamps = 100.0 + np.arange(frames) / 30.0
+    for index, stamp in enumerate(stamps):
+        rgb, depth = images(index)
+        name = f"{stamp:.6f}.png"
+        cv2.imwrite(str(folder / "rgb" / name), rgb[:, :, ::-1])
+        cv2.imwrite(str(folder / "depth" / name), np.round(depth * 5000).astype(np.uint16))
+        for kind in lists:
+            lists[kind].append(f"{stamp:.6f} {kind}/{name}")
+    for kind, lines in lists.items():
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+    if has_truth:
+        rows = []
+        for stamp, pose in zip(stamps, truth(frames), strict=True):
+            position, quaternion = se3.to_quaternion(pose)
+            rows.append(f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in (*position, *quaternion)))
+        (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    (folder / "camera.toml").write_text(
+        f"width = {CAMERA.width}\nheight = {CAMERA.height}\nfx = {CAMERA.fx}\nfy = {CAMERA.fy}\n"
+        f"cx = {CAMERA.cx}\ncy = {CAMERA.cy}\nfps = 30.0\n"
+    )
+    return folder
+
+
+class Noise(Settings):
+    level_m: float = tunable(0.001, low=1e-4, high=1e-1, scale="log", unit="m", online=True, meaning="noise of a pose")
+    clip: float = tunable(2.0, low=0.0, high=4.0, online=True, meaning="largest deviation in standard deviations")
+    passes: int = tunable(1, low=1, high=5, online=True, meaning="how often noise is added")
+    enabled: bool = tunable(True, online=True, meaning="whether there is noise")
+    seedless: int = tunable(0, low=0, high=3, meaning="may not change in mid-episode")
+
+
+class ToySettings(Settings):
+    """What the toy tracker does and when it misbehaves."""
+
+    noise: Noise = Noise()
+    mode: str = "ok"
+    at: int = 4
+    until: int = 10_000
+
+
+class ToyTracker:
+    """Knows the toy camera's motion and adds seeded noise; misbehaves from frame `at` to `until` if told to."""
+
+    def __init__(self, settings: ToySettings) -> None:
+        self.settings = settings
+        self.closed = False
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        assert camera.width > 0
+        self._rng = rng
+        self._poses: dict[float, np.ndarray] = {}
+
+    def update_settings(self, settings: ToySettings) -> None:
+        self.settings = settings
+
+    def track(self, frame: Frame) -> TrackResult:
+        noise = self.settings.noise
+        pose = truth(frame.index + 1)[-1]
+        for _ in range(noise.passes):
+            wobble = np.clip(self._rng.normal(size=6), -noise.clip, noise.clip) * noise.level_m * noise.enabled
+            pose = pose @ se3.exp(wobble)
+        points = self._rng.uniform((0, 0), (frame.rgb.shape[1], frame.rgb.shape[0]), (100, 2)).astype(np.float32)
+        mask = np.zeros(frame.depth.shape, bool)
+        mask[40:80, 10 + frame.index : 40 + frame.index] = True
+        result = TrackResult(
+            pose, "ok",
+            {"keypoints": 100.0, "culled": 20.0, "matches": 60.0, "inliers": 50.0, "mask_fraction": float(mask.mean())},
+            {"features": 0.001, "tracking": 0.002}, mask, points, np.arange(100) >= 20,
+        )  # fmt: skip
+        if self.settings.mode != "ok" and self.settings.at <= frame.index < self.settings.until:
+            result = misbehave(self.settings.mode, result)
+        if result.state == "ok" and result.T_world_cam is not None:
+            self._poses[frame.timestamp] = result.T_world_cam
+        return result
+
+    def finalize(self) -> Trajectory:
+        return Trajectory(np.array(list(self._poses)), np.array(list(self._poses.values())).reshape(-1, 4, 4))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def misbehave(mode: str, result: TrackResult) -> TrackResult:
+    """One of the ways in which a tracker can fail."""
+    pose = np.array(result.T_world_cam)
+    if mode == "lost":
+        return replace(result, T_world_cam=None, state="lost")
+    if mode == "initialising":
+        return replace(result, T_world_cam=None, state="initialising")
+    if mode == "nan":
+        return replace(result, T_world_cam=pose * np.nan)
+    if mode == "scaled":
+        return replace(result, T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0]) @ pose)
+    if mode == "mirrored":
+        return replace(result, T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0]))
+    if mode == "none":
+        return replace(result, T_world_cam=None)
+    if mode == "string":
+        return "nonsense"  # type: ignore[return-value]
+    if mode == "raise":
+        raise ValueError("the toy tracker raised on purpose")
+    if mode == "hang":
+        import time
+
+        time.sleep(3600)
+    if mode == "segfault":
+        import ctypes
+
+        ctypes.string_at(0)
+    if mode == "exit":
+        import os
+
+        os._exit(3)
+    if mode == "memory":
+        hoard = [np.ones(2**24) for _ in range(64)]  # 8 GiB, 128 MiB at a time
+        assert hoard
+    if mode == "memoryerror":
+        raise MemoryError("the toy tracker ran out of memory on purpose")
+    raise AssertionError(f"unknown mode {mode}")
+
+
+class FixedTracker:
+    """Cannot be steered, has no final trajectory and returns nothing but the pose."""
+
+    def __init__(self, settings: ToySettings) -> None:
+        self.settings = settings
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        self.frames = 0
+
+    def track(self, frame: Frame) -> TrackResult:
+        self.frames += 1
+        return TrackResult(truth(frame.index + 1)[-1], "ok")
+
+
+def _spec(name: str, factory: str, presets: Mapping[str, Mapping[str, object]] | None = None) -> TrackerSpec:
+    return TrackerSpec(
+        id=name, entry_point=f"{__file__}:{factory}", label=f"{name} (tests)", settings=ToySettings,
+        summary="for tests", presets=presets or {},
+    )  # fmt: skip
+
+
+SPEC = _spec("toy", "ToyTracker", {"quiet": {"noise.level_m": 1e-4}})
+FIXED = _spec("toy-fixed", "FixedTracker")
