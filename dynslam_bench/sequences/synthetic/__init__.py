@@ -1,1 +1,86 @@
-"""The renderer of dynamic RGB-D sequences with exact poses, depth, masks and flow."""
+"""The renderer of dynamic RGB-D sequences with exact poses, depth, masks and flow.
+
+Importing this package loads neither numba nor OpenCV; opening a sequence does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .settings import (
+    CAMERA,
+    HELD_OUT_INSTANCES,
+    SYNTHETIC_IDS,
+    TUNE_INSTANCES,
+    RenderSettings,
+    SyntheticId,
+    parse_synthetic_id,
+)
+
+if TYPE_CHECKING:
+    from .sequence import SyntheticSequence
+
+__all__ = [
+    "CAMERA",
+    "HELD_OUT_INSTANCES",
+    "SYNTHETIC_IDS",
+    "TUNE_INSTANCES",
+    "RenderSettings",
+    "SyntheticId",
+    "open_synthetic",
+    "parse_synthetic_id",
+    "render_synthetic",
+]
+
+
+def open_synthetic(
+    id: str | SyntheticId,
+    cache_root: Path | None,
+    *,
+    settings: RenderSettings | None = None,
+    threads: int | None = None,
+) -> SyntheticSequence:
+    """Open a rendered sequence; frames are rendered when first read and cached under ``cache_root/synthetic``.
+
+    Args:
+        id: For example ``synthetic/walking_xyz@101?frames=150``.
+        cache_root: Where rendered frames are kept; None keeps nothing and renders at every read.
+        settings: What differs from the default rendering (noise, controls, lighting).
+        threads: Threads a frame; None for the cores there are. The frames do not depend on it.
+
+    Raises:
+        SequenceError: Unknown id, or an instance or length out of range.
+    """
+    from .sequence import SyntheticSequence
+
+    parsed = parse_synthetic_id(id) if isinstance(id, str) else id
+    return SyntheticSequence(parsed, cache_root, settings or RenderSettings(), threads)
+
+
+def render_synthetic(
+    id: str | SyntheticId,
+    cache_root: Path,
+    *,
+    settings: RenderSettings | None = None,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Render all frames of a sequence that are not cached yet; returns the folder, in TUM layout.
+
+    Args:
+        id: As for `open_synthetic`.
+        cache_root: As for `open_synthetic`.
+        settings: As for `open_synthetic`.
+        threads: Frames rendered at a time; None for the cores there are, at most four.
+        progress: Called with (frames done, frames in all).
+
+    Raises:
+        SequenceError: Unknown id.
+        DynslamError: The cache cannot be written; what was rendered stays and is not rendered again.
+    """
+    sequence = open_synthetic(id, cache_root, settings=settings, threads=threads)
+    sequence.render(progress)
+    assert sequence.store is not None
+    return sequence.store.folder

@@ -1,0 +1,202 @@
+"""Renders frames of a scene: geometry, colour, depth as measured, masks and flow."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels, sensors
+from .scene import Scene, Snapshot
+from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
+
+_BAND = 48
+_JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One frame as it goes to disk, and the exact geometry behind it.
+
+    Attributes:
+        rgb: uint8 ``[H, W, 3]``.
+        raw_depth: uint16 ``[H, W]`` in units of 1 / 5000 m, 0 = missing, as the sensor measures it.
+        exact_depth: float64 ``[H, W]`` z-depth in metres, 0 where nothing is hit.
+        instances: uint8 ``[H, W]``.
+    """
+
+    rgb: NDArray[np.uint8]
+    raw_depth: NDArray[np.uint16]
+    exact_depth: NDArray[np.float64]
+    instances: NDArray[np.uint8]
+
+
+class Renderer:
+    """Renders any frame of one sequence; frames do not depend on each other nor on the number of threads.
+
+    Args:
+        sequence: Which sequence.
+        settings: Renderer settings.
+        threads: Threads that share the rows of a frame; None for the cores there are, at most four.
+    """
+
+    def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
+        self.settings = settings
+        self.scene = Scene(sequence, settings)
+        self.atlas = self.scene.atlas()
+        self.threads = threads or default_threads()
+        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
+        self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
+        self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+
+    def render(self, index: int) -> Rendered:
+        """Render frame `index`."""
+        scene, settings = self.scene, self.settings
+        now, after = scene.snapshot(index / FPS), scene.snapshot((index + 1) / FPS)
+        tiles = self._tiles(now)
+        height, width = CAMERA.height, CAMERA.width
+        hit, depth = self._geometry(now, tiles)
+        color, cosine = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
+        lights = self._lights(now, index / FPS)
+        jitter = _JITTER if settings.antialias else np.zeros((1, 2))
+        self._rows(lambda a, b: kernels.shade_pixels(
+            a, b, self._intrinsics, tiles[0], tiles[1], tiles[2], tiles[3], scene.kind, now.local, scene.shape,
+            scene.texture, scene.uv, scene.tint, self.atlas.texels, self.atlas.level_offset, self.atlas.log2_size, lights,
+            hit, depth, jitter, color, cosine))  # fmt: skip
+        raw = self._measure(index, depth, cosine, color)
+        if settings.color.shutter > 0:
+            flow = np.empty((height, width, 2), np.float32)
+            motion = self._motion(now, after)
+            self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
+            sharp, color = color, np.empty_like(color)
+            blurred = color
+            self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, flow, settings.color.shutter, blurred))
+        rgb = self._expose(index, color)
+        ids = np.append(scene.instance, 0).astype(np.uint8)
+        return Rendered(rgb, raw, depth, ids[hit >> 3])
+
+    def flow(self, index: int, other: int) -> NDArray[np.float32]:
+        """Exact flow float32 ``[H, W, 2]`` in pixels from frame `index` to frame `other`; NaN where there is none.
+
+        It is the motion of the surface point seen at each pixel centre, also where it is hidden in the other frame.
+        """
+        now, after = self.scene.snapshot(index / FPS), self.scene.snapshot(other / FPS)
+        hit, depth = self._geometry(now, self._tiles(now))
+        flow = np.empty((*hit.shape, 2), np.float32)
+        motion = self._motion(now, after)
+        self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
+        return flow
+
+    def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
+        now = self.scene.snapshot(index / FPS)
+        hit, depth = self._geometry(now, self._tiles(now))
+        return depth, np.append(self.scene.instance, 0).astype(np.uint8)[hit >> 3]
+
+    def _rows(self, work: Callable[[int, int], None]) -> None:
+        bands = [(a, min(a + _BAND, CAMERA.height)) for a in range(0, CAMERA.height, _BAND)]
+        if self._pool is None:
+            work(0, CAMERA.height)
+            return
+        for done in [self._pool.submit(work, a, b) for a, b in bands]:
+            done.result()
+
+    def _tiles(self, snap: Snapshot) -> tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+        """Bin the primitives into tiles by the projected corners of their boxes."""
+        scene = self.scene
+        world = (scene.corners * scene.scale[:, None, :]) @ np.swapaxes(snap.rotation, 1, 2) + snap.origin[:, None, :]
+        points = (world - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
+        z = points[:, :, 2]
+        nearest = z.min(axis=1)
+        seen = z.max(axis=1) > 0.05
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = points[:, :, 0] / z * CAMERA.fx + CAMERA.cx
+            v = points[:, :, 1] / z * CAMERA.fy + CAMERA.cy
+        tiles_x, tiles_y = -(-CAMERA.width // kernels.TILE), -(-CAMERA.height // kernels.TILE)
+        crossing = nearest <= 0.05
+        low_u, high_u = np.where(crossing, 0, u.min(1) - 2), np.where(crossing, CAMERA.width, u.max(1) + 2)
+        low_v, high_v = np.where(crossing, 0, v.min(1) - 2), np.where(crossing, CAMERA.height, v.max(1) + 2)
+        seen &= (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
+        boxes = np.stack([
+            np.clip(low_u, 0, CAMERA.width - 1), np.clip(low_v, 0, CAMERA.height - 1),
+            np.clip(high_u, 0, CAMERA.width - 1), np.clip(high_v, 0, CAMERA.height - 1),
+        ], axis=1)  # fmt: skip
+        boxes = (boxes // kernels.TILE).astype(np.int32)
+        order = np.argsort(nearest, kind="stable")
+        order = order[seen[order]].astype(np.int32)
+        start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
+        return tiles_x, start, members, nearest
+
+    def _geometry(self, snap: Snapshot, tiles: tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
+                  ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:  # fmt: skip
+        hit = np.empty((CAMERA.height, CAMERA.width), np.int32)
+        depth = np.empty((CAMERA.height, CAMERA.width))
+        self._rows(lambda a, b: kernels.cast_geometry(
+            a, b, self._intrinsics, tiles[0], tiles[1], tiles[2], tiles[3], self.scene.kind, snap.local, self.scene.shape, hit, depth
+        ))  # fmt: skip
+        return hit, depth
+
+    def _motion(self, now: Snapshot, other: Snapshot) -> NDArray[np.float64]:
+        """Maps ``[P, 12]`` from points in this camera's frame, fixed to a primitive, to the other camera's frame."""
+        turn = other.rotation @ np.swapaxes(now.rotation, 1, 2)
+        shift = other.origin - (turn @ now.origin[:, :, None])[:, :, 0]
+        to_other = other.T_world_cam[:3, :3].T
+        result = np.empty((len(shift), 3, 4))
+        result[:, :, :3] = to_other @ turn @ now.T_world_cam[:3, :3]
+        moved = (turn @ now.T_world_cam[:3, 3]) + shift - other.T_world_cam[:3, 3]
+        result[:, :, 3] = moved @ to_other.T
+        return np.ascontiguousarray(result.reshape(-1, 12))
+
+    def _lights(self, snap: Snapshot, time: float) -> NDArray[np.float64]:
+        """Directions to the lights in the camera frame, and strengths; row 0 is the ambient light."""
+        rows = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
+        rows[:, :3] /= np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
+        if self.settings.lighting_change:
+            rows[:, 3] *= 0.78 + 0.22 * math.cos(2 * math.pi * time / 7.0)
+            if math.sin(2 * math.pi * time / 4.7) > 0.3:
+                rows[2, 3] += 0.25
+        rows[:, :3] = rows[:, :3] @ snap.T_world_cam[:3, :3]
+        return np.ascontiguousarray(rows)
+
+    def _measure(self, index: int, depth: NDArray[np.float64], cosine: NDArray[np.float32], color: NDArray[np.float32]
+                 ) -> NDArray[np.uint16]:  # fmt: skip
+        sensor = self.settings.depth
+        if not sensor.noise:
+            return np.clip(np.floor(depth * CAMERA.depth_factor + 0.5), 0, 65535).astype(np.uint16)
+        raw = np.empty(depth.shape, np.uint16)
+        seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index)) & 0xFFFFFFFFFFFFFFFF)
+        self._rows(lambda a, b: sensors.measure_depth(
+            a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, sensor.disparity_noise_px, sensor.near_m, sensor.far_m,
+            sensor.edge_px, sensor.dark, CAMERA.depth_factor, raw))  # fmt: skip
+        return raw
+
+    def _expose(self, index: int, color: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Exposure of a rolling readout (drift and mains flicker), noise and rounding."""
+        sensor = self.settings.color
+        rows = np.arange(CAMERA.height)
+        time = index / FPS + rows / CAMERA.height / FPS * 0.9
+        gain = 1 + sensor.exposure_drift * (
+            0.7 * np.sin(2 * math.pi * time / 6.1) + 0.3 * np.sin(2 * math.pi * time / 1.9 + 1.0)
+        )
+        gain *= 1 + sensor.flicker * np.sin(2 * math.pi * 100.0 * time * 1.0013)
+        gains = np.repeat(gain[:, None], 3, axis=1)
+        offset = np.zeros_like(gains)
+        rgb = np.empty(color.shape, np.uint8)
+        seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index + 1)) & 0xFFFFFFFFFFFFFFFF)
+        read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
+        self._rows(lambda a, b: sensors.expose(a, b, seed, color, gains, offset, read, shot, rgb))
+        return rgb
+
+
+def default_threads() -> int:
+    """Cores this process may use, at most four; ``NUMBA_NUM_THREADS`` lowers it."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("NUMBA_NUM_THREADS", "")
+    return max(1, min(cores, 4, int(limit) if limit.isdigit() and int(limit) > 0 else 4))

@@ -1,0 +1,217 @@
+"""The rendered sequence: frames are rendered when first read, then come from the cache."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.records import digest
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame, FrameMasks
+
+from .renderer import Rendered, Renderer, default_threads
+from .scene import CLASS_NAMES, Scene
+from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
+from .store import FrameStore
+
+START_S = 1000.0
+"""Stamp of the first frame in seconds."""
+
+
+class SyntheticSequence:
+    """A rendered sequence; fulfils the `Sequence` protocol.
+
+    Args:
+        sequence: Which sequence.
+        cache_root: Folder under which rendered frames are kept; None keeps nothing and renders every time.
+        settings: What differs from the default rendering.
+        threads: Threads a frame; None for the cores there are, at most four. The frames do not depend on it.
+    """
+
+    def __init__(
+        self, sequence: SyntheticId, cache_root: Path | None, settings: RenderSettings, threads: int | None = None
+    ) -> None:
+        self._id = sequence
+        self.settings = settings
+        self.threads = threads or default_threads()
+        self._lock = threading.Lock()
+        stamps = START_S + np.arange(sequence.frames) / FPS
+        self._timestamps = np.round(stamps, 6)
+        self.store: FrameStore | None = None
+        if cache_root is not None:
+            label = f"{sequence.name}@{sequence.instance}-{self._key()}"
+            self.store = FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
+
+    def __getstate__(self) -> dict[str, object]:
+        # Without the lock and the renderer, which are made anew where the copy is used.
+        return {
+            key: value
+            for key, value in vars(self).items()
+            if key in ("_id", "settings", "threads", "_timestamps", "store")
+        }
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self._lock = threading.Lock()
+
+    @property
+    def id(self) -> str:
+        """For example ``synthetic/walking_xyz@0?frames=600``."""
+        return str(self._id)
+
+    @property
+    def synthetic_id(self) -> SyntheticId:
+        """The id in parts."""
+        return self._id
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of TUM's fr3 sequences, without distortion."""
+        return CAMERA
+
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        """Stamps of all frames in seconds."""
+        return self._timestamps
+
+    @cached_property
+    def ground_truth(self) -> Trajectory:
+        """Exact camera-to-world poses of all frames; needs no rendering."""
+        return Trajectory(self._timestamps, self.scene.poses(np.arange(len(self)) / FPS))
+
+    @property
+    def fps(self) -> float:
+        """30 Hz."""
+        return FPS
+
+    @property
+    def license(self) -> str:
+        """Rendered by this package: nobody else's rights."""
+        return "CC0-1.0"
+
+    @property
+    def citation(self) -> str:
+        """What to cite."""
+        return f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
+
+    @property
+    def masks(self) -> SyntheticMasks:
+        """Exact instance masks."""
+        return SyntheticMasks(self)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The geometry behind the frames."""
+        return Scene(self._id, self.settings)
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """The renderer; built when the first frame is rendered."""
+        return Renderer(self._id, self.settings, self.threads)
+
+    def digest(self) -> str:
+        """Short digest of the renderer's version and all parameters."""
+        return digest({"id": self.id, "key": self._key()})
+
+    def _key(self) -> str:
+        return digest({"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")}, 8)
+
+    def __len__(self) -> int:
+        return self._id.frames
+
+    def __getitem__(self, index: int) -> Frame:
+        i = range(len(self))[index]
+        stamp = float(self._timestamps[i])
+        if self.store is not None:
+            rgb, raw = self.store.read("rgb", stamp), self.store.read("depth", stamp)
+            if rgb is not None and raw is not None:
+                return Frame(i, stamp, rgb, _metres(raw))
+        made = self._make(i)
+        return Frame(i, stamp, made.rgb, _metres(made.raw_depth))
+
+    def flow(self, index: int, other: int | None = None) -> NDArray[np.float32]:
+        """Exact optical flow float32 ``[H, W, 2]`` in pixels (u, v) from a frame to another (default: the next).
+
+        It is the motion of the surface point at each pixel centre, also where that point is hidden in the other frame;
+        NaN where it comes to lie behind the camera. Recomputed from the geometry, nothing is stored.
+        """
+        i = range(len(self))[index]
+        return self.renderer.flow(i, i + 1 if other is None else range(len(self))[other])
+
+    def exact_depth(self, index: int) -> NDArray[np.float64]:
+        """Exact z-depth float64 ``[H, W]`` in metres at the pixel centres, 0 where nothing is hit."""
+        return self.renderer.geometry(range(len(self))[index])[0]
+
+    def render(self, progress: Callable[[int, int], None] | None = None) -> int:
+        """Render every frame that is missing or damaged; several frames at a time.
+
+        Args:
+            progress: Called with (frames done, frames in all) after each frame.
+
+        Returns:
+            How many frames had to be rendered.
+
+        Raises:
+            DynslamError: The cache cannot be written; frames already rendered stay.
+        """
+        todo = [i for i in range(len(self)) if self.store is None or not self._cached(i)]
+        done = len(self) - len(todo)
+        if progress is not None:
+            progress(done, len(self))
+        if todo:
+            single = Renderer(self._id, self.settings, 1)
+            with ThreadPoolExecutor(self.threads) as pool:
+                try:
+                    for _ in pool.map(lambda i: self._make(i, single, lists=False) and None, todo):
+                        done += 1
+                        if progress is not None:
+                            progress(done, len(self))
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+        if self.store is not None:
+            self.store.write_lists(self.ground_truth)
+        return len(todo)
+
+    def _cached(self, index: int) -> bool:
+        assert self.store is not None
+        stamp = float(self._timestamps[index])
+        return all(self.store.read(kind, stamp) is not None for kind in ("rgb", "depth", "masks"))
+
+    def _make(self, index: int, renderer: Renderer | None = None, lists: bool = True) -> Rendered:
+        """Render a frame and store it."""
+        if renderer is None:
+            with self._lock:
+                renderer = self.renderer
+        made = renderer.render(index)
+        if self.store is not None:
+            self.store.write(float(self._timestamps[index]), made.rgb, made.raw_depth, made.instances)
+            if lists and (index == len(self) - 1 or index == 0):
+                self.store.write_lists(self.ground_truth)
+        return made
+
+
+class SyntheticMasks:
+    """Exact masks of a rendered sequence, by frame index."""
+
+    def __init__(self, sequence: SyntheticSequence) -> None:
+        self.sequence = sequence
+
+    def __getitem__(self, index: int) -> FrameMasks:
+        sequence = self.sequence
+        i = range(len(sequence))[index]
+        ids = None if sequence.store is None else sequence.store.read("masks", float(sequence.timestamps[i]))
+        if ids is None:
+            ids = sequence.renderer.geometry(i)[1]
+        return FrameMasks(ids, dict(CLASS_NAMES), sequence.scene.moving(i))
+
+
+def _metres(raw: NDArray[np.uint16]) -> NDArray[np.float32]:
+    return raw.astype(np.float32) / np.float32(CAMERA.depth_factor)

@@ -1,0 +1,50 @@
+import subprocess
+import sys
+
+import pytest
+
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, SyntheticId, parse_synthetic_id
+
+
+def test_the_eight_twins_exist() -> None:
+    assert len(SYNTHETIC_IDS) == 8
+    for name in SYNTHETIC_IDS:
+        parsed = parse_synthetic_id(name)
+        assert (parsed.instance, parsed.frames) == (0, 600)
+        assert parse_synthetic_id(str(parsed)) == parsed
+
+
+def test_instance_and_length_are_read() -> None:
+    parsed = parse_synthetic_id("synthetic/sitting_rpy@107?frames=33")
+    assert parsed == SyntheticId("sitting", "rpy", 107, 33)
+    assert parsed.split == "held-out"
+    assert str(parsed) == "synthetic/sitting_rpy@107?frames=33"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("synthetic/walking_xy", "did you mean 'synthetic/walking_xyz'"),
+        ("synthetic/Walking-static", "did you mean 'synthetic/walking_static'"),
+        ("synthetic/walking_xyz@200", "0 to 199"),
+        ("synthetic/walking_xyz@-1", "0 to 199"),
+        ("synthetic/walking_xyz@", "instance ''"),
+        ("synthetic/walking_xyz@1.5", "instance '1.5'"),
+        ("synthetic/walking_xyz?frames=0", "from 1 to"),
+        ("synthetic/walking_xyz?frames=many", "frames 'many'"),
+        ("synthetic/walking_xyz?frame=3", "?frames=N"),
+        ("tum/walking_xyz", "did you mean"),
+        ("", "not the id"),
+    ],
+)
+def test_bad_ids_say_what_is_wrong(text: str, words: str) -> None:
+    with pytest.raises(SequenceError, match=r"^[^\n]+$") as caught:
+        parse_synthetic_id(text)
+    assert words in str(caught.value)
+
+
+def test_ids_need_neither_numba_nor_opencv() -> None:
+    code = "import sys, dynslam_bench.sequences.synthetic; print([m for m in ('numba', 'cv2', 'torch') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
