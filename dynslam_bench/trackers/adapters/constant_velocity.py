@@ -100,17 +100,17 @@ def relative_motion(
     Returns:
         ``T_a_b`` ``[4, 4]`` and the number of inliers; None and their number if fewer than 12 points agree.
     """
-    corners = cv2.goodFeaturesToTrack(grey_a, CORNERS, 0.01, 8)
-    if corners is None:
+    found_corners: object = cv2.goodFeaturesToTrack(grey_a, CORNERS, 0.01, 8)  # None if there are none
+    if found_corners is None:
         return None, 0
-    corners = np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+    corners = np.asarray(found_corners, dtype=np.float32).reshape(-1, 2)
     height, width = depth_a.shape
     column, row = np.rint(corners).astype(np.intp).T
     depth = depth_a[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
     corners, depth = corners[depth > 0], depth[depth > 0]
     if len(corners) < LEAST_INLIERS:
         return None, 0
-    followed, found, _ = cv2.calcOpticalFlowPyrLK(grey_a, grey_b, corners[:, None], np.empty((0, 1, 2), np.float32))
+    followed, found, _ = cv2.calcOpticalFlowPyrLK(grey_a, grey_b, corners[:, None], corners[:, None].copy())
     good = found.reshape(-1) == 1
     if good.sum() < LEAST_INLIERS:
         return None, 0

@@ -22,7 +22,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._slam: Any = None
-        self._stamps: list[float] = []
+        self._tracked: list[float] = []
 
     def reset(self, request: dict[str, Any]) -> None:
         """Load the vocabulary and start ORB-SLAM3's threads."""
@@ -41,28 +41,37 @@ class Worker:
         start = time.perf_counter()
         result = self._slam.track_rgbd(np.ascontiguousarray(rgb), np.ascontiguousarray(depth), timestamp)
         seconds = time.perf_counter() - start
-        self._stamps.append(timestamp)
         state = STATES.get(result.state.name, "initialising")
         pose = None if result.pose_wc is None or state == "initialising" else result.pose_wc.astype(float).tolist()
+        if state == "ok" and pose is None:
+            state = "lost"
+        if state == "ok":
+            self._tracked.append(timestamp)
         points = float(result.num_tracked_points)
         return {
-            "state": "lost" if state == "ok" and pose is None else state,
+            "state": state,
             "T_world_cam": pose,
             "stats": {"keypoints": float(len(self._slam.tracked_keypoints())), "matches": points, "inliers": points},
             "timings": {"tracking": seconds},
         }
 
     def finalize(self) -> list[list[float]]:
-        """Stop the threads; the poses of all frames that were not lost, after its last optimisation."""
+        """Stop the threads; the poses of all frames that were tracked, after its last optimisation.
+
+        Its file also holds predicted poses of lost frames, and repeats a stamp where a frame had no pose at all.
+        """
         self._slam.shutdown()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "final.txt"
             self._slam.save_trajectory_tum(str(path))
             rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
-        stamps = np.asarray(self._stamps)
-        for row in rows:  # the file rounds the stamps; give the frames' own back
-            row[0] = float(stamps[np.abs(stamps - row[0]).argmin()])
-        return rows
+        own = {f"{stamp:.6f}": stamp for stamp in self._tracked}  # the file rounds the stamps
+        poses: dict[float, list[float]] = {}
+        for row in rows:
+            stamp = own.get(f"{row[0]:.6f}")
+            if stamp is not None:
+                poses.setdefault(stamp, [stamp, *row[1:]])
+        return [poses[stamp] for stamp in sorted(poses)]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The DBoW2 text vocabulary that ORB-SLAM3 needs: found, decompressed into the cache, and checked before it is loaded."""
+"""The DBoW2 text vocabulary of ORB-SLAM3: found, decompressed into the cache, checked before it is loaded."""
 
 from __future__ import annotations
 
