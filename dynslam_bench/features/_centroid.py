@@ -1,0 +1,56 @@
+"""Orientation of a patch by its intensity centroid (Rublee et al., 2011, Section 3.2)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+def patch_half_widths(radius: int) -> NDArray[np.int64]:
+    """Half widths of the rows of a disc: row ``dy`` spans ``-w[|dy|] .. w[|dy|]``, int64 ``[radius + 1]``."""
+    rows = np.arange(radius + 1)
+    return np.rint(np.sqrt(radius * radius - rows * rows)).astype(np.int64)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _orientations(
+    image: NDArray[np.uint8], xy: NDArray[np.float32], half_widths: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    out = np.zeros(len(xy), np.float32)
+    radius = len(half_widths) - 1
+    for i in range(len(xy)):
+        x0, y0 = int(xy[i, 0]), int(xy[i, 1])
+        m10, m01 = 0, 0
+        for dy in range(-radius, radius + 1):
+            w = half_widths[abs(dy)]
+            row = 0
+            for dx in range(-w, w + 1):
+                value = np.int64(image[y0 + dy, x0 + dx])
+                m10 += dx * value
+                row += value
+            m01 += dy * row
+        angle = math.degrees(math.atan2(float(m01), float(m10)))
+        if angle < 0.0:
+            angle += 360.0
+        if angle >= 360.0:
+            angle = 0.0
+        out[i] = angle
+        if out[i] >= 360.0:  # rounded up by float32
+            out[i] = 0.0
+    return out
+
+
+def orientations(
+    image: NDArray[np.uint8], xy: NDArray[np.float32], half_widths: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Orientations in degrees, [0, 360), float32 ``[N]``.
+
+    Args:
+        image: uint8 ``[H, W]``.
+        xy: Integer-valued pixels ``[N, 2]``, at least the disc's radius away from the border.
+        half_widths: Of `patch_half_widths`.
+    """
+    return np.asarray(_orientations(image, np.ascontiguousarray(xy, np.float32), half_widths))

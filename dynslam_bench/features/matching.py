@@ -1,0 +1,254 @@
+"""Matching of binary descriptors: Hamming distances, brute force, search in a radius, rotation consistency.
+
+Descriptors are compared as 64-bit words (`as_words`); rows of equal length are comparable, whatever the extractor.
+All functions are pure and deterministic; ties are broken by the lower index.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Words = NDArray[np.uint64]
+
+_M1 = np.uint64(0x5555555555555555)
+_M2 = np.uint64(0x3333333333333333)
+_M4 = np.uint64(0x0F0F0F0F0F0F0F0F)
+_H01 = np.uint64(0x0101010101010101)
+_ONE, _TWO, _FOUR, _TOP = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
+FAR = 1 << 20
+"""A distance above that of any two descriptors."""
+
+
+def as_words(descriptors: NDArray[np.uint8]) -> Words:
+    """Packed descriptors uint8 ``[N, B]`` as uint64 ``[N, ceil(B / 8)]``, padded with zero bits."""
+    count, length = descriptors.shape
+    padded = np.zeros((count, -(-length // 8) * 8), np.uint8)
+    padded[:, :length] = descriptors
+    return padded.view(np.uint64)
+
+
+def popcount(words: Words) -> NDArray[np.uint8]:
+    """Number of set bits of each 64-bit word (numpy 2 counts them itself; older versions by halving)."""
+    if hasattr(np, "bitwise_count"):
+        return np.asarray(np.bitwise_count(words), dtype=np.uint8)
+    v = words - ((words >> _ONE) & _M1)
+    v = (v & _M2) + ((v >> _TWO) & _M2)
+    v = (v + (v >> _FOUR)) & _M4
+    return np.asarray((v * _H01) >> _TOP, dtype=np.uint8)
+
+
+def hamming(a: Words, b: Words) -> NDArray[np.int64]:
+    """Hamming distances of descriptors ``[..., W]`` that are broadcast against each other, int64 ``[...]``."""
+    return np.asarray(popcount(a ^ b).sum(axis=-1, dtype=np.int64))
+
+
+@njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+def distance(a: Words, b: Words) -> int:
+    """Hamming distance of two descriptors ``[W]``; for use inside compiled kernels."""
+    total = 0
+    for w in range(a.shape[0]):
+        v = a[w] ^ b[w]
+        v = v - ((v >> _ONE) & _M1)
+        v = (v & _M2) + ((v >> _TWO) & _M2)
+        v = (v + (v >> _FOUR)) & _M4
+        total += np.int64((v * _H01) >> _TOP)
+    return total
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _brute_force(
+    a: Words, b: Words
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    n, m = a.shape[0], b.shape[0]
+    best = np.full(n, -1, np.int64)
+    first = np.full(n, FAR, np.int64)
+    second = np.full(n, FAR, np.int64)
+    back = np.full(m, -1, np.int64)
+    back_distance = np.full(m, FAR, np.int64)
+    for i in range(n):
+        for j in range(m):
+            d = distance(a[i], b[j])
+            if d < first[i]:
+                second[i] = first[i]
+                first[i] = d
+                best[i] = j
+            elif d < second[i]:
+                second[i] = d
+            if d < back_distance[j]:
+                back_distance[j] = d
+                back[j] = i
+    return best, first, second, back
+
+
+def match_brute_force(
+    a: Words, b: Words, *, max_distance: int = 64, ratio: float = 0.8, mutual: bool = True
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Nearest neighbours among all descriptors.
+
+    Args:
+        a: Descriptors ``[N, W]``.
+        b: Descriptors ``[M, W]``.
+        max_distance: Largest Hamming distance of a match.
+        ratio: The nearest must be nearer than `ratio` times the second nearest; 1 switches the test off.
+        mutual: Whether the match must be the nearest in both directions.
+
+    Returns:
+        Indices into `a`, indices into `b` and distances of the matches, ordered by the first.
+    """
+    if not len(a) or not len(b):
+        empty = np.zeros(0, np.int64)
+        return empty, empty, empty
+    best, first, second, back = _brute_force(np.ascontiguousarray(a), np.ascontiguousarray(b))
+    keep = first <= max_distance
+    if ratio < 1.0:
+        keep &= first < ratio * second
+    if mutual:
+        keep &= back[best] == np.arange(len(a))
+    index = np.flatnonzero(keep)
+    return index, best[index], first[index]
+
+
+@dataclass(frozen=True, eq=False)
+class CellGrid:
+    """Keypoints sorted into cells, for searches in a radius.
+
+    Attributes:
+        cell: Side of a cell, pixels.
+        columns: Cells in a row.
+        rows: Rows of cells.
+        start: int64 ``[rows * columns + 1]``, where each cell's keypoints begin in `order`.
+        order: int64 ``[N]``, keypoints sorted by cell, then by index.
+    """
+
+    cell: float
+    columns: int
+    rows: int
+    start: NDArray[np.int64]
+    order: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, xy: NDArray[np.float64], width: int, height: int, cell: float = 20.0) -> CellGrid:
+        """Sort the points ``[N, 2]`` into cells; points outside the image go to the nearest border cell."""
+        columns, rows = max(1, int(np.ceil(width / cell))), max(1, int(np.ceil(height / cell)))
+        column = np.clip(xy[:, 0] // cell, 0, columns - 1).astype(np.int64)
+        row = np.clip(xy[:, 1] // cell, 0, rows - 1).astype(np.int64)
+        index = row * columns + column
+        start = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=rows * columns))]).astype(np.int64)
+        return cls(cell, columns, rows, start, np.argsort(index, kind="stable").astype(np.int64))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _search(
+    cell: float, columns: int, rows: int, start: NDArray[np.int64], order: NDArray[np.int64],
+    xy: NDArray[np.float64], right: NDArray[np.float64], octave: NDArray[np.int64], words: Words,
+    free: NDArray[np.bool_],
+    target: NDArray[np.float64], target_right: NDArray[np.float64], radius: NDArray[np.float64],
+    octave_low: NDArray[np.int64], octave_high: NDArray[np.int64], target_words: Words,
+    max_distance: int, ratio: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
+    count = target.shape[0]
+    match = np.full(count, -1, np.int64)
+    match_distance = np.full(count, FAR, np.int64)
+    owner = np.full(xy.shape[0], -1, np.int64)
+    for i in range(count):
+        x, y, r = target[i, 0], target[i, 1], radius[i]
+        c0, c1 = int((x - r) // cell), int((x + r) // cell)
+        r0, r1 = int((y - r) // cell), int((y + r) // cell)
+        c0, c1 = min(max(c0, 0), columns - 1), min(max(c1, 0), columns - 1)
+        r0, r1 = min(max(r0, 0), rows - 1), min(max(r1, 0), rows - 1)
+        best, first, second, first_octave, second_octave = -1, FAR, FAR, -1, -2
+        for row in range(r0, r1 + 1):
+            for k in range(start[row * columns + c0], start[row * columns + c1 + 1]):
+                j = order[k]
+                if not free[j] or octave[j] < octave_low[i] or octave[j] > octave_high[i]:
+                    continue
+                if abs(xy[j, 0] - x) > r or abs(xy[j, 1] - y) > r:
+                    continue
+                if right[j] == right[j] and target_right[i] == target_right[i]:
+                    if abs(right[j] - target_right[i]) > r:
+                        continue
+                d = distance(target_words[i], words[j])
+                if d < first:
+                    second, second_octave = first, first_octave
+                    first, first_octave, best = d, octave[j], j
+                elif d < second:
+                    second, second_octave = d, octave[j]
+        if best < 0 or first > max_distance:
+            continue
+        if ratio < 1.0 and first_octave == second_octave and first > ratio * second:
+            continue
+        rival = owner[best]
+        if rival >= 0:
+            if match_distance[rival] <= first:
+                continue
+            match[rival] = -1
+            match_distance[rival] = FAR
+        owner[best] = i
+        match[i] = best
+        match_distance[i] = first
+    return match, match_distance
+
+
+def search_in_radius(
+    grid: CellGrid,
+    keypoints: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], Words],
+    free: NDArray[np.bool_],
+    targets: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    octaves: tuple[NDArray[np.int64], NDArray[np.int64]],
+    target_words: Words,
+    *,
+    max_distance: int,
+    ratio: float = 1.0,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each target position, the keypoint nearby whose descriptor is nearest; each keypoint is given once.
+
+    Args:
+        grid: The keypoints' cells.
+        keypoints: Undistorted pixels ``[N, 2]``, right coordinates ``[N]`` (NaN without depth), octaves ``[N]`` and
+            descriptors ``[N, W]``.
+        free: bool ``[N]``, keypoints that may be matched.
+        targets: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared) and half sides of
+            the search windows ``[M]``, pixels.
+        octaves: Lowest and highest octave allowed for each target ``[M]``.
+        target_words: Descriptors of the targets ``[M, W]``.
+        max_distance: Largest Hamming distance of a match.
+        ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the test off.
+
+    Returns:
+        int64 ``[M]`` matched keypoint or -1, and int64 ``[M]`` its distance. Where two targets claim one keypoint the
+        smaller distance wins, then the lower index.
+    """
+    xy, right, octave, words = keypoints
+    target, target_right, radius = targets
+    return _search(  # type: ignore[no-any-return]
+        grid.cell, grid.columns, grid.rows, grid.start, grid.order, xy, right, octave, words, free,
+        target, target_right, radius, octaves[0], octaves[1], target_words, max_distance, ratio,
+    )  # fmt: skip
+
+
+def rotation_consistent(
+    angle_a: NDArray[np.floating], angle_b: NDArray[np.floating], *, bins: int = 30, share: float = 0.1
+) -> NDArray[np.bool_]:
+    """Which matches agree with the rotation in the image plane that most matches show.
+
+    Args:
+        angle_a: Keypoint orientations in the one image, degrees ``[N]``.
+        angle_b: Keypoint orientations in the other, degrees ``[N]``.
+        bins: Number of bins of the histogram of differences.
+        share: The second and third fullest bin count only if they hold at least this share of the fullest one.
+
+    Returns:
+        bool ``[N]``, True for matches in the (up to three) fullest bins.
+    """
+    if not len(angle_a):
+        return np.zeros(0, bool)
+    difference = np.mod(np.asarray(angle_a, np.float64) - np.asarray(angle_b, np.float64), 360.0)
+    index = np.minimum((difference * (bins / 360.0)).round().astype(np.int64) % bins, bins - 1)
+    counts = np.bincount(index, minlength=bins)
+    top = np.argsort(-counts, kind="stable")[:3]
+    good = top[counts[top] >= max(1.0, share * counts[top[0]])]
+    return np.asarray(np.isin(index, good))

@@ -1,0 +1,174 @@
+"""ORB features that are spread evenly over the image and the scales.
+
+FAST corners (Rosten and Drummond, 2006) of each pyramid level are ranked by strength within the cells of a grid; the
+strongest of every cell come first, then the second strongest, until the level's share is full. Orientation is the
+intensity centroid and the descriptor the rotated BRIEF of Rublee et al. (2011).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import SettingsError
+
+from ._centroid import orientations, patch_half_widths
+from .keypoints import Keypoints
+from .settings import FeatureSettings
+
+PATCH_RADIUS = 15
+"""Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
+EDGE = 19
+"""Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
+
+
+class OrbExtractor:
+    """Finds oriented FAST corners and describes them with rotated BRIEF (32 bytes).
+
+    Deterministic: the result depends on the image and the settings only.
+
+    Args:
+        settings: Number of features, pyramid, thresholds and grid.
+
+    Raises:
+        SettingsError: The second FAST threshold lies above the first.
+    """
+
+    def __init__(self, settings: FeatureSettings | None = None) -> None:
+        self.settings = settings or FeatureSettings()
+        s = self.settings
+        if s.fast_threshold_min > s.fast_threshold:
+            raise SettingsError(
+                f"fast_threshold_min is {s.fast_threshold_min}, above fast_threshold {s.fast_threshold}",
+                "lower fast_threshold_min",
+            )
+        self._first = cv2.FastFeatureDetector.create(s.fast_threshold, True)
+        self._second = cv2.FastFeatureDetector.create(s.fast_threshold_min, True)
+        self._describer = cv2.ORB.create(
+            nfeatures=s.n_features, scaleFactor=s.scale_factor, nlevels=s.levels, edgeThreshold=EDGE,
+            firstLevel=0, WTA_K=2, patchSize=2 * PATCH_RADIUS + 1, fastThreshold=s.fast_threshold_min,
+        )  # fmt: skip
+        self._half_widths = patch_half_widths(PATCH_RADIUS)
+
+    def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
+        """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
+        gray = np.ascontiguousarray(gray, dtype=np.uint8)
+        pyramid = self._pyramid(gray)
+        quotas = level_quotas(self.settings.n_features, len(pyramid), self.settings.scale_factor)
+        parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
+        missing = 0
+        for image, quota in zip(reversed(pyramid), reversed(quotas), strict=True):
+            xy, response = self._corners(image, quota + missing)
+            missing = quota + missing - len(xy)  # what a coarse level cannot give is sought in the next finer one
+            parts.append((xy, response, orientations(image, xy, self._half_widths)))
+        parts.reverse()
+        return self._describe(gray, parts)
+
+    def _pyramid(self, gray: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+        height, width = gray.shape
+        levels = [gray]
+        for level in range(1, self.settings.levels):
+            scale = self.settings.scale_factor**level
+            size = round(width / scale), round(height / scale)
+            if min(size) <= 2 * EDGE:
+                break
+            levels.append(np.asarray(cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8))
+        return levels if min(height, width) > 2 * EDGE else []
+
+    def _corners(self, image: NDArray[np.uint8], quota: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Up to `quota` corners of one level, level pixels ``[N, 2]``, and their strengths ``[N]``."""
+        inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
+        cell = self.settings.cell_px
+        columns, rows = -(-inner.shape[1] // cell), -(-inner.shape[0] // cell)
+        xy, response = _detect(self._first, inner)
+        cells = _cell_of(xy, cell, columns)
+        filled = np.bincount(cells, minlength=rows * columns) > 0
+        if (not filled.all()) and self.settings.fast_threshold_min < self.settings.fast_threshold:
+            weak_xy, weak_response = _detect(self._second, inner)
+            weak_cells = _cell_of(weak_xy, cell, columns)
+            extra = ~filled[weak_cells]
+            xy = np.concatenate([xy, weak_xy[extra]])
+            response = np.concatenate([response, weak_response[extra]])
+            cells = np.concatenate([cells, weak_cells[extra]])
+        chosen = spread(cells, response, xy, quota)
+        return xy[chosen] + np.float32(EDGE - 3), response[chosen]
+
+    def _describe(
+        self,
+        gray: NDArray[np.uint8],
+        parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]],
+    ) -> Keypoints:
+        count = sum(len(xy) for xy, _, _ in parts)
+        if count == 0:
+            return Keypoints(
+                np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32),
+                np.zeros((0, 32), np.uint8),
+            )  # fmt: skip
+        scales = self.settings.scale_factor ** np.arange(len(parts))
+        octave = np.repeat(np.arange(len(parts), dtype=np.int32), [len(xy) for xy, _, _ in parts])
+        xy = np.concatenate([xy for xy, _, _ in parts]).astype(np.float64)
+        xy = (xy * scales[octave][:, None]).astype(np.float32)
+        response = np.concatenate([part for _, part, _ in parts])
+        angle = np.concatenate([part for _, _, part in parts])
+        size = (2 * PATCH_RADIUS + 1) * scales[octave]
+        make = cv2.KeyPoint
+        points = [
+            make(x, y, s, a, r, o, i)
+            for i, ((x, y), s, a, r, o) in enumerate(
+                zip(xy.tolist(), size.tolist(), angle.tolist(), response.tolist(), octave.tolist(), strict=True)
+            )
+        ]
+        kept, descriptors = self._describer.compute(gray, points)
+        if descriptors is None or not len(kept):
+            return self._describe(gray, [])
+        index = np.array([point.class_id for point in kept], dtype=np.int64)
+        return Keypoints(xy[index], octave[index], angle[index], response[index], np.ascontiguousarray(descriptors))
+
+
+def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
+    """How many features each level gets: in proportion to its side length, `n_features` in all."""
+    if levels == 0:
+        return []
+    shares = scale_factor ** -np.arange(levels, dtype=np.float64)
+    quotas = np.floor(n_features * shares / shares.sum()).astype(int)
+    quotas[0] += n_features - int(quotas.sum())
+    return [int(quota) for quota in quotas]
+
+
+def spread(
+    cells: NDArray[np.int64], response: NDArray[np.float32], xy: NDArray[np.float32], quota: int
+) -> NDArray[np.int64]:
+    """Choose points so that all cells get their share: first every cell's strongest, then the second strongest, ...
+
+    Args:
+        cells: Cell of each point ``[N]``.
+        response: Strength of each point ``[N]``.
+        xy: Positions ``[N, 2]``, to break ties independently of the order of detection.
+        quota: How many points to choose at most.
+
+    Returns:
+        Indices of the chosen points, at most `quota`, in order of rank and strength.
+    """
+    order = np.lexsort((xy[:, 0], xy[:, 1], -response, cells))
+    sorted_cells = cells[order]
+    starts = np.flatnonzero(np.r_[True, sorted_cells[1:] != sorted_cells[:-1]]) if len(order) else np.zeros(0, int)
+    lengths = np.diff(np.r_[starts, len(order)])
+    rank = np.arange(len(order)) - np.repeat(starts, lengths)
+    best = np.lexsort((-response[order], rank))[:quota]
+    return np.asarray(order[best], dtype=np.int64)
+
+
+def _detect(
+    detector: cv2.FastFeatureDetector, image: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    if min(image.shape) < 7:
+        return np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    found = detector.detect(image)
+    xy = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32).reshape(-1, 2)
+    return xy, np.array([point.response for point in found], dtype=np.float32)
+
+
+def _cell_of(xy: NDArray[np.float32], cell: int, columns: int) -> NDArray[np.int64]:
+    column, row = (xy // cell).astype(np.int64).T if len(xy) else np.zeros((2, 0), np.int64)
+    return row * columns + column

@@ -1,0 +1,332 @@
+"""The back end that all trackers share: what turns the kept features of a frame into a pose and a map."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.culling.filter import FrameBundle, KeyframeView
+from dynslam_bench.features.keypoints import Keypoints
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .history import History
+from .map import Map
+from .mapping import LocalMapper
+from .observation import Observations, observe
+from .outputs import KeyframeRecord, MapOutputs
+from .relocalisation import locate
+from .result import TrackResult
+from .settings import BackendSettings
+from .tracking import ENOUGH_FIRST, Matches, Tracked, local_points, match_last_frame, match_map, solve
+
+Array = NDArray[np.float64]
+State = Literal["initialising", "ok", "lost"]
+
+MIN_INITIAL = 60
+"""Features with depth that the first keyframe needs."""
+MAX_EXTRAPOLATION_S = 0.25
+"""After a longer gap between frames the motion model is not trusted: the prediction is the last pose."""
+
+
+class RgbdBackend:
+    """Tracks frames against a map that it builds.
+
+    Args:
+        settings: Of tracking, mapping, bundle adjustment, keyframes and relocalisation.
+        scale_factor: Ratio of consecutive pyramid levels of the features that will come.
+        levels: Number of pyramid levels of the features that will come.
+    """
+
+    def __init__(self, settings: BackendSettings | None = None, *, scale_factor: float = 1.2, levels: int = 8) -> None:
+        self.settings = settings or BackendSettings()
+        self._scales = scale_factor ** np.arange(max(levels, 1), dtype=np.float64)
+        self._ready = False
+
+    def reset(self, camera: Camera, seed: int) -> None:
+        """Forget everything: a new sequence begins.
+
+        Args:
+            camera: Intrinsics; keypoints' `xy` come undistorted, so its distortion plays no role here.
+            seed: Founds all random draws.
+        """
+        self.camera = camera.undistorted()
+        self.seed = int(seed)
+        self.world = Map(self.camera, self._scales)
+        self.mapper = LocalMapper(self.world, self.settings)
+        self.history = History()
+        self.state: State = "initialising"
+        self._last: Tracked | None = None
+        self._velocity: Array | None = None
+        self._velocity_dt = 0.0
+        self._reference = -1
+        self._last_keyframe_frame = -1
+        self._frame = -1
+        self._next_stamp: float | None = None
+        self._depth_images: dict[int, NDArray[np.float32]] = {}
+        self._ready = True
+
+    # ------------------------------------------------------------------ prediction
+
+    def predict(self) -> Array | None:
+        """The motion model's camera-to-world pose for the next frame; None when nothing is known yet.
+
+        While lost this is the last tracked pose.
+        """
+        if self._last is None:
+            return None
+        return se3.inverse(self._predicted(None))
+
+    def _predicted(self, stamp: float | None) -> Array:
+        assert self._last is not None
+        if self._velocity is None or self.state != "ok":
+            return self._last.T_cam_world
+        motion = self._velocity
+        if stamp is not None and self._velocity_dt > 0:
+            dt = stamp - self._last.timestamp
+            if not 0 < dt <= MAX_EXTRAPOLATION_S:
+                return self._last.T_cam_world
+            ratio = dt / self._velocity_dt
+            if abs(ratio - 1.0) > 0.2:
+                motion = se3.exp(se3.log(motion) * ratio)
+        return np.asarray(motion @ self._last.T_cam_world)
+
+    # ------------------------------------------------------------------ one frame
+
+    def track(
+        self,
+        frame: FrameBundle,
+        keep: NDArray[np.bool_],
+        weight: NDArray[np.float32],
+        dynamic_mask: NDArray[np.bool_] | None = None,
+    ) -> TrackResult:
+        """Find the frame's pose and, if it shows enough new, make it a keyframe.
+
+        Args:
+            frame: The frame with its features.
+            keep: bool ``[N]``; features with False enter neither tracking nor map.
+            weight: float32 ``[N]`` in [0, 1], confidence that a feature is static.
+            dynamic_mask: bool ``[H, W]``, pixels held for dynamic; passed on in the result.
+
+        Returns:
+            The pose (after bundle adjustment if the frame became a keyframe), state, stats and timings.
+        """
+        assert self._ready, "reset() comes before track()"
+        begin = perf_counter()
+        self._frame = frame.index
+        seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
+        stats = {"matches": 0.0, "inliers": 0.0, "keyframe": 0.0, "residual_px": 0.0, "relocalised": 0.0}
+        timings = {"tracking": 0.0, "mapping": 0.0, "bundle_adjustment": 0.0}
+        pose: Array | None
+        if self.world.keyframe_count == 0:
+            pose = self._initialise(frame, seen, timings, stats)
+        else:
+            pose = self._localise(frame, seen, timings, stats)
+        timings["tracking"] = perf_counter() - begin - timings["mapping"] - timings["bundle_adjustment"]
+        return TrackResult(
+            None if pose is None else se3.inverse(pose), self.state, self._stats(frame, keep, dynamic_mask, stats),
+            timings, dynamic_mask, frame.keypoints.xy, np.asarray(keep, bool),
+        )  # fmt: skip
+
+    def _initialise(
+        self, frame: FrameBundle, seen: Observations, timings: dict[str, float], stats: dict[str, float]
+    ) -> Array | None:
+        if np.count_nonzero(seen.z > 0) < MIN_INITIAL:
+            return None
+        pose = np.eye(4)
+        tracked = Tracked(seen, np.full(len(seen), -1, np.int64), pose, frame.timestamp)
+        self.state = "ok"
+        self._last = tracked
+        self._make_keyframe(frame, tracked, timings)
+        stats["keyframe"] = 1.0
+        stats["matches"] = stats["inliers"] = float(np.count_nonzero(tracked.point >= 0))
+        self.history.append(frame.timestamp, self._reference, np.eye(4))
+        return pose
+
+    def _localise(
+        self, frame: FrameBundle, seen: Observations, timings: dict[str, float], stats: dict[str, float]
+    ) -> Array:
+        assert self._last is not None
+        last = self._last
+        prediction = self._predicted(frame.timestamp)
+        matches, pose = self._first_pose(seen, last, prediction, stats)
+        inliers: NDArray[np.bool_] = np.zeros(0, bool)
+        residual = 0.0
+        if matches is not None:
+            found, in_view = match_map(
+                self.world, seen, pose, matches,
+                local_points(self.world, matches, self.settings.tracking.local_map), self.settings.tracking,
+            )  # fmt: skip
+            matches = matches.joined(found)
+            mapped = matches.select(matches.point >= 0)
+            if len(mapped) >= 2 * self.settings.tracking.min_inliers:
+                matches = mapped
+            estimate = solve(self.world, seen, matches, pose)
+            inliers = estimate.inliers & (matches.point >= 0)
+            pose, residual = estimate.T_cam_world, estimate.residual_px
+            self.world.visible[in_view] += 1
+            stats["matches"] = float(len(matches))
+            stats["inliers"] = float(np.count_nonzero(inliers))
+        if matches is None or np.count_nonzero(inliers) < self._needed_inliers() or not np.isfinite(pose).all():
+            self.state = "lost"
+            self._velocity = None
+            return prediction
+        stats["residual_px"] = residual
+        points = matches.point[inliers]
+        self.world.found[points] += 1
+        point = np.full(len(seen), -1, np.int64)
+        point[matches.feature[inliers]] = points
+        tracked = Tracked(seen, point, pose, frame.timestamp)
+        dt = frame.timestamp - last.timestamp
+        fresh = self.state == "ok" and 0 < dt <= MAX_EXTRAPOLATION_S
+        self._velocity = pose @ se3.inverse(last.T_cam_world) if fresh else None
+        self._velocity_dt = dt
+        self.state = "ok"
+        self._last = tracked
+        near, _ = self.world.covisible_of(points)
+        if len(near):
+            self._reference = int(near[0])
+        if self._wants_keyframe(tracked):
+            self._make_keyframe(frame, tracked, timings)
+            stats["keyframe"] = 1.0
+        pose = tracked.T_cam_world
+        self.history.append(frame.timestamp, self._reference, pose @ se3.inverse(self.world.kf_pose[self._reference]))
+        return pose
+
+    def _needed_inliers(self) -> int:
+        return self.settings.tracking.min_inliers if self.state == "ok" else self.settings.relocalisation.min_inliers
+
+    def _first_pose(
+        self, seen: Observations, last: Tracked, prediction: Array, stats: dict[str, float]
+    ) -> tuple[Matches | None, Array]:
+        """A first pose: from the last frame; else from the reference keyframe; else from any keyframe."""
+        s = self.settings.tracking
+        for widen in (1.0, 2.5):
+            matches = match_last_frame(
+                self.world, last, seen, prediction, widen * s.radius_px, self.mapper.close_m, s.max_distance
+            )
+            if len(matches) < ENOUGH_FIRST:
+                continue
+            estimate = solve(self.world, seen, matches, prediction, rounds=3)
+            if estimate.count >= ENOUGH_FIRST // 2:
+                return matches.select(estimate.inliers), estimate.T_cam_world
+        rng = stream(self.seed, "relocalisation", self._frame)
+        tries = [[self._reference]] if self.state == "ok" else []
+        tries.append(self.world.keyframes.tolist())
+        for keyframes in tries:
+            found = locate(self.world, keyframes, seen, self.settings.relocalisation, rng, s.min_inliers)
+            if found is not None and found.estimate.count >= ENOUGH_FIRST // 2:
+                stats["relocalised"] = 1.0
+                return found.matches.select(found.estimate.inliers), found.estimate.T_cam_world
+        return None, prediction
+
+    # ------------------------------------------------------------------ keyframes
+
+    def _wants_keyframe(self, tracked: Tracked) -> bool:
+        s = self.settings.keyframes
+        gap = self._frame - self._last_keyframe_frame
+        if gap <= s.min_gap:
+            return False
+        close = (tracked.seen.z > 0) & (tracked.seen.z < self.mapper.close_m)
+        known = tracked.point >= 0
+        tracked_close = int(np.count_nonzero(close & known))
+        new_close = int(np.count_nonzero(close & ~known))
+        hungry = tracked_close < s.min_close and new_close > s.new_close
+        reference = self.world.kf_point[self._reference, : self.world.kf_count[self._reference]]
+        reference = reference[reference >= 0]
+        mature = 2 if self.world.keyframe_count <= 2 else 3
+        total = int(np.count_nonzero(self.world.n_obs[reference] >= mature)) or len(reference)
+        inliers = int(np.count_nonzero(known))
+        weak = inliers < s.tracked_share * total
+        return bool((weak or hungry or (gap >= s.max_gap and new_close > s.new_close)) and inliers > 15)
+
+    def _make_keyframe(self, frame: FrameBundle, tracked: Tracked, timings: dict[str, float]) -> None:
+        slot, spent = self.mapper.insert(tracked.seen, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp)
+        timings.update(spent)
+        self._reference = slot
+        self._last_keyframe_frame = frame.index
+        for dropped, heir, relative in self.mapper.dropped:
+            self.history.inherit(dropped, heir, relative)
+            self._depth_images.pop(dropped, None)
+        self._depth_images[slot] = frame.depth
+        for old in self.world.keyframes[: -self.settings.keyframes.depth_images or None].tolist():
+            self._depth_images.pop(old, None)
+        tracked.point = self.world.kf_point[slot, : len(tracked.seen)].astype(np.int64)
+        tracked.T_cam_world = self.world.kf_pose[slot].copy()
+        self.world.release()
+
+    # ------------------------------------------------------------------ what others may see
+
+    def _stats(
+        self, frame: FrameBundle, keep: NDArray[np.bool_], mask: NDArray[np.bool_] | None, stats: dict[str, float]
+    ) -> dict[str, float]:
+        return {
+            "keypoints": float(len(frame)),
+            "culled": float(len(frame) - np.count_nonzero(keep)),
+            "matches": stats["matches"],
+            "inliers": stats["inliers"],
+            "map_points": float(len(self.world.points)),
+            "keyframes": float(self.world.keyframe_count),
+            "keyframe": stats["keyframe"],
+            "residual_px": stats["residual_px"],
+            "mask_fraction": 0.0 if mask is None else float(np.count_nonzero(mask)) / max(mask.size, 1),
+            "relocalised": stats["relocalised"],
+        }
+
+    def keyframe_views(self, limit: int) -> tuple[KeyframeView, ...]:
+        """The newest keyframes, newest first, at most `limit`."""
+        world = self.world
+        views = []
+        for slot in world.keyframes[::-1][: max(limit, 0)].tolist():
+            n = int(world.kf_count[slot])
+            keypoints = Keypoints(
+                world.kf_raw[slot, :n], world.kf_octave[slot, :n].astype(np.int32), world.kf_angle[slot, :n],
+                world.kf_response[slot, :n], world.kf_words[slot, :n].view(np.uint8),
+            )  # fmt: skip
+            views.append(
+                KeyframeView(
+                    world.T_world_cam(slot),
+                    keypoints,
+                    world.kf_xy[slot, :n],
+                    world.kf_z[slot, :n],
+                    self._depth_images.get(slot),
+                )  # fmt: skip
+            )
+        return tuple(views)
+
+    def map_points(self) -> tuple[NDArray[np.int64], Array]:
+        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points."""
+        points = self.world.points
+        return self.world.id[points], self.world.position[points]
+
+    def finalize(self) -> Trajectory:
+        """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes."""
+        stamps, poses = self.history.poses(self.world)
+        order = np.argsort(stamps, kind="stable")
+        fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
+        return Trajectory(stamps[order][fresh], poses[order][fresh])
+
+    def outputs(self) -> MapOutputs:
+        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
+        world = self.world
+        slots = world.keyframes
+        records = tuple(
+            KeyframeRecord(
+                int(world.kf_id[slot]),
+                int(world.kf_frame[slot]),
+                float(world.kf_stamp[slot]),
+                world.T_world_cam(slot),
+                int(world.kf_count[slot]),
+                int(np.count_nonzero(world.kf_point[slot, : world.kf_count[slot]] >= 0)),
+            )  # fmt: skip
+            for slot in slots.tolist()
+        )
+        points = world.points
+        return MapOutputs(
+            records, world.id[points], world.position[points], world.rgb[points], world.n_obs[points].astype(np.int64)
+        )

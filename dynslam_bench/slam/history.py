@@ -1,0 +1,46 @@
+"""The poses of all tracked frames, each kept relative to a keyframe so that later refinement moves it along."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry import se3
+
+from .map import Map
+
+Array = NDArray[np.float64]
+
+
+class History:
+    """Frames with stamp, reference keyframe and pose relative to it; grows by doubling."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._stamp = np.zeros(64)
+        self._reference = np.zeros(64, np.int32)
+        self._relative = np.zeros((64, 4, 4))
+
+    def append(self, stamp: float, reference: int, T_cam_ref: Array) -> None:
+        """Note a tracked frame: its stamp, its reference keyframe's slot and ``T_cam_ref``."""
+        if self.count == len(self._stamp):
+            for name in ("_stamp", "_reference", "_relative"):
+                old = getattr(self, name)
+                new = np.zeros((2 * len(old), *old.shape[1:]), old.dtype)
+                new[: len(old)] = old
+                setattr(self, name, new)
+        self._stamp[self.count] = stamp
+        self._reference[self.count] = reference
+        self._relative[self.count] = T_cam_ref
+        self.count += 1
+
+    def inherit(self, dropped: int, heir: int, T_dropped_heir: Array) -> None:
+        """Re-anchor the frames of a removed keyframe."""
+        rows = np.flatnonzero(self._reference[: self.count] == dropped)
+        self._relative[rows] = self._relative[rows] @ T_dropped_heir
+        self._reference[rows] = heir
+
+    def poses(self, world: Map) -> tuple[Array, Array]:
+        """Stamps ``[N]`` and camera-to-world poses ``[N, 4, 4]`` of all frames with the keyframes as they are now."""
+        n = self.count
+        return self._stamp[:n].copy(), se3.inverse(self._relative[:n] @ world.kf_pose[self._reference[:n]])

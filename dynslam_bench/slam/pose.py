@@ -1,0 +1,285 @@
+"""Robust pose optimisation against known points: Gauss-Newton on SE(3) with the right coordinate of depth.
+
+The residual of a point is ``(u - u', v - v', ur - (u' - b f / z'))``; features without depth have the first two rows
+only. Rounds of a Huber-weighted Gauss-Newton alternate with a chi-square test that sets outliers aside, as in motion-only
+bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos, 2017, Section III-C).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry.camera import Camera
+
+Array = NDArray[np.float64]
+
+CHI2_MONO = 5.991
+"""95 % quantile of chi-square with two degrees of freedom."""
+CHI2_DEPTH = 7.815
+"""95 % quantile of chi-square with three degrees of freedom."""
+NEAR_M = 0.05
+"""Points nearer than this to the camera plane are never inliers."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Outcome of `optimise_pose`.
+
+    Attributes:
+        T_cam_world: World-to-camera pose ``[4, 4]``.
+        inliers: bool ``[N]``.
+        residual_px: Median reprojection error of the inliers in pixels of octave 0; NaN without any.
+        information: Gauss-Newton matrix ``[6, 6]`` of (translation, rotation) in the camera frame.
+    """
+
+    T_cam_world: Array
+    inliers: NDArray[np.bool_]
+    residual_px: float
+    information: Array
+
+    @property
+    def count(self) -> int:
+        """Number of inliers."""
+        return int(np.count_nonzero(self.inliers))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def cholesky_solve(a: Array, b: Array) -> bool:
+    """Solve ``a x = b`` in place for a symmetric positive definite `a`; `b` becomes x. False if it is not definite."""
+    n = a.shape[0]
+    for j in range(n):
+        for i in range(j, n):
+            s = a[i, j]
+            for k in range(j):
+                s -= a[i, k] * a[j, k]
+            if i == j:
+                if not s > 1e-14:
+                    return False
+                a[j, j] = np.sqrt(s)
+            else:
+                a[i, j] = s / a[j, j]
+    for i in range(n):
+        s = b[i]
+        for k in range(i):
+            s -= a[i, k] * b[k]
+        b[i] = s / a[i, i]
+    for i in range(n - 1, -1, -1):
+        s = b[i]
+        for k in range(i + 1, n):
+            s -= a[k, i] * b[k]
+        b[i] = s / a[i, i]
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def apply_twist(pose: Array, xi: Array) -> Array:
+    """``exp(xi) @ pose`` for a twist (translation, rotation), re-orthonormalised."""
+    theta2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
+    theta = np.sqrt(theta2)
+    if theta < 1e-8:
+        a, b, c = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    else:
+        a, b, c = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2, (theta - np.sin(theta)) / (theta2 * theta)
+    k = np.zeros((3, 3))
+    k[0, 1], k[0, 2], k[1, 2] = -xi[5], xi[4], -xi[3]
+    k[1, 0], k[2, 0], k[2, 1] = xi[5], -xi[4], xi[3]
+    k2 = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for m in range(3):
+                k2[i, j] += k[i, m] * k[m, j]
+    step = np.eye(4)
+    for i in range(3):
+        for j in range(3):
+            step[i, j] += a * k[i, j] + b * k2[i, j]
+            step[i, 3] += (b * k[i, j] + c * k2[i, j]) * xi[j]
+        step[i, 3] += xi[i]
+    out = np.eye(4)
+    for i in range(3):
+        for j in range(4):
+            s = step[i, 3] if j == 3 else 0.0
+            for m in range(3):
+                s += step[i, m] * pose[m, j]
+            out[i, j] = s
+    # Gram-Schmidt on the rows keeps rounding from building up
+    n = np.sqrt(out[0, 0] ** 2 + out[0, 1] ** 2 + out[0, 2] ** 2)
+    for j in range(3):
+        out[0, j] /= n
+    d = out[0, 0] * out[1, 0] + out[0, 1] * out[1, 1] + out[0, 2] * out[1, 2]
+    for j in range(3):
+        out[1, j] -= d * out[0, j]
+    n = np.sqrt(out[1, 0] ** 2 + out[1, 1] ** 2 + out[1, 2] ** 2)
+    for j in range(3):
+        out[1, j] /= n
+    out[2, 0] = out[0, 1] * out[1, 2] - out[0, 2] * out[1, 1]
+    out[2, 1] = out[0, 2] * out[1, 0] - out[0, 0] * out[1, 2]
+    out[2, 2] = out[0, 0] * out[1, 1] - out[0, 1] * out[1, 0]
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _linearise(
+    pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array, active: NDArray[np.bool_],
+    huber: bool, fx: float, fy: float, cx: float, cy: float, bf: float, h: Array, g: Array,
+) -> float:  # fmt: skip
+    h[:] = 0.0
+    g[:] = 0.0
+    cost = 0.0
+    j = np.zeros((3, 6))
+    r = np.zeros(3)
+    for i in range(points.shape[0]):
+        if not active[i]:
+            continue
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        depth = info_right[i] > 0.0
+        limit = CHI2_DEPTH if depth else CHI2_MONO
+        if z < NEAR_M:
+            cost += limit
+            continue
+        iz = 1.0 / z
+        u = fx * x * iz + cx
+        r[0] = uv[i, 0] - u
+        r[1] = uv[i, 1] - (fy * y * iz + cy)
+        r[2] = right[i] - (u - bf * iz) if depth else 0.0
+        chi2 = info[i] * (r[0] * r[0] + r[1] * r[1]) + (info_right[i] * r[2] * r[2] if depth else 0.0)
+        w = 1.0
+        if huber and chi2 > limit:
+            w = np.sqrt(limit / chi2)
+            cost += 2.0 * np.sqrt(limit * chi2) - limit
+        else:
+            cost += chi2
+        a, b = fx * iz, fy * iz
+        j[0, 0], j[0, 1], j[0, 2] = a, 0.0, -a * x * iz
+        j[0, 3], j[0, 4], j[0, 5] = -fx * x * y * iz * iz, fx * (1.0 + x * x * iz * iz), -a * y
+        j[1, 0], j[1, 1], j[1, 2] = 0.0, b, -b * y * iz
+        j[1, 3], j[1, 4], j[1, 5] = -fy * (1.0 + y * y * iz * iz), fy * x * y * iz * iz, b * x
+        c = bf * iz * iz
+        j[2, 0], j[2, 1], j[2, 2] = j[0, 0], 0.0, j[0, 2] + c
+        j[2, 3], j[2, 4], j[2, 5] = j[0, 3] + c * y, j[0, 4] - c * x, j[0, 5]
+        for row in range(3 if depth else 2):
+            weight = w * (info_right[i] if row == 2 else info[i])
+            for m in range(6):
+                f = weight * j[row, m]
+                g[m] += f * r[row]
+                for n in range(m + 1):
+                    h[m, n] += f * j[row, n]
+    for m in range(6):
+        for n in range(m):
+            h[n, m] = h[m, n]
+    return cost
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _classify(
+    pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
+    fx: float, fy: float, cx: float, cy: float, bf: float, inlier: NDArray[np.bool_], error: Array,
+) -> None:  # fmt: skip
+    for i in range(points.shape[0]):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        inlier[i] = False
+        error[i] = np.inf
+        if z < NEAR_M:
+            continue
+        du = uv[i, 0] - (fx * x / z + cx)
+        dv = uv[i, 1] - (fy * y / z + cy)
+        chi2 = info[i] * (du * du + dv * dv)
+        error[i] = np.sqrt(chi2)
+        limit = CHI2_MONO
+        if info_right[i] > 0.0:
+            dr = right[i] - (fx * x / z + cx - bf / z)
+            chi2 += info_right[i] * dr * dr
+            limit = CHI2_DEPTH
+        inlier[i] = chi2 <= limit
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _optimise(
+    pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
+    fx: float, fy: float, cx: float, cy: float, bf: float, rounds: int, iterations: int,
+) -> tuple[Array, NDArray[np.bool_], Array, Array]:  # fmt: skip
+    n = points.shape[0]
+    inlier = np.ones(n, np.bool_)
+    error = np.zeros(n)
+    h, g = np.zeros((6, 6)), np.zeros(6)
+    work = np.zeros((6, 6))
+    for turn in range(rounds):
+        huber = turn < rounds - 1
+        damping = 1e-6
+        cost = _linearise(pose, points, uv, right, info, info_right, inlier, huber, fx, fy, cx, cy, bf, h, g)
+        for _ in range(iterations):
+            work[:] = h
+            for m in range(6):
+                work[m, m] += damping * h[m, m] + 1e-9
+            step = g.copy()
+            if not cholesky_solve(work, step):
+                break
+            candidate = apply_twist(pose, step)
+            h2, g2 = np.zeros((6, 6)), np.zeros(6)
+            new = _linearise(candidate, points, uv, right, info, info_right, inlier, huber, fx, fy, cx, cy, bf, h2, g2)
+            if new <= cost:
+                gain = cost - new
+                pose, cost = candidate, new
+                h[:], g[:] = h2, g2
+                damping = max(damping * 0.1, 1e-9)
+                if gain < 1e-4 * (cost + 1e-12):
+                    break
+            else:
+                damping *= 100.0
+                if damping > 1e3:
+                    break
+        _classify(pose, points, uv, right, info, info_right, fx, fy, cx, cy, bf, inlier, error)
+        count = 0
+        for i in range(n):
+            count += inlier[i]
+        if count < 6:
+            break
+    return pose, inlier, error, h
+
+
+def optimise_pose(
+    T_cam_world: Array,
+    points: Array,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    camera: Camera,
+    *,
+    rounds: int = 4,
+    iterations: int = 6,
+) -> PoseEstimate:
+    """The world-to-camera pose that fits the points to the pixels, and which of them fit.
+
+    Args:
+        T_cam_world: Where to start ``[4, 4]``.
+        points: World points ``[N, 3]``, metres.
+        uv: Undistorted pixels ``[N, 2]``.
+        right: Right coordinates ``[N]``; ignored where `info_right` is 0.
+        info: Inverse variances of the pixels ``[N]``, 1/px^2.
+        info_right: Inverse variances of the right coordinates ``[N]``, 0 without depth.
+        camera: Intrinsics and baseline.
+        rounds: Optimisations, each followed by a new sorting into inliers and outliers.
+        iterations: Gauss-Newton steps a round at most.
+
+    Returns:
+        The pose; with fewer than six points the start pose and no inliers.
+    """
+    if len(points) < 6:
+        return PoseEstimate(T_cam_world, np.zeros(len(points), bool), float("nan"), np.zeros((6, 6)))
+    pose, inliers, error, h = _optimise(
+        np.ascontiguousarray(T_cam_world, np.float64), np.ascontiguousarray(points), np.ascontiguousarray(uv),
+        np.ascontiguousarray(right), np.ascontiguousarray(info), np.ascontiguousarray(info_right),
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m, rounds, iterations,
+    )  # fmt: skip
+    residual = float(np.median(error[inliers])) if inliers.any() else float("nan")
+    return PoseEstimate(pose, inliers, residual, h)

@@ -1,0 +1,149 @@
+"""Settings of the back end; importing this loads neither OpenCV nor numba."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dynslam_bench.core.settings import Settings, tunable
+
+
+class TrackingSettings(Settings):
+    """Finding the pose of a frame against the map."""
+
+    radius_px: float = tunable(
+        15.0, low=5.0, high=40.0, limits=(1.0, 300.0), unit="px", online=True,
+        meaning="search window around the predicted position of a feature of the last frame, at octave 0",
+    )  # fmt: skip
+    map_radius_px: float = tunable(
+        4.0, low=1.5, high=12.0, limits=(0.5, 100.0), unit="px", online=True,
+        meaning="search window around the projection of a map point, at octave 0",
+    )  # fmt: skip
+    max_distance: int = tunable(
+        90, low=40, high=120, limits=(1, 256), unit="bits", online=True,
+        meaning="largest Hamming distance of a match by projection",
+    )  # fmt: skip
+    ratio: float = tunable(
+        0.85, low=0.6, high=1.0, limits=(0.1, 1.0), online=True,
+        meaning="nearest over second nearest descriptor distance allowed when map points are searched",
+    )  # fmt: skip
+    min_inliers: int = tunable(
+        25, low=10, high=60, limits=(6, 1000), meaning="fewer inliers after the last optimisation mean lost"
+    )
+    local_map: Literal["all", "covisible"] = tunable(
+        "all", meaning="search all map points in view, or only those of covisible keyframes"
+    )
+    close_factor: float = tunable(
+        40.0, low=20.0, high=80.0, limits=(1.0, 1000.0), unit="baselines",
+        meaning="points nearer than this many stereo baselines are close: their depth is trusted at once",
+    )  # fmt: skip
+    right_sigma_px: float = tunable(
+        1.0, low=0.3, high=3.0, limits=(0.05, 50.0), scale="log", unit="px",
+        meaning="standard deviation of the right coordinate at octave 0, beside the depth sensor's noise",
+    )  # fmt: skip
+    depth_noise: float = tunable(
+        0.0025, low=0.0005, high=0.02, limits=(0.0, 1.0), scale="log", unit="1/m",
+        meaning="standard deviation of the depth over its square",
+    )  # fmt: skip
+
+
+class KeyframeSettings(Settings):
+    """When a frame becomes a keyframe, and when a keyframe is redundant."""
+
+    min_gap: int = tunable(
+        0, low=0, high=10, limits=(0, 1000), unit="frames", meaning="frames between keyframes, at least"
+    )
+    max_gap: int = tunable(
+        30, low=10, high=90, limits=(1, 100000), unit="frames",
+        meaning="after so many frames a keyframe is made if it shows anything new",
+    )  # fmt: skip
+    tracked_share: float = tunable(
+        0.75, low=0.4, high=0.95, limits=(0.0, 1.0), online=True,
+        meaning="a keyframe is made when fewer than this share of the reference keyframe's points are tracked",
+    )  # fmt: skip
+    min_close: int = tunable(
+        100, low=30, high=300, limits=(0, 10000), meaning="a keyframe is made when fewer close points are tracked"
+    )
+    new_close: int = tunable(
+        70, low=20, high=200, limits=(0, 10000), meaning="and when at least so many close features are not in the map"
+    )
+    redundant_share: float = tunable(
+        0.9, low=0.7, high=1.0, limits=(0.1, 1.0),
+        meaning="a keyframe goes when this share of its points is seen by three others at the same scale or finer",
+    )  # fmt: skip
+    maximum: int = tunable(
+        600, low=50, high=2000, limits=(10, 100000), scale="log", meaning="keyframes kept at most; bounds the memory"
+    )
+    depth_images: int = Field(8, ge=0, le=1000, description="newest keyframes that keep their depth image, for filters")
+
+
+class MappingSettings(Settings):
+    """Growing and cleaning the map at each keyframe."""
+
+    neighbours: int = tunable(
+        8, low=3, high=20, limits=(1, 100), meaning="covisible keyframes that new points are sought in and fused with"
+    )
+    triangulate: bool = tunable(True, meaning="triangulate features without depth")
+    min_parallax_deg: float = tunable(
+        1.0, low=0.2, high=3.0, limits=(0.01, 30.0), unit="deg", meaning="smallest parallax of a triangulated point"
+    )
+    min_found_ratio: float = tunable(
+        0.25, low=0.1, high=0.6, limits=(0.0, 1.0),
+        meaning="a point goes when it is found in fewer than this share of the frames that should see it",
+    )  # fmt: skip
+    min_observations: int = tunable(
+        2, low=1, high=4, limits=(1, 10),
+        meaning="a point goes when, three keyframes after its creation, fewer keyframes observe it",
+    )  # fmt: skip
+
+
+class BundleAdjustmentSettings(Settings):
+    """Local bundle adjustment at each keyframe; its work is bounded by counts, never by the clock."""
+
+    enabled: bool = tunable(True, meaning="whether to refine keyframes and points at each keyframe")
+    solver: Literal["schur", "gtsam"] = tunable("schur", meaning="own vectorised Schur complement, or gtsam")
+    window: int = tunable(
+        8, low=2, high=20, limits=(1, 100), meaning="keyframes that are refined: the newest and its covisible ones"
+    )
+    fixed: int = tunable(
+        6, low=1, high=20, limits=(0, 100), meaning="further keyframes that see the same points and stay where they are"
+    )
+    observations: int = tunable(
+        6000, low=1000, high=20000, limits=(100, 1000000), scale="log",
+        meaning="observations used at most: the budget that bounds the keyframe's step",
+    )  # fmt: skip
+    iterations: int = tunable(3, low=1, high=10, limits=(1, 100), meaning="Levenberg-Marquardt iterations")
+
+
+class RelocalisationSettings(Settings):
+    """Finding the pose again after tracking was lost."""
+
+    candidates: int = tunable(
+        5, low=1, high=20, limits=(1, 1000), meaning="keyframes with the most descriptor matches that PnP is tried on"
+    )
+    iterations: int = tunable(
+        150, low=30, high=1000, limits=(1, 100000), scale="log", meaning="RANSAC samples a candidate"
+    )
+    max_distance: int = tunable(
+        60, low=30, high=90, limits=(1, 256), unit="bits", meaning="largest Hamming distance of a match by descriptor"
+    )
+    min_inliers: int = tunable(
+        40, low=15, high=80, limits=(6, 1000), meaning="inliers that a recovered pose needs at least"
+    )
+
+
+class SmoothingSettings(Settings):
+    """Smoothing of the final trajectory by a constant-velocity prior; the online trajectory is never touched."""
+
+    enabled: bool = tunable(True, meaning="smooth the final trajectory")
+
+
+class BackendSettings(Settings):
+    """All settings of the back end."""
+
+    tracking: TrackingSettings = TrackingSettings()
+    keyframes: KeyframeSettings = KeyframeSettings()
+    mapping: MappingSettings = MappingSettings()
+    bundle_adjustment: BundleAdjustmentSettings = BundleAdjustmentSettings()
+    relocalisation: RelocalisationSettings = RelocalisationSettings()
