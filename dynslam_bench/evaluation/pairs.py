@@ -45,10 +45,11 @@ def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
     steps = se3.inverse(poses[:-1]) @ poses[1:]
     step: Array
     if spec.unit == "m":
-        step = np.linalg.norm(steps[:, :3, 3], axis=1)
+        step = np.asarray(np.linalg.norm(steps[:, :3, 3], axis=1), dtype=np.float64)
     else:
         step = se3.rotation_angle(steps) * (180 / np.pi if spec.unit == "deg" else 1.0)
-    return np.append(0.0, np.cumsum(step)).astype(np.float64)
+    index: Array = np.concatenate([np.zeros(1), np.cumsum(step)])
+    return index
 
 
 def tum_fixed_pairs(index: Array, delta: float) -> Index:

@@ -47,13 +47,14 @@ def tum_relative_errors(
 
     Args:
         estimate: Estimated camera-to-world poses; need not be aligned.
-        ground_truth: True poses, at least two.
+        ground_truth: True poses.
         spec: A ``tum-fixed`` or ``tum-random`` selection.
         scale: Factor applied to the estimate's relative translations.
     """
     pairs = select_pairs(estimate.timestamps, estimate.T_world_cam, spec)
     nearest = closest(ground_truth.timestamps, estimate.timestamps)
-    tolerance = 2 * float(np.median(np.diff(ground_truth.timestamps)))
+    intervals = np.diff(ground_truth.timestamps)
+    tolerance = 2 * float(np.median(intervals)) if len(intervals) else 0.0
     covered = nearest_gap(estimate.timestamps, ground_truth.timestamps) <= tolerance
     keep = covered[pairs].all(axis=1)
     kept = pairs[keep]

@@ -1,0 +1,129 @@
+"""The causal pose error: joined at the first frame with both, honest about holes, and quitting never pays."""
+
+import numpy as np
+import pytest
+
+from dynslam_bench.evaluation import OnlineError, Protocol, RPESpec, evaluate, hold
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+
+
+def walk(n=60, seed=0):
+    rng = np.random.default_rng(seed)
+    poses = [se3.exp(rng.normal(size=6))]
+    for _ in range(n - 1):
+        poses.append(poses[-1] @ se3.exp(rng.normal(0, 0.02, 6)))
+    return Trajectory(100 + np.arange(n) / 30, np.array(poses))
+
+
+def estimate_of(truth, seed=1):
+    rng = np.random.default_rng(seed)
+    noisy = truth.T_world_cam @ se3.exp(rng.normal(0, 0.01, (len(truth), 6)))
+    return se3.exp(rng.normal(size=6)) @ noisy
+
+
+def run(error, truth, poses, ok):
+    return [error.update(t, p, o) for t, p, o in zip(truth.timestamps, poses, ok, strict=True)]
+
+
+def test_cumulative_error_is_the_origin_aligned_ape():
+    truth = walk()
+    poses = estimate_of(truth)
+    samples = run(OnlineError(truth), truth, poses, [True] * len(truth))
+    result = evaluate(Trajectory(truth.timestamps, poses), truth, Protocol(id="x", alignment="origin"))
+    assert np.sqrt(np.mean([s.trans_m**2 for s in samples])) == pytest.approx(result.metrics["ate_rmse_m"], abs=1e-12)
+    assert max(s.rot_deg for s in samples) == pytest.approx(result.metrics["ape_rot_max_deg"], abs=1e-9)
+    assert samples[0].trans_m == pytest.approx(0, abs=1e-12)
+    assert samples[0].frame_trans_m is None
+
+
+def test_frame_to_frame_error_is_eq_26_over_one_frame():
+    truth = walk()
+    poses = estimate_of(truth)
+    samples = run(OnlineError(truth), truth, poses, [True] * len(truth))
+    protocol = Protocol(id="x", rpe=(RPESpec(delta=1, unit="f", pairs="all"),))
+    metrics = evaluate(Trajectory(truth.timestamps, poses), truth, protocol).metrics
+    frame = np.array([s.frame_trans_m for s in samples[1:]])
+    assert np.sqrt((frame**2).mean()) == pytest.approx(metrics["rpe_1f_trans_rmse_m"], abs=1e-12)
+    rotation = np.array([s.frame_rot_deg for s in samples[1:]])
+    assert rotation.max() == pytest.approx(metrics["rpe_1f_rot_max_deg"], abs=1e-9)
+
+
+def test_a_lost_frame_is_charged_as_not_moving():
+    truth = walk()
+    poses = estimate_of(truth)
+    ok = np.ones(len(truth), dtype=bool)
+    ok[20:30] = False
+    samples = run(OnlineError(truth), truth, poses, ok)
+    moved = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    way = np.linalg.norm(moved[:, :3, 3], axis=1)
+    for i in range(20, 31):  # the interval that ends the spell has a lost frame at its beginning
+        assert samples[i].frame_trans_m == pytest.approx(way[i - 1], abs=1e-12)
+    held = hold(Trajectory(truth.timestamps, poses).select(ok), truth.timestamps)
+    expected = run(OnlineError(truth), truth, held.T_world_cam, [True] * len(truth))
+    assert [s.trans_m for s in samples] == pytest.approx([s.trans_m for s in expected], abs=1e-12)
+
+
+def test_a_predicted_pose_of_a_lost_frame_counts_for_nothing():
+    truth = walk()
+    poses = estimate_of(truth)
+    ok = np.arange(len(truth)) < 25
+    without = [pose if good else None for pose, good in zip(poses, ok, strict=True)]
+    assert run(OnlineError(truth), truth, poses, ok) == run(OnlineError(truth), truth, without, ok)
+
+
+def test_a_tracker_that_never_starts_stands_at_the_first_true_pose():
+    truth = walk()
+    samples = run(OnlineError(truth), truth, [None] * len(truth), [False] * len(truth))
+    way = np.linalg.norm(truth.positions - truth.positions[0], axis=1)
+    assert [s.trans_m for s in samples] == pytest.approx(way.tolist(), abs=1e-12)
+
+
+def test_joined_at_the_first_frame_that_has_both():
+    truth = walk()
+    poses = estimate_of(truth)
+    ok = np.arange(len(truth)) >= 5
+    samples = run(OnlineError(truth), truth, poses, ok)
+    assert samples[5].trans_m == pytest.approx(0, abs=1e-12)
+    late = OnlineError(truth.select(slice(10, None)))
+    joined = run(late, truth, poses, [True] * len(truth))
+    assert joined[:10] == [None] * 10
+    assert joined[10].trans_m == pytest.approx(0, abs=1e-12)
+    assert joined[10].frame_trans_m is None
+    assert joined[11].frame_trans_m is not None
+
+
+def test_holes_give_none_and_the_pose_goes_on():
+    truth = walk()
+    poses = estimate_of(truth)
+    hole = truth.select(np.r_[0:20, 30 : len(truth)])
+    whole = run(OnlineError(truth), truth, poses, [True] * len(truth))
+    samples = run(OnlineError(hole), truth, poses, [True] * len(truth))
+    assert samples[20:30] == [None] * 10
+    assert samples[30].frame_trans_m is None
+    assert samples[30].trans_m == pytest.approx(whole[30].trans_m, abs=1e-12)
+    assert samples[31] == whole[31]
+
+
+def test_without_ground_truth_there_is_no_error():
+    truth = walk(5)
+    empty = truth.select(slice(0, 0))
+    for ground_truth in (None, empty):
+        assert run(OnlineError(ground_truth), truth, truth.T_world_cam, [True] * 5) == [None] * 5
+
+
+def test_causal_and_repeatable():
+    truth = walk()
+    poses = estimate_of(truth)
+    error = OnlineError(truth)
+    whole = run(error, truth, poses, [True] * len(truth))
+    error.reset()
+    other = poses.copy()
+    other[30:] = np.eye(4)
+    assert run(error, truth, other, [True] * len(truth))[:30] == whole[:30]
+
+
+def test_the_tolerance_is_strict():
+    truth = Trajectory(np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1)))
+    assert OnlineError(truth, max_dt=0.5).update(0.5, np.eye(4), True) is None
+    assert OnlineError(truth, max_dt=0.5).update(0.499, np.eye(4), True) is not None

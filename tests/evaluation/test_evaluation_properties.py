@@ -1,0 +1,413 @@
+"""What must hold whatever the numbers: invariances, statistics, policies, holes, and clear refusals."""
+
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.evaluation import (
+    PROTOCOLS,
+    Evaluation,
+    Protocol,
+    RPESpec,
+    common_frames,
+    compare_masks,
+    compare_protocols,
+    coverage,
+    evaluate,
+    evaluate_files,
+    get_protocol,
+    hold,
+    never_move,
+    pose_errors,
+)
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.evaluation.segments import segment_errors
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.tum_file import write_tum
+
+
+def walk(seed=0, n=200, rate=30.0):
+    rng = np.random.default_rng(seed)
+    poses = [se3.exp(rng.normal(size=6))]
+    for _ in range(n - 1):
+        poses.append(poses[-1] @ se3.exp(rng.normal(0, 0.01, 6)))
+    return Trajectory(np.round(1311868163.0 + np.arange(n) / rate, 6), np.array(poses))
+
+
+def noisy(truth, seed=1, size=0.01):
+    rng = np.random.default_rng(seed)
+    return Trajectory(truth.timestamps, truth.T_world_cam @ se3.exp(rng.normal(0, size, (len(truth), 6))))
+
+
+def turned(trajectory, seed):
+    return trajectory.transformed(se3.exp(np.random.default_rng(seed).normal(0, 2, 6)))
+
+
+def close(a, b, tolerance=1e-9):
+    assert a.keys() == b.keys()
+    for key in a:
+        assert a[key] == pytest.approx(b[key], abs=tolerance, rel=1e-7), key
+
+
+@pytest.mark.parametrize("name", sorted(PROTOCOLS))
+def test_a_perfect_estimate_scores_zero(name):
+    truth = walk()
+    metrics = evaluate(truth, truth, name).metrics
+    assert all(abs(v) < 1e-6 for k, v in metrics.items() if not k.startswith("never_move"))
+    assert metrics["never_move_ate_rmse_m"] > 0.05
+
+
+@pytest.mark.parametrize("name", ["tum-rgbd/v1", "tum-rgbd/v1-random-pairs", "vslam-lab", "kitti"])
+def test_the_world_frame_of_the_estimate_does_not_matter(name):
+    truth, seed = walk(), 5
+    estimate = noisy(truth)
+    close(evaluate(estimate, truth, name).metrics, evaluate(turned(estimate, seed), truth, name).metrics)
+
+
+def test_the_world_frame_of_both_does_not_matter():
+    truth = walk()
+    estimate = noisy(truth)
+    close(evaluate(estimate, truth).metrics, evaluate(turned(estimate, 2), turned(truth, 3)).metrics)
+
+
+def test_relative_errors_need_no_alignment_and_absolute_ones_do():
+    truth = walk()
+    moved = turned(noisy(truth), 4)
+    none = evaluate(moved, truth, get_protocol("tum-rgbd/v1").model_copy(update={"alignment": "none"})).metrics
+    se3_aligned = evaluate(moved, truth).metrics
+    assert none["rpe_1s_trans_rmse_m"] == pytest.approx(se3_aligned["rpe_1s_trans_rmse_m"], abs=1e-12)
+    assert none["ate_rmse_m"] > 10 * se3_aligned["ate_rmse_m"]
+
+
+def test_sim3_finds_the_scale_and_se3_does_not():
+    truth = walk()
+    scaled = truth.T_world_cam.copy()
+    scaled[:, :3, 3] *= 0.5
+    estimate = turned(Trajectory(truth.timestamps, scaled), 8)
+    result = evaluate(estimate, truth, "vslam-lab")
+    assert result.alignment.scale == pytest.approx(2.0, abs=1e-9)
+    assert result.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert evaluate(estimate, truth).metrics["ate_rmse_m"] > 0.05
+
+
+def test_yaw_alignment_undoes_a_turn_about_z_and_nothing_else():
+    truth = walk()
+    about_z = se3.exp(np.array([1.0, -2.0, 0.5, 0, 0, 0])) @ se3.exp(np.array([0, 0, 0, 0, 0, 1.2]))
+    protocol = Protocol(id="x", alignment="yaw")
+    result = evaluate(truth.transformed(about_z), truth, protocol)
+    assert result.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    tilted = truth.transformed(se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))
+    assert evaluate(tilted, truth, protocol).metrics["ate_rmse_m"] > 0.01
+    grid = [
+        np.sqrt(((positions @ rotation.T - (positions @ rotation.T).mean(0) - goal) ** 2).sum(1).mean())
+        for angle in np.linspace(0, 2 * np.pi, 721)
+        for rotation in [se3.exp(np.array([0, 0, 0, 0, 0, angle]))[:3, :3]]
+        for positions in [tilted.positions]
+        for goal in [truth.positions - truth.positions.mean(0)]
+    ]
+    assert evaluate(tilted, truth, protocol).metrics["ate_rmse_m"] <= min(grid) + 1e-12
+
+
+@pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
+def test_alignment_is_a_minimum(mode):
+    truth = walk()
+    estimate = turned(noisy(truth, size=0.05), 2)
+    best = align(estimate.T_world_cam, truth.T_world_cam, mode)
+
+    def cost(similarity_poses):
+        return ((similarity_poses[:, :3, 3] - truth.positions) ** 2).sum()
+
+    reached = cost(best.apply(estimate.T_world_cam))
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        twist = rng.normal(0, 0.01, 6)
+        if mode == "yaw":
+            twist[3:5] = 0
+        assert cost(se3.exp(twist) @ best.apply(estimate.T_world_cam)) >= reached
+
+
+def test_rmse_squared_is_mean_squared_plus_variance():
+    metrics = evaluate(noisy(walk()), walk()).metrics
+    for prefix, unit in (("ate", "m"), ("ape_rot", "deg"), ("rpe_1s_trans", "m")):
+        rmse, mean, std = (metrics[f"{prefix}_{name}_{unit}"] for name in ("rmse", "mean", "std"))
+        assert rmse**2 == pytest.approx(mean**2 + std**2)
+        assert rmse >= mean
+
+
+# -- not moving
+
+
+def test_never_move_equals_the_evaluation_of_a_camera_that_does_not_move():
+    truth = walk()
+    still = Trajectory(truth.timestamps, np.tile(se3.exp(np.ones(6)), (len(truth), 1, 1)))
+    expected = never_move(truth)
+    result = evaluate(still, truth)
+    assert result.alignment.degenerate
+    assert result.metrics["ate_rmse_m"] == pytest.approx(expected["constant_rmse_m"], abs=1e-9)
+    assert result.metrics["never_move_ate_rmse_m"] == pytest.approx(expected["constant_rmse_m"], abs=1e-12)
+    assert evaluate(still, truth, "vslam-lab").metrics["ate_rmse_m"] == pytest.approx(
+        expected["constant_rmse_m"], abs=1e-9
+    )
+    origin = evaluate(still, truth, Protocol(id="x", alignment="origin"))
+    assert origin.metrics["ate_rmse_m"] == pytest.approx(expected["first_rmse_m"], abs=1e-9)
+    assert origin.metrics["never_move_ate_rmse_m"] == pytest.approx(expected["first_rmse_m"], abs=1e-12)
+    assert expected["first_rmse_m"] > expected["constant_rmse_m"]
+    assert any("do not determine a rotation" in line for line in result.diagnostics)
+
+
+def test_motion_on_a_line_is_aligned_to_the_minimum_and_the_roll_comes_from_the_orientations():
+    n = 60
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 0, 3] = np.linspace(0, 3, n)
+    truth = Trajectory(np.arange(n) / 30, poses)
+    result = evaluate(turned(truth, 3), truth)
+    assert result.alignment.degenerate
+    assert result.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-6)
+    assert result.metrics["ape_rot_rmse_deg"] == pytest.approx(0, abs=1e-4)
+
+
+# -- holes, coverage, policies
+
+
+def test_a_hole_in_the_ground_truth_is_measured_and_named():
+    truth = walk(n=300)
+    hole = truth.select(np.r_[0:100, 160:300])
+    result = evaluate(noisy(truth), hole)
+    assert result.n_pairs == 240
+    assert (result.association.in_holes, result.association.outside, result.association.taken) == (60, 0, 0)
+    assert result.association.largest_hole_s == pytest.approx(61 / 30, abs=1e-5)
+    line = next(line for line in result.diagnostics if "no ground truth" in line)
+    assert line.startswith(
+        "no ground truth within 0.02 s for 60 of 300 poses (60 in holes of it; largest hole 2.03 s at"
+    )
+
+
+def test_poses_outside_and_doubly_claimed_are_told_apart():
+    truth = walk(n=100)
+    late = truth.select(slice(0, 80))
+    result = evaluate(noisy(truth), late)
+    assert result.association.outside == 20
+    sparse = truth.select(slice(0, None, 2))
+    wide = Protocol(id="x", max_dt=0.05)
+    claimed = evaluate(noisy(truth), sparse, wide)
+    assert claimed.n_pairs == 50
+    assert claimed.association.taken == 50
+
+
+def test_coverage_counts_input_frames():
+    truth = walk(n=100)
+    tracked = noisy(truth).select(np.r_[0:40, 60:100])
+    assert coverage(tracked, truth.timestamps) == pytest.approx(0.8)
+    result = evaluate(tracked, truth, input_timestamps=truth.timestamps)
+    assert (result.n_input, result.n_tracked, result.coverage) == (100, 80, pytest.approx(0.8))
+    assert "80.0 % of 100 frames tracked" in result.summary()
+    assert evaluate(tracked, truth).coverage is None
+
+
+def test_lost_frame_policies():
+    truth = walk(n=100)
+    tracked = truth.select(np.r_[0:40, 60:100])
+    excluded = evaluate(tracked, truth, input_timestamps=truth.timestamps)
+    assert excluded.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    held_protocol = get_protocol("tum-rgbd/v1").model_copy(update={"id": "held", "lost_frames": "hold"})
+    held = evaluate(tracked, truth, held_protocol, input_timestamps=truth.timestamps)
+    assert held.n_pairs == 100
+    assert held.coverage == pytest.approx(0.8)
+    frozen = truth.T_world_cam.copy()
+    frozen[40:60] = frozen[39]
+    by_hand = evaluate(Trajectory(truth.timestamps, frozen), truth)
+    close(held.metrics, by_hand.metrics)
+    fails = held_protocol.model_copy(update={"lost_frames": "fail"})
+    with pytest.raises(EvaluationError, match=r"20 of 100 frames were lost \(coverage 80.0 %\)"):
+        evaluate(tracked, truth, fails, input_timestamps=truth.timestamps)
+    assert evaluate(truth, truth, fails, input_timestamps=truth.timestamps).coverage == 1.0
+    with pytest.raises(EvaluationError, match="needs the stamps of the input frames"):
+        evaluate(tracked, truth, held_protocol)
+
+
+def test_frames_lost_before_the_first_tracked_one_take_its_pose():
+    truth = walk(n=10)
+    held = hold(truth.select(slice(3, 5)), truth.timestamps)
+    assert np.array_equal(held.T_world_cam[:4], np.repeat(truth.T_world_cam[3:4], 4, axis=0))
+    assert np.array_equal(held.T_world_cam[4:], np.repeat(truth.T_world_cam[4:5], 6, axis=0))
+
+
+def test_foreign_stamps_are_refused_with_their_count():
+    truth = walk(n=20)
+    shifted = Trajectory(truth.timestamps + 0.01, truth.T_world_cam)
+    with pytest.raises(EvaluationError, match="20 of 20 estimated poses belong to none of 20 input frames"):
+        evaluate(shifted, truth, input_timestamps=truth.timestamps)
+
+
+def test_common_frames_are_those_of_all():
+    truth = walk(n=50)
+    a = truth.select(np.r_[0:30])
+    b = noisy(truth).select(np.r_[10:50])
+    c = Trajectory(truth.timestamps[::2] + 3e-4, truth.T_world_cam[::2])  # a file that rounds its stamps
+    one, two, three = common_frames([a, b, c])
+    assert np.array_equal(one.timestamps, truth.timestamps[10:30:2])
+    assert np.array_equal(two.T_world_cam, b.T_world_cam[0:20:2])
+    assert len(three) == 10
+    assert common_frames([c, a, b])[0].timestamps.tolist() == three.timestamps.tolist()
+    with pytest.raises(EvaluationError, match="no trajectories"):
+        common_frames([])
+
+
+# -- refusals
+
+
+def test_nothing_in_common_names_the_measured_gap():
+    truth = walk()
+    with pytest.raises(
+        EvaluationError, match=r"none of 200 poses has ground truth within 0\.02 s: the nearest is 93\."
+    ) as e:
+        evaluate(Trajectory(truth.timestamps + 100, truth.T_world_cam), truth)
+    assert "\n" not in str(e.value)
+    with pytest.raises(EvaluationError, match="nanoseconds"):
+        evaluate(Trajectory(truth.timestamps * 1e9, truth.T_world_cam), truth)
+
+
+def test_too_few_and_empty():
+    truth = walk()
+    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    with pytest.raises(EvaluationError, match="only 1 of 1 poses"):
+        evaluate(truth.select(slice(0, 1)), truth)
+    with pytest.raises(EvaluationError, match="the estimate holds no poses"):
+        evaluate(empty, truth)
+    with pytest.raises(EvaluationError, match="the ground truth holds no poses"):
+        evaluate(truth, empty)
+    with pytest.raises(EvaluationError, match="no frame was tracked"):
+        hold(empty, truth.timestamps)
+
+
+def test_a_short_trajectory_leaves_out_what_is_not_defined():
+    truth = walk(n=20)  # 0.63 s
+    result = evaluate(noisy(truth), truth)
+    assert result.n_pairs_rpe["1s"] == 0
+    assert "rpe_1s_trans_rmse_m" not in result.metrics
+    assert "rpe_1f_trans_rmse_m" in result.metrics
+    assert "no pair of poses for the relative error over 1s; it is left out" in result.diagnostics
+
+
+# -- protocols
+
+
+def test_protocols_are_frozen_told_apart_and_described():
+    digests = {protocol.digest() for protocol in PROTOCOLS.values()}
+    assert len(digests) == len(PROTOCOLS)
+    tum = get_protocol("tum-rgbd/v1")
+    assert get_protocol(tum) is tum
+    assert tum.digest() == "1190f97bbd77"  # stored with every number: a change of v1 is a new version
+    for change in ({"max_dt": 0.03}, {"strict": False}, {"alignment": "sim3"}, {"lost_frames": "hold"}, {"rpe": ()}):
+        assert tum.model_copy(update=change).digest() != tum.digest()
+    with pytest.raises(Exception, match="frozen"):
+        tum.max_dt = 1.0
+    assert tum.describe() == (
+        "tum-rgbd/v1: SE(3)-aligned, |dt| < 0.02 s one-to-one, RPE over 1 s (TUM pairs) and 1 frame (TUM pairs), "
+        "online trajectory, lost frames excluded [1190f97bbd77]"
+    )
+    assert Protocol.model_validate_json(tum.model_dump_json()) == tum
+
+
+def test_unknown_protocol_has_a_did_you_mean():
+    with pytest.raises(EvaluationError, match=r"unknown protocol 'tum-rgbd'.*did you mean 'tum-rgbd/v1'"):
+        get_protocol("tum-rgbd")
+
+
+def test_a_delta_in_frames_is_whole():
+    with pytest.raises(ValueError, match="whole number"):
+        RPESpec(delta=1.5, unit="f")
+
+
+def test_the_record_survives_the_disk(tmp_path):
+    result = evaluate(noisy(walk()), walk(), input_timestamps=walk().timestamps)
+    (tmp_path / "m.json").write_text(result.to_json())
+    assert Evaluation.read(tmp_path / "m.json") == result
+
+
+def test_files_and_their_notes(tmp_path):
+    write_tum(tmp_path / "gt.txt", walk())
+    write_tum(tmp_path / "est.txt", noisy(walk()))
+    with (tmp_path / "est.txt").open("a") as file:
+        file.write("1311868000.0 nan 0 0 0 0 0 1\n")
+    result = evaluate_files(tmp_path / "est.txt", tmp_path / "gt.txt")
+    assert "estimate: 1 of 201 lines skipped: not finite" in result.diagnostics
+    assert result.metrics["ate_rmse_m"] == pytest.approx(
+        evaluate(noisy(walk()), walk()).metrics["ate_rmse_m"], abs=1e-6
+    )
+
+
+def test_compare_protocols_shows_how_far_they_are_apart():
+    truth = walk(n=400)
+    rows = compare_protocols(turned(noisy(truth), 2), truth)
+    by_label = {row.label: row for row in rows}
+    assert (
+        by_label["not aligned"].rmse_m
+        > by_label["origin-aligned"].rmse_m
+        > by_label["SE(3)-aligned (TUM's ATE)"].rmse_m
+    )
+    assert by_label["Sim(3)-aligned"].rmse_m <= by_label["SE(3)-aligned (TUM's ATE)"].rmse_m
+    assert {row.metric for row in rows} == {"ATE", "RPE"}
+    assert all(row.rmse_m is not None and row.pairs > 0 for row in rows)
+    short = compare_protocols(noisy(walk(n=20)), walk(n=20))
+    missing = next(row for row in short if row.label == "TUM, 1 s, fixed delta")
+    assert missing.rmse_m is None
+    assert "1 s" in missing.note
+
+
+def test_pose_errors_series_gives_the_ate():
+    truth = walk()
+    estimate = turned(noisy(truth), 3)
+    aligned, true, series = pose_errors(estimate, truth)
+    assert np.sqrt((series["trans_m"] ** 2).mean()) == pytest.approx(evaluate(estimate, truth).metrics["ate_rmse_m"])
+    assert np.allclose(np.linalg.norm(aligned.positions - true.positions, axis=1), series["trans_m"])
+    assert len(series["rot_deg"]) == len(truth)
+
+
+# -- KITTI
+
+
+def test_kitti_segments_of_a_constant_drift():
+    n = 2001
+    true, estimated = np.tile(np.eye(4), (n, 1, 1)), np.tile(np.eye(4), (n, 1, 1))
+    true[:, 2, 3] = np.arange(n) * 0.5  # 1000 m straight ahead
+    estimated[:, 2, 3] = np.arange(n) * 0.5 * 1.02
+    translation, rotation = segment_errors(estimated, true, (100, 200, 800))
+    assert np.allclose(translation, 2.0, atol=0.02)  # a segment ends one pose behind its length
+    assert np.allclose(rotation, 0, atol=1e-9)
+    expected = sum(len([s for s in range(0, n, 10) if s + length / 0.5 + 1 < n]) for length in (100, 200, 800))
+    assert len(translation) == expected
+    result = evaluate(Trajectory(np.arange(n) / 10, estimated), Trajectory(np.arange(n) / 10, true), "kitti")
+    assert result.metrics["kitti_trans_percent"] == pytest.approx(2.0, abs=0.02)
+    assert result.metrics["kitti_rot_deg_per_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_kitti_says_when_the_path_is_too_short():
+    result = evaluate(noisy(walk()), walk(), "kitti")
+    assert "kitti_trans_percent" not in result.metrics
+    assert any("shorter than a segment of 100 m" in line for line in result.diagnostics)
+
+
+# -- masks
+
+
+def test_mask_counts():
+    predicted = np.zeros((4, 5), dtype=bool)
+    truth = np.zeros((4, 5), dtype=bool)
+    predicted[:2], truth[1:3] = True, True
+    counts = compare_masks(predicted, truth)
+    assert (counts.true_positive, counts.false_positive, counts.false_negative, counts.true_negative) == (5, 5, 5, 5)
+    assert (counts.iou, counts.precision, counts.recall) == (pytest.approx(1 / 3), 0.5, 0.5)
+    total = counts + compare_masks(truth, truth)
+    assert total.true_positive == 15
+    assert total.iou == pytest.approx(15 / 25)
+    assert compare_masks(predicted, truth, valid=truth).false_positive == 0
+
+
+def test_masks_without_anything_are_not_scored_and_shapes_must_agree():
+    nothing = np.zeros((3, 3), dtype=bool)
+    counts = compare_masks(nothing, nothing)
+    assert (counts.iou, counts.precision, counts.recall) == (None, None, None)
+    with pytest.raises(EvaluationError, match=r"\(3, 3\) and \(2, 3\)"):
+        compare_masks(nothing, nothing[:2])
