@@ -40,7 +40,7 @@ def fundamental_matrix(first: Points, second: Points, settings: EpipolarSettings
     for _ in range(2):  # the minimal sample's F is noisy at the image's fringe: refit it to all that agree
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
             return None
-        agree = epipolar_distance(matrix, first, second) < settings.inlier_px
+        agree = epipolar_distance(np.asarray(matrix, np.float64), first, second) < settings.inlier_px
         if np.count_nonzero(agree) < MIN_MATCHES:
             return None
         matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
@@ -106,12 +106,12 @@ class EpipolarFilter(DynamicFilter):
         keep = np.ones(len(frame), dtype=bool)
         flow = state.flow
         if flow is None or state.previous is None:
-            return FilterResult.of(keep, **stats)
+            return FilterResult.of(keep, stats)
         before = state.camera.undistort_points(flow.xy)
         fit = flow.valid & state.keep
         stats["matches"] = float(np.count_nonzero(fit))
         if stats["matches"] < MIN_MATCHES:
-            return FilterResult.of(keep, **{**stats, "degenerate": 1.0})
+            return FilterResult.of(keep, {**stats, "degenerate": 1.0})
         stats["parallax_px"], stats["homography_share"] = parallax(before[fit], frame.xy[fit], state.camera)
         degenerate = (
             stats["parallax_px"] < self.settings.min_parallax_px
@@ -119,15 +119,15 @@ class EpipolarFilter(DynamicFilter):
         )
         matrix = None if degenerate else fundamental_matrix(before[fit], frame.xy[fit], self.settings)
         if matrix is None:
-            return FilterResult.of(keep, **{**stats, "degenerate": 1.0})
+            return FilterResult.of(keep, {**stats, "degenerate": 1.0})
         failing = np.zeros(len(frame), dtype=bool)
         distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
         failing[flow.valid] = distance > self.settings.threshold_px
         stats["inliers"] = float(np.count_nonzero(fit & ~failing))
         if self.settings.mode == "point":
-            return FilterResult.of(~failing, **stats)
+            return FilterResult.of(~failing, stats)
         keep, stats["moving_objects"] = vote_on_objects(frame, failing, flow.valid, self.settings.vote_share)
-        return FilterResult.of(keep, **stats)
+        return FilterResult.of(keep, stats)
 
 
 def vote_on_objects(

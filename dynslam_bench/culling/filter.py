@@ -115,10 +115,16 @@ class FilterResult:
     mask: NDArray[np.bool_] | None = None
 
     @classmethod
-    def of(cls, keep: NDArray[np.bool_], mask: NDArray[np.bool_] | None = None, **stats: float) -> FilterResult:
+    def of(
+        cls,
+        keep: NDArray[np.bool_] | np.bool_,
+        stats: Mapping[str, float] | None = None,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> FilterResult:
         """A verdict with weights 1 (kept) and 0 (dropped); `stats` gains ``dropped``."""
-        counts = {"dropped": float(np.count_nonzero(~keep)), **stats}
-        return cls(keep, keep.astype(np.float32), counts, mask)
+        verdict = np.asarray(keep, dtype=bool)
+        counts = {"dropped": float(np.count_nonzero(~verdict)), **(stats or {})}
+        return cls(verdict, verdict.astype(np.float32), counts, mask)
 
 
 @runtime_checkable

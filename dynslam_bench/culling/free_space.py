@@ -44,7 +44,7 @@ class FreeSpaceFilter(DynamicFilter):
         ][: self.settings.keyframes]  # fmt: skip
         known = np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(known):
-            return FilterResult.of(keep, asked=0.0, tested=0.0)
+            return FilterResult.of(keep, {"asked": 0.0, "tested": 0.0})
         points = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[known], frame.z[known]))
         votes = np.zeros(len(known), dtype=int)
         seen = np.zeros(len(known), dtype=bool)
@@ -54,7 +54,7 @@ class FreeSpaceFilter(DynamicFilter):
             seen |= observed
         self._forget({view.timestamp for view in keyframes})
         keep[known] = votes < min(self.settings.min_votes, len(keyframes))
-        return FilterResult.of(keep, asked=float(len(keyframes)), tested=float(np.count_nonzero(seen)))
+        return FilterResult.of(keep, {"asked": float(len(keyframes)), "tested": float(np.count_nonzero(seen))})
 
     def _saw_past(
         self, view: KeyframeView, points: NDArray[np.float64], camera: Camera

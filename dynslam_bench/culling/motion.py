@@ -39,7 +39,7 @@ class MotionFilter(DynamicFilter):
         flow = state.flow
         if flow is None or state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
             self._evidence = None
-            return FilterResult.of(keep, tested=0.0, failed=0.0)
+            return FilterResult.of(keep, {"tested": 0.0, "failed": 0.0})
         tested = flow.valid & (frame.z > 0)
         failed = np.zeros(len(frame), dtype=bool)
         failed[tested] = self._fails(frame, state, tested)
@@ -48,7 +48,7 @@ class MotionFilter(DynamicFilter):
         evidence = evidence.clip(0, 1)
         self._evidence = _pool(evidence, frame)
         return FilterResult.of(
-            evidence < 0.5, tested=float(np.count_nonzero(tested)), failed=float(np.count_nonzero(failed))
+            evidence < 0.5, {"tested": float(np.count_nonzero(tested)), "failed": float(np.count_nonzero(failed))}
         )
 
     def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -68,7 +68,7 @@ class MotionFilter(DynamicFilter):
             return np.zeros(len(before))
         rows, columns = self._evidence.shape
         cell = np.floor(before / (CELL // 2)).astype(np.intp)
-        return self._evidence[cell[:, 1].clip(0, rows - 1), cell[:, 0].clip(0, columns - 1)]
+        return np.asarray(self._evidence[cell[:, 1].clip(0, rows - 1), cell[:, 0].clip(0, columns - 1)])
 
 
 def nearest_depth(

@@ -40,7 +40,8 @@ class SemanticFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop what lies on the masks; without a segmenter, keep all."""
         if frame.instances is None or not len(frame.instances):
-            return FilterResult.of(np.ones(len(frame), bool), objects=0.0, mask_fraction=0.0)
+            return FilterResult.of(np.ones(len(frame), bool), {"objects": 0.0, "mask_fraction": 0.0})
         mask = dynamic_mask(frame.instances, self.settings, depth=frame.depth)
         keep = ~inside(mask, frame.keypoints.xy)
-        return FilterResult.of(keep, mask, objects=float(len(frame.instances)), mask_fraction=float(mask.mean()))
+        stats = {"objects": float(len(frame.instances)), "mask_fraction": float(mask.mean())}
+        return FilterResult.of(keep, stats, mask)

@@ -1,0 +1,181 @@
+"""Settings of the blocks that the published systems are composed of; no heavy import."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from dynslam_bench.core.settings import Settings, tunable
+
+
+class BoxSettings(Settings):
+    """B2, box removal (Crowd-SLAM, YOLO-SLAM's detection half)."""
+
+    margin_px: int = tunable(
+        0, low=0, high=30, limits=(0, 200), unit="px", online=True, meaning="how far boxes are enlarged on every side"
+    )
+
+
+class BoxEpipolarSettings(Settings):
+    """B3 with different limits inside and outside the boxes (Blitz-SLAM, SGC-VSLAM, SG-SLAM)."""
+
+    inside_px: float = tunable(
+        0.5, low=0.1, high=3.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        meaning="epipolar distance above which a point inside a dynamic box is dropped",
+    )  # fmt: skip
+    outside_px: float = tunable(
+        1.0, low=0.2, high=10.0, scale="log", limits=(0.01, 1000.0), unit="px", online=True,
+        meaning="epipolar distance above which a point outside all boxes is dropped",
+    )  # fmt: skip
+    inlier_px: float = tunable(
+        1.0, low=0.1, high=3.0, scale="log", limits=(0.01, 20.0), unit="px", meaning="RANSAC's inlier threshold"
+    )
+    confidence: float = tunable(0.99, low=0.9, high=0.999, limits=(0.5, 0.99999), meaning="RANSAC confidence")
+
+
+class MovingVoteSettings(Settings):
+    """B3 and B11 as in DS-SLAM's code: one vote for all people."""
+
+    corners: int = tunable(1000, low=200, high=2000, limits=(8, 10000), meaning="Shi-Tomasi corners that are tracked")
+    sad_limit: int = tunable(2120, low=500, high=5000, limits=(1, 10**6), meaning="largest 3x3 sum of differences")
+    inlier_px: float = tunable(
+        0.1, low=0.05, high=1.0, scale="log", limits=(0.01, 10.0), unit="px", meaning="RANSAC's inlier threshold"
+    )
+    threshold_px: float = tunable(
+        1.0, low=0.3, high=3.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        meaning="epipolar distance above which a corner moves",
+    )  # fmt: skip
+    radius_px: int = tunable(
+        15,
+        low=0,
+        high=30,
+        limits=(0, 200),
+        unit="px",
+        meaning="a moving corner this near to a person makes people move",
+    )
+    min_votes: int = tunable(
+        1, low=1, high=20, limits=(1, 1000), online=True, meaning="moving corners that it takes"
+    )  # fmt: skip
+
+
+class MultiViewSettings(Settings):
+    """B4 and B5, DynaSLAM's multi-view geometry with region growing."""
+
+    tau_m: float = tunable(
+        0.4, low=0.1, high=1.0, scale="log", limits=(0.01, 10.0), unit="m", online=True,
+        meaning="depth by which a keyframe's point must be hidden (paper 0.4, code 0.6)",
+    )  # fmt: skip
+    order: Literal["nearest", "farthest"] = tunable(
+        "nearest", meaning="which keyframes are asked (the paper means nearest, the code takes farthest)"
+    )
+    references: int = tunable(5, low=1, high=10, limits=(1, 20), meaning="keyframes that are asked")
+    min_keyframes: int = tunable(5, low=1, high=10, limits=(1, 20), meaning="keyframes before the test is active")
+    max_parallax_deg: float = tunable(
+        30.0, low=10.0, high=60.0, limits=(1.0, 180.0), unit="deg", meaning="largest angle between the two views"
+    )
+    max_variance: float = tunable(
+        0.001, low=1e-4, high=0.1, scale="log", limits=(0.0, 100.0), unit="m^2",
+        meaning="largest variance of the depth around the point (rejects depth edges)",
+    )  # fmt: skip
+    grow: bool = tunable(True, meaning="grow regions of equal depth from the points that were found (B5)")
+    grow_m: float = tunable(
+        0.2, low=0.05, high=0.5, limits=(0.0, 5.0), unit="m", when={"grow": [True]},
+        meaning="largest depth difference to the seed within a region",
+    )  # fmt: skip
+    dilation_px: int = tunable(
+        15, low=0, high=30, limits=(0, 100), unit="px", meaning="radius by which the result is grown"
+    )
+
+
+class DepthRansacSettings(Settings):
+    """B6, YOLO-SLAM's depth RANSAC inside boxes."""
+
+    variance_m2: float = tunable(
+        0.43, low=0.01, high=1.0, scale="log", limits=(1e-4, 100.0), unit="m^2", online=True,
+        meaning="largest depth variance of the set that is taken for the person",
+    )  # fmt: skip
+    confidence: float = tunable(0.99, low=0.9, high=0.999, limits=(0.5, 0.9999), meaning="sets the number of draws")
+    max_draws: int = tunable(50, low=10, high=200, limits=(1, 1000), meaning="most draws a box")
+
+
+class CorrelationSettings(Settings):
+    """B7, Dai et al.'s point correlations on a Delaunay graph."""
+
+    window: int = tunable(
+        8, low=2, high=20, limits=(1, 60), unit="frames", meaning="frames between the observations that are compared"
+    )
+    quantile: float = tunable(
+        0.95, low=0.8, high=0.999, limits=(0.5, 0.99999), online=True, meaning="chi-square quantile that cuts an edge"
+    )
+    pixel_sigma: float = tunable(
+        1.0, low=0.3, high=3.0, scale="log", limits=(0.01, 20.0), unit="px", meaning="standard deviation of a keypoint"
+    )
+    largest: Literal["volume", "count"] = tunable(
+        "volume", meaning="which component is static: the one with the largest volume, or with the most points"
+    )
+
+
+class ProbabilitySettings(Settings):
+    """B8, moving probability of tracked features (RDS-SLAM's Bayes filter, Detect-SLAM's moving average)."""
+
+    rule: Literal["bayes", "average"] = tunable("bayes", meaning="how evidence is accumulated")
+    hit: float = tunable(
+        0.9, low=0.6, high=0.99, limits=(0.5, 0.999), when={"rule": ["bayes"]},
+        meaning="probability that a moving point lies on a mask, and a static one off it",
+    )  # fmt: skip
+    rate: float = tunable(
+        0.3, low=0.05, high=0.9, limits=(0.01, 1.0), when={"rule": ["average"]}, meaning="weight of the new observation"
+    )
+    threshold: float = tunable(
+        0.5, low=0.3, high=0.9, limits=(0.0, 1.0), online=True, meaning="probability above which a point is dropped"
+    )
+    link_px: float = tunable(
+        2.5,
+        low=1.0,
+        high=6.0,
+        limits=(0.1, 50.0),
+        unit="px",
+        meaning="how near its flow must end to an earlier feature",
+    )
+
+
+class TemplateSettings(Settings):
+    """B13, template matching over a sliding window inside boxes (DynaTM-SLAM; constants are our assumption)."""
+
+    patch_px: int = tunable(11, low=5, high=21, limits=(3, 41), unit="px", meaning="side of the square patch")
+    window: int = tunable(5, low=2, high=10, limits=(1, 30), unit="frames", meaning="earlier frames that are searched")
+    zncc: float = tunable(
+        0.8, low=0.5, high=0.95, limits=(-1.0, 1.0), online=True,
+        meaning="median correlation below which a point is dropped",
+    )  # fmt: skip
+
+
+class ResidualSettings(Settings):
+    """B14, residuals of image clusters with a semantic prior (DGS-SLAM of Yan 2022; constants are our assumption)."""
+
+    clusters: int = tunable(24, low=8, high=48, limits=(2, 200), meaning="clusters of image position and depth")
+    depth_weight: float = tunable(
+        2.0, low=0.2, high=10.0, scale="log", limits=(0.0, 100.0),
+        meaning="weight of the relative depth residual beside the intensity residual",
+    )  # fmt: skip
+    prior: float = tunable(
+        0.9, low=0.5, high=0.99, limits=(0.01, 0.999), meaning="prior probability that a person's cluster moves"
+    )
+    threshold: float = tunable(
+        0.5, low=0.2, high=0.9, limits=(0.0, 1.0), online=True, meaning="posterior above which a cluster is dynamic"
+    )
+
+
+class ClassRuleSettings(Settings):
+    """B15, three rules: class, depth, epipolar line (SEG-SLAM; constants are our assumption)."""
+
+    threshold_px: float = tunable(
+        1.0, low=0.2, high=5.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        meaning="epipolar distance above which a point on a movable object is dropped",
+    )  # fmt: skip
+    depth_m: float = tunable(
+        0.3, low=0.1, high=1.0, limits=(0.0, 10.0), unit="m", online=True,
+        meaning="a point this near to the depth of a moving object goes with it",
+    )  # fmt: skip
+    vote_share: float = tunable(
+        0.3, low=0.05, high=0.9, limits=(0.0, 1.0), meaning="share of an object's points that must fail"
+    )

@@ -1,0 +1,61 @@
+"""B3 with boxes: F from the points outside all boxes, different limits inside and outside."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from .baseline_settings import BoxEpipolarSettings
+from .boxes import dynamic_boxes, in_boxes
+from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
+from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .settings import EpipolarSettings
+
+MIN_OUTSIDE = 20
+"""SG-SLAM takes all matches where fewer than this lie outside the boxes."""
+
+
+class BoxEpipolarFilter(DynamicFilter):
+    """Drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
+
+    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is
+    meaningless. Stats: ``dropped``, ``matches``, ``boxes``, ``failed`` (1 where F could not be estimated).
+    """
+
+    name = "box_epipolar"
+    needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
+    provenance: Provenance = "faithful-paper"
+
+    def __init__(self, settings: BoxEpipolarSettings, segmentation: SegmentationSettings) -> None:
+        self.settings = settings
+        self._segmentation = segmentation
+
+    def reset(self, camera: Camera) -> None:
+        """Nothing to forget."""
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Test the flow of this frame's keypoints to the previous image."""
+        keep = np.ones(len(frame), dtype=bool)
+        flow = state.flow
+        boxes = dynamic_boxes(frame, self._segmentation)
+        stats = {"matches": 0.0, "boxes": float(len(boxes)), "failed": 0.0}
+        if flow is None or state.previous is None:
+            return FilterResult.of(keep, stats)
+        inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
+        before = state.camera.undistort_points(flow.xy)
+        fit = flow.valid & state.keep & ~inside
+        if np.count_nonzero(fit) < MIN_OUTSIDE:
+            fit = flow.valid & state.keep
+        stats["matches"] = float(np.count_nonzero(fit))
+        options = EpipolarSettings(inlier_px=self.settings.inlier_px, confidence=self.settings.confidence)
+        matrix = None
+        if stats["matches"] >= MIN_MATCHES:
+            matrix = fundamental_matrix(before[fit], frame.xy[fit], options)
+        if matrix is None:
+            return FilterResult.of(keep, {**stats, "failed": 1.0})
+        distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
+        limit = np.where(inside[flow.valid], self.settings.inside_px, self.settings.outside_px)
+        keep[flow.valid] = distance <= limit
+        return FilterResult.of(keep, stats)

@@ -1,0 +1,83 @@
+"""B15: three rules in one: class, depth, epipolar line (SEG-SLAM)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.postprocess import dynamic_mask, select
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from .baseline_settings import ClassRuleSettings
+from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
+from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .semantic import inside
+from .settings import EpipolarSettings
+
+MOVABLE = frozenset(
+    {"chair", "couch", "bed", "dining table", "tv", "laptop", "mouse", "keyboard", "cell phone", "book", "backpack",
+     "handbag", "suitcase", "sports ball", "bottle", "cup", "bowl", "umbrella", "teddy bear", "potted plant"}
+)  # fmt: skip
+"""COCO classes that people move about (our assumption; the paper gives no list)."""
+
+
+class ClassRuleFilter(DynamicFilter):
+    """Drops all points on people; on movable things those off their line, or at the depth of a thing that moves.
+
+    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``.
+    """
+
+    name = "class_rule"
+    needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
+    provenance: Provenance = "inspired"
+
+    def __init__(self, settings: ClassRuleSettings, segmentation: SegmentationSettings) -> None:
+        self.settings = settings
+        self._segmentation = segmentation
+
+    def reset(self, camera: Camera) -> None:
+        """Nothing to forget."""
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Judge by class first, then movable things by geometry."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = dict.fromkeys(("on_people", "on_movable", "moving_objects"), 0.0)
+        if frame.instances is None or not len(frame.instances):
+            return FilterResult.of(keep, stats)
+        people = dynamic_mask(frame.instances, self._segmentation, frame.depth)
+        keep &= ~inside(people, frame.keypoints.xy)
+        stats["on_people"] = float(np.count_nonzero(~keep))
+        off_line, tested = self._off_line(frame, state, keep)
+        chosen = select(frame.instances, self._segmentation.model_copy(update={"classes": ",".join(sorted(MOVABLE))}))
+        for mask in chosen.masks:
+            on = inside(mask, frame.keypoints.xy) & keep
+            stats["on_movable"] += float(np.count_nonzero(on))
+            voters = on & tested
+            drop = on & off_line
+            if voters.any() and off_line[voters].mean() >= self.settings.vote_share:
+                stats["moving_objects"] += 1.0
+                depth = frame.depth[mask]
+                depth = depth[np.isfinite(depth) & (depth > 0)]
+                if len(depth):
+                    drop |= on & (np.abs(frame.z - np.median(depth)) < self.settings.depth_m)
+            keep &= ~drop
+        return FilterResult.of(keep, stats, people)
+
+    def _off_line(self, frame: FrameBundle, state: FilterState, static: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which points fail the epipolar test, and which were tested at all, bool ``[N]`` each."""
+        none = np.zeros(len(frame), dtype=bool)
+        if state.flow is None or state.previous is None:
+            return none, none
+        valid = state.flow.valid
+        fit = valid & state.keep & static
+        before = state.camera.undistort_points(state.flow.xy)
+        matrix = (
+            fundamental_matrix(before[fit], frame.xy[fit], EpipolarSettings()) if fit.sum() >= MIN_MATCHES else None
+        )
+        if matrix is None:
+            return none, none
+        failing = none.copy()
+        failing[valid] = (
+            epipolar_distance(matrix, before[valid], frame.xy[valid]) > self.settings.threshold_px
+        )  # fmt: skip
+        return failing, valid

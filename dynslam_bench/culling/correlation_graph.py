@@ -1,0 +1,141 @@
+"""B7: Dai et al. 2020: points that keep their mutual vectors over time belong together; the largest body is static."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+from scipy.stats import chi2
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+
+from .baseline_settings import CorrelationSettings
+from .ego_motion import depth_sigma
+from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .links import link_to_previous
+
+MIN_POINTS = 20
+MIN_COMPONENT = 4
+"""Smaller fragments are noise: they are neither the static body nor an object."""
+
+
+class CorrelationFilter(DynamicFilter):
+    """Drops the points outside the largest rigid component of a Delaunay graph.
+
+    An edge compares the vector between its two points now with the one `window` frames ago; it is cut where the
+    Mahalanobis distance of the difference exceeds the chi-square quantile. Vectors are compared in the world frame
+    under the predicted pose: only its rotation matters. Stats: ``dropped``, ``tracked``, ``edges``, ``cut``,
+    ``components``.
+    """
+
+    name = "correlation"
+    needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
+    provenance: Provenance = "faithful-paper"
+
+    def __init__(self, settings: CorrelationSettings) -> None:
+        self.settings = settings
+        self.reset(None)
+
+    def reset(self, camera: Camera | None) -> None:
+        """Forget all tracks."""
+        self._history: deque[NDArray[np.float64]] = deque()
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Build the graph over the points that were tracked for the whole window."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = dict.fromkeys(("tracked", "edges", "cut", "components"), 0.0)
+        now = self._observe(frame, state)
+        link = link_to_previous(frame, state)
+        if self._history and (state.previous is None or len(self._history[-1]) != len(state.previous)):
+            self._history.clear()
+        carried = deque(_follow(past, link) for past in self._history)
+        self._history = carried
+        self._history.append(now)
+        while len(self._history) > self.settings.window + 1:
+            self._history.popleft()
+        then = self._history[0]
+        rows = np.flatnonzero(np.isfinite(now).all(axis=1) & np.isfinite(then).all(axis=1))
+        stats["tracked"] = float(len(rows))
+        if len(self._history) < 2 or len(rows) < MIN_POINTS:
+            return FilterResult.of(keep, stats)
+        edges = _delaunay_edges(frame.xy[rows])
+        change = _edge(now[rows], edges) - _edge(then[rows], edges)
+        z_then = then[rows, 3]
+        covariance = _point_covariance(frame.z[rows], state.camera, self.settings.pixel_sigma)
+        covariance += _point_covariance(z_then, state.camera, self.settings.pixel_sigma)
+        total = (covariance[edges[:, 0]] + covariance[edges[:, 1]])[:, :, None] * np.eye(3)
+        distance = np.einsum("ni,nij,nj->n", change, np.linalg.inv(total), change)
+        whole = distance <= chi2.ppf(self.settings.quantile, 3)
+        stats |= {"edges": float(len(edges)), "cut": float(np.count_nonzero(~whole))}
+        kept, stats["components"] = self._static_component(edges[whole], now[rows, :3])
+        keep[rows[~kept]] = False
+        return FilterResult.of(keep, stats)
+
+    def _observe(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
+        """World points and depth ``[N, 4]`` under the predicted pose; NaN without depth or pose."""
+        pose = np.eye(4) if state.T_world_pred is None and state.previous is None else state.T_world_pred
+        seen = np.full((len(frame), 4), np.nan)
+        valid = frame.z > 0
+        if pose is not None and valid.any():
+            seen[valid, :3] = se3.transform(pose, state.camera.unproject(frame.xy[valid], frame.z[valid]))
+            seen[valid, 3] = frame.z[valid]
+        return seen
+
+    def _static_component(
+        self, edges: NDArray[np.intp], points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], float]:
+        count = len(points)
+        graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+        _, label = connected_components(graph, directed=False)
+        size = np.bincount(label)
+        bodies = np.flatnonzero(size >= MIN_COMPONENT)
+        if not len(bodies):
+            return np.ones(count, dtype=bool), 0.0
+        if self.settings.largest == "count":
+            measure = size[bodies].astype(np.float64)
+        else:
+            measure = np.array([_volume(points[label == body]) for body in bodies])
+        static = bodies[int(np.argmax(measure))]
+        return np.asarray((label == static) | (size[label] < MIN_COMPONENT)), float(len(bodies))
+
+
+def _follow(past: NDArray[np.float64], link: NDArray[np.intp]) -> NDArray[np.float64]:
+    carried = np.full((len(link), past.shape[1]), np.nan)
+    carried[link >= 0] = past[link[link >= 0]]
+    return carried
+
+
+def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Unique undirected edges ``[E, 2]`` of the Delaunay triangulation of pixels ``[N, 2]``."""
+    try:
+        simplices = Delaunay(xy, qhull_options="QJ").simplices
+    except QhullError:
+        return np.zeros((0, 2), np.intp)
+    pairs = np.sort(np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]), axis=1)
+    return np.asarray(np.unique(pairs, axis=0), dtype=np.intp)
+
+
+def _edge(points: NDArray[np.float64], edges: NDArray[np.intp]) -> NDArray[np.float64]:
+    return points[edges[:, 0], :3] - points[edges[:, 1], :3]
+
+
+def _point_covariance(z: NDArray[np.floating], camera: Camera, pixel_sigma: float) -> NDArray[np.float64]:
+    """Variances ``[N, 3]`` of points at depth z, m^2: the larger of depth and lateral noise on every axis.
+
+    The paper propagates a full covariance; the isotropic bound is ours, since vectors are compared in the world frame.
+    """
+    z = np.asarray(z, dtype=np.float64)
+    lateral = z * pixel_sigma / camera.fx
+    return np.repeat((np.maximum(depth_sigma(z), lateral) ** 2)[:, None], 3, axis=1)
+
+
+def _volume(points: NDArray[np.float64]) -> float:
+    try:
+        return float(ConvexHull(points, qhull_options="QJ").volume)
+    except QhullError:
+        return 0.0

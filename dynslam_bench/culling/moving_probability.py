@@ -1,0 +1,74 @@
+"""B8: the probability that a feature moves, accumulated over frames (RDS-SLAM, Detect-SLAM)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.postprocess import dynamic_mask
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from .baseline_settings import ProbabilitySettings
+from .boxes import dynamic_boxes, in_boxes
+from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .links import inherit, link_to_previous
+from .semantic import inside
+
+UNKNOWN = 0.5
+
+
+class ProbabilityFilter(DynamicFilter):
+    """Drops features whose moving probability exceeds the threshold; it is inherited along the flow.
+
+    Args:
+        settings: Accumulation rule and threshold.
+        segmentation: Which objects count as dynamic.
+        evidence: Whether lying on a mask or in a box counts.
+
+    Stats: ``dropped``, ``linked``, ``mean_probability``.
+    """
+
+    name = "probability"
+    needs: frozenset[Need] = frozenset({"masks", "flow", "previous"})
+    provenance: Provenance = "inspired"
+
+    def __init__(
+        self, settings: ProbabilitySettings, segmentation: SegmentationSettings, evidence: str = "masks"
+    ) -> None:
+        self.settings = settings
+        self._segmentation = segmentation
+        self._boxes = evidence == "boxes"
+        self._probability = np.zeros(0)
+
+    def reset(self, camera: Camera) -> None:
+        """Forget all probabilities."""
+        self._probability = np.zeros(0)
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Update the probabilities by this frame's masks."""
+        link = link_to_previous(frame, state, self.settings.link_px)
+        if state.previous is None or len(self._probability) != len(state.previous):
+            link[:] = -1
+        prior = inherit(self._probability, link, UNKNOWN)
+        if frame.instances is not None:
+            prior = self._update(prior, self._observe(frame))
+        self._probability = prior
+        mean = float(prior.mean()) if len(prior) else UNKNOWN
+        return FilterResult.of(
+            prior <= self.settings.threshold,
+            {"linked": float(np.count_nonzero(link >= 0)), "mean_probability": mean},
+        )
+
+    def _observe(self, frame: FrameBundle) -> NDArray[np.bool_]:
+        assert frame.instances is not None
+        if self._boxes:
+            return np.asarray(in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self._segmentation)).any(axis=0))
+        return inside(dynamic_mask(frame.instances, self._segmentation, frame.depth), frame.keypoints.xy)
+
+    def _update(self, prior: NDArray[np.float64], on_mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+        if self.settings.rule == "average":
+            return (1 - self.settings.rate) * prior + self.settings.rate * on_mask
+        moving = np.where(on_mask, self.settings.hit, 1 - self.settings.hit)
+        posterior = moving * prior / (moving * prior + (1 - moving) * (1 - prior))
+        return np.asarray(posterior.clip(0.01, 0.99))
