@@ -1,0 +1,37 @@
+"""Degenerate input, answered the same way by every method: rows that are not valid, with a reason in the statistics."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .estimator import FlowResult
+
+
+def empty_result() -> FlowResult:
+    """The result for no points."""
+    return FlowResult(
+        np.empty((0, 2), np.float32), np.empty(0, np.bool_), np.empty(0, np.float32),
+        {"points": 0.0, "valid": 0.0, "evaluations": 0.0},
+    )  # fmt: skip
+
+
+def unseen_result(points: NDArray[np.float32], **reasons: float) -> FlowResult:
+    """No point is valid; each stays where it is, or at 0 where it is not finite."""
+    n = len(points)
+    stats = {"points": float(n), "valid": 0.0, "evaluations": 0.0, **reasons}
+    xy = np.where(np.isfinite(points), points, 0).astype(np.float32)
+    return FlowResult(xy, np.zeros(n, np.bool_), np.ones(n, np.float32), stats)
+
+
+def same_image(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bool:
+    """Whether two images are equal pixel by pixel: such a pair says nothing about motion."""
+    return reference is target or (reference.shape == target.shape and bool(np.array_equal(reference, target)))
+
+
+def usable_points(points: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Finite points inside an image of shape ``(H, W)``."""
+    height, width = shape[:2]
+    with np.errstate(invalid="ignore"):
+        inside = (points >= 0).all(axis=1) & (points <= (width - 1, height - 1)).all(axis=1)
+    return np.asarray(inside, dtype=np.bool_)

@@ -1,0 +1,79 @@
+"""Dense inverse search (OpenCV's DIS) behind the interface of all flows."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .checks import empty_result, same_image, unseen_result, usable_points
+from .estimator import FlowResult
+from .settings import FlowSettings
+
+_PRESETS = {
+    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
+    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+}
+SMALLEST_SIDE = 32
+"""DIS fails on images below its patch and pyramid sizes."""
+
+
+class DisFlow:
+    """Dense flow, read at the points; the way back is a check; see `estimator.FlowEstimator`."""
+
+    def __init__(self, settings: FlowSettings | None = None) -> None:
+        self.settings = settings or FlowSettings(method="dis")
+        self._dis = cv2.DISOpticalFlow.create(_PRESETS[self.settings.dis_preset])
+
+    def prepare(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image itself."""
+        return np.ascontiguousarray(gray)
+
+    def dense(self, reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Flow of every pixel, float32 ``[H, W, 2]``."""
+        return np.asarray(self._dis.calc(reference, target, None), dtype=np.float32)
+
+    def track(
+        self,
+        reference: NDArray[np.uint8],
+        target: NDArray[np.uint8],
+        points: NDArray[np.float32],
+        *,
+        guess: NDArray[np.float32] | None = None,
+        seed: int = 0,
+    ) -> FlowResult:
+        """Find points of the reference in the target; see `FlowEstimator.track`. The guess is not used."""
+        points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
+        n = len(points)
+        if not n:
+            return empty_result()
+        if same_image(reference, target):
+            return unseen_result(points, identical=1.0)
+        if min(reference.shape) < SMALLEST_SIDE:
+            return unseen_result(points, too_small=1.0)
+        if reference.max() == reference.min() or target.max() == target.min():
+            return unseen_result(points, textureless=1.0)
+        usable = usable_points(points, reference.shape)
+        clean = np.where(usable[:, None], points, 0).astype(np.float32)
+        xy = clean + _read(self.dense(reference, target), clean)
+        valid = usable & usable_points(xy, target.shape)
+        cost = np.zeros(n, dtype=np.float32)
+        if self.settings.forward_backward_px > 0:
+            seen = np.where(valid[:, None], xy, clean).astype(np.float32)
+            back = seen + _read(self.dense(target, reference), seen)
+            cost = np.hypot(*(back - clean).T).astype(np.float32)
+            valid &= cost <= self.settings.forward_backward_px
+        xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
+        return FlowResult(xy, valid, cost, {"points": float(n), "valid": float(valid.sum()), "evaluations": 0.0})
+
+
+def _read(flow: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Bilinear values ``[N, 2]`` of a flow field at points inside it."""
+    height, width = flow.shape[:2]
+    corner = np.minimum(points.astype(np.int64), (width - 2, height - 2))
+    fx, fy = (points - corner).T[:, :, None]
+    x, y = corner.T
+    upper = flow[y, x] * (1 - fx) + flow[y, x + 1] * fx
+    lower = flow[y + 1, x] * (1 - fx) + flow[y + 1, x + 1] * fx
+    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)

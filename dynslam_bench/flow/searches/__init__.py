@@ -1,0 +1,1 @@
+"""Label searches: one interface, budgets counted in cost evaluations, anytime and monotone."""

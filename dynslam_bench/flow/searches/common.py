@@ -1,0 +1,85 @@
+"""What all label searches share: their state, their random numbers, and how a label enters the population."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._jit import inlined
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX2 = np.uint64(0x94D049BB133111EB)
+
+
+class SearchState(NamedTuple):
+    """The best labels so far, of all points.
+
+    Attributes:
+        moths: float32 ``[N, P, 4]``, where each point's population is.
+        flames: float32 ``[N, P, 4]``, the best labels ever evaluated, best first.
+        costs: int64 ``[N, P]``, their costs (Eq. 5, 7).
+        used: int64 ``[N]``, cost evaluations spent.
+        lower: float32 ``[N, 4]``, the box that is searched.
+        upper: float32 ``[N, 4]``.
+    """
+
+    moths: NDArray[np.float32]
+    flames: NDArray[np.float32]
+    costs: NDArray[np.int64]
+    used: NDArray[np.int64]
+    lower: NDArray[np.float32]
+    upper: NDArray[np.float32]
+
+
+def new_state(
+    count: int, population: int, lower: NDArray[np.float32], upper: NDArray[np.float32], ceiling: int
+) -> SearchState:
+    """A state in which nothing has been evaluated: every flame costs `ceiling`."""
+    return SearchState(
+        np.zeros((count, population, 4), dtype=np.float32),
+        np.zeros((count, population, 4), dtype=np.float32),
+        np.full((count, population), ceiling, dtype=np.int64),
+        np.zeros(count, dtype=np.int64),
+        lower,
+        upper,
+    )
+
+
+@inlined
+def stream(seed, point, phase):  # type: ignore[no-untyped-def]
+    """Start of a point's random numbers in one phase: a hash of its arguments (splitmix64)."""
+    z = np.uint64(seed) + _GOLDEN * (np.uint64(point) * np.uint64(64) + np.uint64(phase) + np.uint64(1))
+    z = (z ^ (z >> np.uint64(30))) * _MIX1
+    z = (z ^ (z >> np.uint64(27))) * _MIX2
+    return z ^ (z >> np.uint64(31))
+
+
+@inlined
+def advance(state):  # type: ignore[no-untyped-def]
+    """The next state of a point's stream; use its upper bits."""
+    return state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+
+
+@inlined
+def uniform(state):  # type: ignore[no-untyped-def]
+    """The state's float32 in [0, 1)."""
+    return np.float32(np.int32(state >> np.uint64(40))) * np.float32(1.0 / (1 << 24))
+
+
+@inlined
+def insert(state, i, u, v, s, theta, cost):  # type: ignore[no-untyped-def]
+    """Merge an evaluated label into the sorted flames of point i if it is better than the worst (``F = best N``)."""
+    costs, flames = state.costs[i], state.flames[i]
+    k = len(costs) - 1
+    if cost >= costs[k]:
+        return
+    while k > 0 and costs[k - 1] > cost:
+        costs[k] = costs[k - 1]
+        for j in range(4):
+            flames[k, j] = flames[k - 1, j]
+        k -= 1
+    costs[k] = cost
+    flames[k, 0], flames[k, 1], flames[k, 2], flames[k, 3] = u, v, s, theta

@@ -1,0 +1,89 @@
+"""How a budget is divided into phases, and which kernel spends it: the one interface of all searches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..matching import CostTables, Reference, Side
+from ..settings import FlowSettings, SearchName
+from ..workers import run_stripes
+from . import rules as rule_book
+from .common import SearchState
+from .moth_flame import moth_flame_phase
+from .patchmatch import shrinking_window_phase
+
+PROPAGATING: frozenset[SearchName] = frozenset({"emfoa+propagation", "patchmatch"})
+_RULES: dict[SearchName, rule_book.MothFlameRules] = {
+    "emfoa+propagation": rule_book.EMFOA,
+    "emfoa": rule_book.EMFOA,
+    "mfo": rule_book.MFO,
+    "emfoa-literal": rule_book.EMFOA_LITERAL,
+}
+
+Phase = Callable[[int, NDArray[np.float32]], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A budget's division.
+
+    Attributes:
+        population: Labels kept a point.
+        ends: Evaluations a point at which each phase ends; between phases labels are exchanged.
+        rules: The moth-flame equations in force; None for random searches.
+        iterations: Of the moth-flame algorithm (T).
+        shrink: Factor of PatchMatch's window; 1 for uniform random search.
+    """
+
+    population: int
+    ends: tuple[int, ...]
+    rules: rule_book.MothFlameRules | None
+    iterations: int
+    shrink: float
+
+
+def make_plan(settings: FlowSettings) -> Plan:
+    """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations."""
+    budget = settings.budget
+    rules = _RULES.get(settings.search)
+    sweeps = min(settings.sweeps, max(1, budget // 16)) if settings.search in PROPAGATING else 0
+    population = max(2, min(settings.population, budget // 8)) if rules else 1
+    # founding the population takes a double share
+    ends = tuple(budget * (k + 2) // (sweeps + 2) for k in range(sweeps + 1))
+    founding = population * (2 if rules and rules.opposition else 1)
+    iterations = max(1, -(-(budget - founding) // population))
+    return Plan(population, ends, rules, iterations, 1.0 if settings.search == "random" else 0.5)
+
+
+def phase_runner(
+    plan: Plan, settings: FlowSettings, reference: Reference, target: Side, tables: CostTables, state: SearchState,
+    seed: int, threads: int, pool: ThreadPoolExecutor | None,
+) -> Phase:  # fmt: skip
+    """The function that runs one phase: ``run(number, candidates)``, on all points."""
+    count = len(reference.points)
+    if plan.rules is None:
+
+        def random_phase(number: int, candidates: NDArray[np.float32]) -> None:
+            run_stripes(
+                shrinking_window_phase, count, threads, pool, reference, target, tables, state, candidates,
+                plan.ends[number], number, np.uint64(seed), np.float32(plan.shrink),
+            )  # fmt: skip
+
+        return random_phase
+    rules = plan.rules
+    flames = rule_book.flame_counts(plan.population, plan.iterations, rules)
+    step = settings.cauchy_step_px
+    steps = np.array([step, step, 0.1, np.deg2rad(5.0)], dtype=np.float32)
+
+    def moth_flame(number: int, candidates: NDArray[np.float32]) -> None:
+        run_stripes(
+            moth_flame_phase, count, threads, pool, reference, target, tables, state, candidates, plan.ends[number],
+            number, np.uint64(seed), rules, flames, rule_book.spiral_table(), rule_book.cauchy_table(), steps,
+        )  # fmt: skip
+
+    return moth_flame

@@ -1,0 +1,111 @@
+"""What can be set about the optical flow."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dynslam_bench.core.settings import Settings, tunable
+
+_DAISY = {"method": ["daisy"]}
+_EMFOA = {"method": ["daisy"], "search": ["emfoa+propagation", "emfoa", "emfoa-literal"]}
+_PROPAGATING = {"method": ["daisy"], "search": ["emfoa+propagation", "patchmatch"]}
+_LUCAS_KANADE = {"method": ["lucas-kanade"]}
+_REFINED = {"method": ["daisy"], "refinement": ["lucas-kanade"]}
+
+SearchName = Literal["emfoa+propagation", "emfoa", "mfo", "emfoa-literal", "patchmatch", "random"]
+
+
+class FlowSettings(Settings):
+    """Optical flow of sparse points and of whole images.
+
+    The defaults are those with which `docs/flow.md` was measured.
+    """
+
+    method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
+        "daisy", meaning="DAISY Filter Flow with a label search, pyramidal Lucas-Kanade, or dense inverse search"
+    )
+    plugin: str = Field(
+        "", description="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`"
+    )
+    search: SearchName = tunable(
+        "emfoa+propagation",
+        when=_DAISY,
+        meaning="label search: enhanced moth-flame with or without propagation, plain moth-flame, the paper's "
+        "equations as printed, PatchMatch, or uniform random",
+    )
+    budget: int = tunable(
+        96, low=24, high=384, limits=(8, 4096), scale="log", online=True, when=_DAISY,
+        meaning="cost evaluations a point (sparse) or superpixel (dense)",
+    )  # fmt: skip
+    population: int = tunable(6, low=4, high=16, limits=(2, 32), when=_EMFOA, meaning="moths (and flames) a point")
+    sweeps: int = tunable(
+        4, low=1, high=8, limits=(1, 32), when=_PROPAGATING, meaning="times neighbours exchange their best labels"
+    )
+    neighbours: int = tunable(
+        4, low=1, high=8, limits=(0, 8), when=_PROPAGATING, meaning="neighbours whose labels are tried in each sweep"
+    )
+    similarity_seeds: bool = tunable(
+        True, when=_PROPAGATING, meaning="between sweeps, try the two similarity motions that most points agree with"
+    )
+    range_px: float = tunable(
+        96.0, low=16.0, high=192.0, limits=(1.0, 1024.0), scale="log", unit="px", online=True, when=_DAISY,
+        meaning="largest displacement searched, around the guess where there is one",
+    )  # fmt: skip
+    scale_range_octaves: float = tunable(
+        1.0, low=0.0, high=1.25, unit="octaves", when=_DAISY, meaning="largest change of scale searched, both ways"
+    )
+    rotation_range_deg: float = tunable(
+        45.0, low=0.0, high=45.0, unit="deg", when=_DAISY, meaning="largest rotation searched, both ways"
+    )
+    cauchy_step_px: float = tunable(
+        2.0, low=0.25, high=16.0, scale="log", unit="px", when=_EMFOA, meaning="scale of the Cauchy steps of Eq. 13"
+    )
+    support: Literal[1, 5, 9] = tunable(1, when=_DAISY, meaning="points around each point over which Eq. 1 is summed")
+    support_spacing_px: int = tunable(
+        4, low=1, high=16, unit="px", when={"method": ["daisy"], "support": [5, 9]}, meaning="distance of those points"
+    )
+    truncation: float = tunable(
+        0.882, low=0.25, high=2.0, limits=(0.01, 4.0), when=_DAISY,
+        meaning="t of Eq. 1: largest L1 distance of one histogram of unit norm",
+    )  # fmt: skip
+    intensity_weight: float = tunable(
+        0.0, low=0.0, high=110.0, limits=(0.0, None), when=_DAISY, meaning="alpha of Eq. 1, for images in [0, 1]"
+    )
+    intensity_limit: float = tunable(
+        7 / 255, low=0.005, high=0.1, limits=(0.0, 1.0), when=_DAISY, meaning="t1 of Eq. 1, grey levels in [0, 1]"
+    )
+    gradient_weight: float = tunable(
+        0.0, low=0.0, high=380.0, limits=(0.0, None), when=_DAISY, meaning="beta of Eq. 1, for images in [0, 1]"
+    )
+    gradient_limit: float = tunable(
+        2 / 255, low=0.002, high=0.05, limits=(0.0, 1.0), when=_DAISY, meaning="t2 of Eq. 1, grey levels a pixel"
+    )
+    refinement: Literal["none", "parabola", "lucas-kanade"] = tunable(
+        "lucas-kanade", when=_DAISY,
+        meaning="sub-pixel step: none, a parabola through the costs, or that and a similarity Lucas-Kanade",
+    )  # fmt: skip
+    refinement_window_px: int = tunable(
+        17, low=9, high=31, limits=(5, 41), unit="px", when=_REFINED, meaning="side of the refinement's window, odd"
+    )
+    refinement_iterations: int = tunable(
+        6, low=1, high=20, limits=(1, 50), when=_REFINED, meaning="most iterations of the refinement at full resolution"
+    )
+    window_px: int = tunable(
+        21, low=9, high=41, limits=(3, 101), unit="px", when=_LUCAS_KANADE, meaning="side of Lucas-Kanade's window, odd"
+    )
+    levels: int = tunable(
+        4, low=1, high=6, limits=(1, 8), when=_LUCAS_KANADE, meaning="pyramid levels, the full image included"
+    )
+    dis_preset: Literal["ultrafast", "fast", "medium"] = tunable(
+        "medium", when={"method": ["dis"]}, meaning="effort of the dense inverse search"
+    )
+    forward_backward_px: float = tunable(
+        1.5, low=0.25, high=8.0, limits=(0.0, 100.0), scale="log", unit="px", online=True,
+        meaning="largest distance between a point and its way there and back; 0 switches the check off",
+    )  # fmt: skip
+    max_cost: float = tunable(
+        0.75, low=0.3, high=1.0, limits=(0.0, 1.0), online=True, when=_DAISY,
+        meaning="matching cost, as a share of its largest value, above which a point is not found",
+    )  # fmt: skip

@@ -1,0 +1,193 @@
+"""DAISY Filter Flow at sparse points: what SLAM needs of it, without an image of labels.
+
+Per point: a label search over the matching cost (Eq. 1) with propagation between neighbouring points, then sub-pixel
+refinement, then the way back.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import layout
+from .checks import empty_result, same_image, unseen_result, usable_points
+from .estimator import FlowResult
+from .maps import OrientationMaps, orientation_maps
+from .matching import CostTables, Reference, describe, reference_appearance, side, tables_for
+from .neighbours import nearest_neighbours
+from .refinement import parabola, similarity_lucas_kanade
+from .searches.common import SearchState, new_state
+from .searches.propagation import common_motions, transported_labels
+from .searches.schedule import PROPAGATING, make_plan, phase_runner
+from .settings import FlowSettings
+from .workers import run_stripes
+
+MOTION_HYPOTHESES = 192
+MOTION_TOLERANCE_PX = 5.0
+NEIGHBOUR_WINDOW = 40
+PARABOLA_STEP_PX = 2.0
+COARSE_RADIUS, COARSE_ITERATIONS = 6, 4
+MIN_CORRELATION = 0.5
+
+
+class SparseDaisyFlow:
+    """Sparse flow on the processor; see `estimator.FlowEstimator`.
+
+    Args:
+        settings: How.
+        threads: Over which rows and points are divided; the result does not depend on it.
+    """
+
+    def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
+        self.settings = settings or FlowSettings()
+        self.threads = max(1, threads)
+        self._pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
+
+    def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
+        """The orientation maps of a uint8 ``[H, W]`` image."""
+        return orientation_maps(gray, threads=self.threads, pool=self._pool)
+
+    def track(
+        self,
+        reference: OrientationMaps,
+        target: OrientationMaps,
+        points: NDArray[np.float32],
+        *,
+        guess: NDArray[np.float32] | None = None,
+        seed: int = 0,
+    ) -> FlowResult:
+        """Find points of the reference in the target; see `FlowEstimator.track`."""
+        points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
+        if not len(points):
+            return empty_result()
+        if same_image(reference.gray, target.gray):
+            return unseen_result(points, identical=1.0)
+        usable = usable_points(points, reference.gray.shape)
+        if not usable.all():
+            inner = self.track(
+                reference, target, points[usable], guess=None if guess is None else guess[usable], seed=seed
+            )
+            return _scatter(inner, points, usable)
+        return self._track(reference, target, points, guess, seed)
+
+    def _track(
+        self, reference: OrientationMaps, target: OrientationMaps, points: NDArray[np.float32],
+        guess: NDArray[np.float32] | None, seed: int,
+    ) -> FlowResult:  # fmt: skip
+        settings = self.settings
+        tables = tables_for(*reference.gray.shape, settings)
+        described = self._describe(reference, points, tables)
+        state = self._search(described, target, tables, guess, seed)
+        labels, cost = state.flames[:, 0].copy(), state.costs[:, 0]
+        evaluations = state.used.copy()
+        n = len(points)
+        if settings.refinement != "none":
+            run_stripes(
+                parabola, n, self.threads, self._pool, labels, np.float32(PARABOLA_STEP_PX), described, side(target),
+                tables, evaluations,
+            )  # fmt: skip
+        valid = (cost < settings.max_cost * tables.ceiling) & (evaluations > 0)
+        if settings.refinement == "lucas-kanade":
+            correlation = self._refine(points, labels, reference, target)
+            valid &= correlation > MIN_CORRELATION
+        xy = points + labels[:, :2]
+        height, width = target.gray.shape
+        valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
+        if settings.forward_backward_px > 0 and settings.refinement == "lucas-kanade":
+            valid &= self._way_back(points, xy, labels, reference, target) <= settings.forward_backward_px
+        stats = {
+            "points": float(n),
+            "valid": float(valid.sum()),
+            "evaluations": float(evaluations.sum()),
+            "evaluations_per_point": float(evaluations.sum()) / n,
+        }
+        return FlowResult(xy, valid, np.asarray(cost / tables.ceiling, dtype=np.float32), stats)
+
+    def _describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
+        count, supports = len(points), len(tables.support)
+        descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
+        run_stripes(describe, count, self.threads, self._pool, points, side(image), tables, descriptors)
+        appearance = np.zeros((count, supports, 2), dtype=np.int32)
+        if tables.appearance:
+            reference_appearance(points, side(image), tables, appearance)
+        return Reference(points, descriptors, appearance)
+
+    def _search(
+        self, reference: Reference, target: OrientationMaps, tables: CostTables, guess: NDArray[np.float32] | None,
+        seed: int,
+    ) -> SearchState:  # fmt: skip
+        settings, points = self.settings, reference.points
+        n = len(points)
+        start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
+        if guess is not None:
+            offset = np.asarray(guess, dtype=np.float32).reshape(-1, 2) - points
+            start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
+        extent = np.array(
+            [settings.range_px, settings.range_px, settings.scale_range_octaves,
+             np.deg2rad(settings.rotation_range_deg)], dtype=np.float32,
+        )  # fmt: skip
+        lower, upper = start[:, 0] - extent, start[:, 0] + extent
+        plan = make_plan(settings)
+        state = new_state(n, plan.population, lower, upper, tables.ceiling)
+        state.flames[:, :] = start
+        run = phase_runner(plan, settings, reference, side(target), tables, state, seed, self.threads, self._pool)
+        run(0, start)
+        if settings.search in PROPAGATING:
+            neighbours = np.empty((n, min(settings.neighbours, n - 1)), dtype=np.int64)
+            nearest_neighbours(points, np.argsort(points[:, 0], kind="stable"), NEIGHBOUR_WINDOW, neighbours)
+            motions = np.full((2, 4), np.nan, dtype=np.float32)
+            candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
+            for number in range(1, len(plan.ends)):
+                best = state.flames[:, 0].copy()
+                if settings.similarity_seeds:
+                    common_motions(
+                        points, best, state.costs[:, 0].copy(), MOTION_HYPOTHESES, np.float32(MOTION_TOLERANCE_PX),
+                        np.uint64(seed + number), motions,
+                    )  # fmt: skip
+                run_stripes(
+                    transported_labels, n, self.threads, self._pool, points, best, neighbours, motions, lower, upper,
+                    candidates,
+                )  # fmt: skip
+                run(number, candidates)
+        return state
+
+    def _refine(
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], reference: OrientationMaps,
+        target: OrientationMaps,
+    ) -> NDArray[np.float32]:  # fmt: skip
+        correlation = np.empty(len(points), dtype=np.float32)
+        for first, second, step, radius, iterations in (
+            (reference.half, target.half, 2, COARSE_RADIUS, COARSE_ITERATIONS),
+            (reference.gray, target.gray, 1, self.settings.refinement_window_px // 2,
+             self.settings.refinement_iterations),
+        ):  # fmt: skip
+            run_stripes(
+                similarity_lucas_kanade, len(points), self.threads, self._pool, points, labels, first, second, step,
+                radius, iterations, np.float32(0.03), np.float32(4.0), correlation,
+            )  # fmt: skip
+        return correlation
+
+    def _way_back(
+        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32],
+        reference: OrientationMaps, target: OrientationMaps,
+    ) -> NDArray[np.float32]:  # fmt: skip
+        """Distance in pixels between each point and where the inverse label, refined the other way, takes it."""
+        inverse = -labels
+        correlation = np.empty(len(points), dtype=np.float32)
+        run_stripes(
+            similarity_lucas_kanade, len(points), self.threads, self._pool, np.ascontiguousarray(xy), inverse,
+            target.gray, reference.gray, 1, self.settings.refinement_window_px // 2,
+            self.settings.refinement_iterations, np.float32(0.03), np.float32(8.0), correlation,
+        )  # fmt: skip
+        distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
+        return distance
+
+
+def _scatter(inner: FlowResult, points: NDArray[np.float32], usable: NDArray[np.bool_]) -> FlowResult:
+    """Spread the result of the usable points over all."""
+    xy, valid = points.copy(), np.zeros(len(points), dtype=np.bool_)
+    cost = np.ones(len(points), dtype=np.float32)
+    xy[usable], valid[usable], cost[usable] = inner.xy, inner.valid, inner.cost
+    return FlowResult(xy, valid, cost, {**inner.stats, "points": float(len(points))})
