@@ -80,10 +80,12 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         For example ``"did you mean 'epipolar.threshold_px'?"``; empty if nothing is known.
     """
     names = sorted(set(known))
-    lowered = {candidate.lower(): candidate for candidate in names}
+    lowered: dict[str, list[str]] = {}
+    for candidate in names:
+        lowered.setdefault(candidate.lower(), []).append(candidate)
     close = difflib.get_close_matches(name.lower(), list(lowered), n=3, cutoff=0.5)
     if close:
-        return "did you mean " + " or ".join(repr(lowered[match]) for match in close) + "?"
+        return "did you mean " + " or ".join(repr(candidate) for match in close for candidate in lowered[match]) + "?"
     if 0 < len(names) <= 12:
         return "known: " + ", ".join(names)
     return f"{len(names)} are known, none is close" if names else ""

@@ -43,13 +43,11 @@ def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
     if spec.unit == "s":
         return stamps
     steps = se3.inverse(poses[:-1]) @ poses[1:]
-    step: Array
     if spec.unit == "m":
         step = np.asarray(np.linalg.norm(steps[:, :3, 3], axis=1), dtype=np.float64)
     else:
         step = se3.rotation_angle(steps) * (180 / np.pi if spec.unit == "deg" else 1.0)
-    index: Array = np.concatenate([np.zeros(1), np.cumsum(step)])
-    return index
+    return np.asarray(np.concatenate([np.zeros(1), np.cumsum(step)]), dtype=np.float64)
 
 
 def tum_fixed_pairs(index: Array, delta: float) -> Index:
@@ -102,8 +100,8 @@ def random_pairs(n: int, count: int) -> Index:
 
 def _uniform(purpose: str, count: int) -> Array:
     """Numbers in [0, 1) from raw generator words, a function of the purpose only."""
-    words = stream(0, purpose).bit_generator.random_raw(count)
-    return (np.asarray(words, dtype=np.uint64) >> np.uint64(11)) * 2.0**-53
+    words = np.asarray(stream(0, purpose).bit_generator.random_raw(count), dtype=np.uint64)
+    return np.asarray((words >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
 
 
 def _thin(pairs: Index, most: int) -> Index:

@@ -1,0 +1,193 @@
+"""SE(3) and camera: properties over random values, and agreement with scipy and OpenCV."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from dynslam_bench.core.errors import TrajectoryError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+
+FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+BONN = Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098, (0.039903, -0.099343, -0.00073, -0.000144, 0.0))
+PINHOLE = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+def twists(angle, n=50, seed=0):
+    rng = np.random.default_rng(seed)
+    phi = rng.normal(size=(n, 3))
+    phi *= angle / np.linalg.norm(phi, axis=1, keepdims=True)
+    return np.concatenate([rng.normal(0, 2, (n, 3)), phi], axis=1)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 9e-6, 1.1e-5, 1e-3, 0.5, 2.0, 3.1, np.pi - 1e-6])
+def test_exp_and_log_are_inverse(angle):
+    xi = twists(angle)
+    poses = se3.exp(xi)
+    assert all(se3.is_pose(pose, 1e-12) for pose in poses)
+    assert np.allclose(se3.log(poses), xi, atol=1e-9 if angle < 3.1 else 1e-6)
+    assert np.allclose(se3.rotation_angle(poses), angle, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 3.0])
+def test_exp_is_the_matrix_exponential(angle):
+    for xi, pose in zip(twists(angle, 5), se3.exp(twists(angle, 5)), strict=True):
+        generator = np.zeros((4, 4))
+        generator[:3, :3] = se3.hat(xi[3:])
+        generator[:3, 3] = xi[:3]
+        assert np.allclose(pose, scipy.linalg.expm(generator), atol=1e-12)
+
+
+def test_log_at_half_a_turn():
+    pose = se3.exp(np.array([1.0, 2.0, 3.0, np.pi, 0, 0]))
+    assert np.allclose(se3.exp(se3.log(pose)), pose, atol=1e-9)
+
+
+def test_inverse_transform_and_hat():
+    poses = se3.exp(twists(1.0))
+    assert np.allclose(se3.inverse(poses) @ poses, np.eye(4), atol=1e-12)
+    points = np.random.default_rng(1).normal(size=(7, 3))
+    moved = se3.transform(poses[0], points)
+    assert np.allclose(moved, [(poses[0] @ np.append(p, 1))[:3] for p in points])
+    a, b = points[:3], points[3:6]
+    assert np.allclose((se3.hat(a) @ b[..., None])[..., 0], np.cross(a, b))
+
+
+def test_batches_of_any_shape():
+    xi = twists(0.7, 12).reshape(3, 4, 6)
+    poses = se3.exp(xi)
+    assert poses.shape == (3, 4, 4, 4)
+    assert np.allclose(se3.log(poses), xi)
+    position, quaternion = se3.to_quaternion(poses)
+    assert position.shape == (3, 4, 3)
+    assert np.allclose(se3.from_quaternion(position, quaternion), poses)
+    assert se3.rotation_angle(poses).shape == (3, 4)
+
+
+def test_quaternions_are_normalised_and_canonical():
+    q = np.array([[0.1, -0.2, 0.3, -0.4]])
+    pose = se3.from_quaternion(np.zeros((1, 3)), q)
+    assert np.allclose(pose, se3.from_quaternion(np.zeros((1, 3)), -7 * q))
+    _, again = se3.to_quaternion(pose)
+    assert np.linalg.norm(again) == pytest.approx(1)
+    assert again[0, 3] > 0
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        None,
+        "pose",
+        np.eye(3),
+        np.full((4, 4), np.nan),
+        np.diag([1.0, 1.0, -1.0, 1.0]),
+        np.diag([2.0, 2.0, 2.0, 1.0]),
+        np.diag([1.0, 1.0, 1.0, 2.0]),
+        np.eye(4, dtype=int),
+    ],
+    ids=["none", "text", "3x3", "nan", "mirror", "scaled", "homogeneous", "integers"],
+)
+def test_what_is_no_pose(pose):
+    assert not se3.is_pose(pose)
+    assert se3.is_pose(np.eye(4))
+
+
+# -- camera
+
+
+def pixel_grid(camera, border=0.0):
+    u, v = np.meshgrid(np.linspace(border, camera.width - border, 25), np.linspace(border, camera.height - border, 19))
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+@pytest.mark.parametrize("camera", [FR1, BONN, PINHOLE], ids=["fr1", "bonn", "pinhole"])
+def test_undistort_and_distort_are_inverse(camera):
+    distorted = pixel_grid(camera)
+    undistorted = camera.undistort_points(distorted)
+    assert np.abs(camera.distort_points(undistorted) - distorted).max() < 1e-4
+    assert (np.abs(undistorted - distorted).max() > 1) == camera.is_distorted
+
+
+@pytest.mark.parametrize("camera", [FR1, BONN], ids=["fr1", "bonn"])
+def test_distortion_is_opencvs(camera):
+    import cv2
+
+    points = np.random.default_rng(0).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (100, 3))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
+    assert np.allclose(camera.distort_points(camera.project(points)), expected[:, 0], atol=1e-9)
+
+
+def test_no_points():
+    assert FR1.undistort_points(np.zeros((0, 2))).shape == (0, 2)
+    assert FR1.distort_points(np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_project_and_unproject_are_inverse():
+    pixels = pixel_grid(PINHOLE)
+    depth = np.random.default_rng(0).uniform(0.3, 8, len(pixels))
+    points = PINHOLE.unproject(pixels, depth)
+    assert np.allclose(points[:, 2], depth)
+    assert np.allclose(PINHOLE.project(points), pixels)
+
+
+@pytest.mark.parametrize(("width", "height"), list(itertools.product((320, 640, 1280), (240, 480, 300))))
+def test_resizing_scales_the_intrinsics_with_the_pixels(width, height):
+    small = PINHOLE.resized(width, height)
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], (20, 3))
+    scale = np.array([width / 640, height / 480])
+    assert np.allclose(small.project(points), (PINHOLE.project(points) + 0.5) * scale - 0.5)
+    assert (small.width, small.height) == (width, height)
+    back = small.resized(640, 480)
+    assert np.allclose([back.fx, back.fy, back.cx, back.cy], [PINHOLE.fx, PINHOLE.fy, PINHOLE.cx, PINHOLE.cy])
+
+
+def test_resizing_follows_cv2_resize():
+    import cv2
+
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    image = np.zeros((48, 64), dtype=np.float32)
+    image[20:22, 40:42] = 1.0  # centred on (40.5, 20.5)
+    point = camera.unproject(np.array([40.5, 20.5]), np.array(2.0))
+    half = cv2.resize(image, (32, 24), interpolation=cv2.INTER_AREA)
+    v, u = np.unravel_index(half.argmax(), half.shape)
+    assert np.allclose(camera.resized(32, 24).project(point), (u, v))
+
+
+def test_distortion_does_not_depend_on_the_resolution():
+    small = FR1.resized(320, 240)
+    pixels = pixel_grid(FR1, border=20)
+    half = (pixels + 0.5) / 2 - 0.5
+    assert np.allclose(small.distort_points(half), (FR1.distort_points(pixels) + 0.5) / 2 - 0.5, atol=1e-9)
+    assert not FR1.undistorted().is_distorted
+    assert np.array_equal(FR1.undistorted().matrix, FR1.matrix)
+
+
+# -- trajectory
+
+
+def test_trajectory_refuses_what_is_none():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    with pytest.raises(TrajectoryError, match="2 stamps but 3 poses"):
+        Trajectory(np.arange(2.0), poses)
+    with pytest.raises(TrajectoryError, match=r"not strictly increasing: 1\.000000 then 1\.000000"):
+        Trajectory(np.array([0.0, 1.0, 1.0]), poses)
+    with pytest.raises(TrajectoryError, match="not finite"):
+        Trajectory(np.array([0.0, 1.0, np.nan]), poses)
+    poses[1, 0, 3] = np.inf
+    with pytest.raises(TrajectoryError, match="not finite"):
+        Trajectory(np.arange(3.0), poses)
+
+
+def test_trajectory_views():
+    trajectory = Trajectory(np.arange(5.0), se3.exp(twists(0.4, 5)))
+    assert len(trajectory.select(slice(1, 4))) == 3
+    assert trajectory.select(trajectory.timestamps > 2).timestamps.tolist() == [3.0, 4.0]
+    assert np.allclose(trajectory.relative_to_first().T_world_cam[0], np.eye(4))
+    turn = se3.exp(twists(1.0, 1)[0])
+    assert trajectory.transformed(turn).path_length_m == pytest.approx(trajectory.path_length_m)
+    way = sum(np.linalg.norm(b - a) for a, b in itertools.pairwise(trajectory.positions))
+    assert trajectory.path_length_m == pytest.approx(way)
+    assert Trajectory(np.zeros(0), np.zeros((0, 4, 4))).path_length_m == 0
