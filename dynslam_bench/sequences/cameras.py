@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from dynslam_bench.core.errors import SequenceError, SettingsError, did_you_mean
+from dynslam_bench.core.errors import SequenceError, SettingsError
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry.camera import Camera
@@ -70,10 +70,10 @@ def known_camera(name: str) -> Camera:
     """A camera by name.
 
     Raises:
-        SequenceError: Unknown name, with a did-you-mean.
+        SequenceError: Unknown name; lists the known ones.
     """
     if name not in CAMERAS:
-        raise SequenceError(f"unknown camera '{name}'", did_you_mean(name, CAMERAS) + ", or a camera.toml file")
+        raise SequenceError(f"unknown camera '{name}'", f"one of {', '.join(CAMERAS)}, or a camera.toml file")
     return CAMERAS[name]
 
 
@@ -108,13 +108,16 @@ def write_camera(path: Path, camera: Camera, *, fps: float | None = None) -> Non
     write_atomic(path, "\n".join(lines) + "\n")
 
 
-def find_camera(folder: Path, choice: str | Path | Camera | None = None) -> tuple[Camera, float | None]:
+def find_camera(
+    folder: Path, choice: str | Path | Camera | None = None, *, otherwise: str | None = None
+) -> tuple[Camera, float | None]:
     """The camera of a folder, and its nominal frame rate where a file states it.
 
     Args:
         folder: A sequence's folder.
         choice: What the user asked for: a camera, a known camera's name or a ``camera.toml``; it wins over a
             ``camera.toml`` inside the folder, which wins over what the published folder name tells.
+        otherwise: Name of the camera if nothing else tells it, from the catalogue.
 
     Raises:
         SequenceError: The choice is not understood, or nothing tells the camera.
@@ -137,6 +140,8 @@ def find_camera(folder: Path, choice: str | Path | Camera | None = None) -> tupl
     for prefix, camera in PUBLISHED_PREFIXES.items():
         if name.startswith(prefix):
             return CAMERAS[camera], 30.0
+    if otherwise is not None:
+        return CAMERAS[otherwise], None
     raise SequenceError(
         f"the camera of {folder} is not known: there is no {CAMERA_FILE} inside, and '{name}' is no published name",
         f"name it with --camera {'|'.join(CAMERAS)}|FILE.toml",

@@ -88,9 +88,7 @@ def catalogue() -> dict[str, CatalogueEntry]:
         document = read_toml(Path(__file__).parent / name)
         common: dict[str, Any] = document["common"]
         for row in document["sequence"]:
-            values = {**common, **row}
-            values["url"] = values["url"].format(**values)
-            entry = build(CatalogueEntry, values)
+            entry = build(CatalogueEntry, {**common, **row})
             entries[entry.id] = entry
     return entries
 
@@ -207,7 +205,7 @@ def open_folder(
 
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
-    intrinsics, fps = find_camera(folder, camera)
+    intrinsics, fps = find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
     if entry is None:
         description = Description(f"folder/{folder.resolve().name}", intrinsics, fps)
     else:

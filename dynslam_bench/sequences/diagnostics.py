@@ -19,6 +19,7 @@ class Dropped:
         duplicate_stamps: Entries whose stamp came again later.
         unsorted: Entries whose stamp lay before the one above it; put in order.
         unnamed: Entries without a file name.
+        absent: Entries whose file does not exist (tolerated up to 2 % of a list).
         max_time_difference_s: The tolerance of the pairing, seconds.
         ground_truth_poses: Usable poses of ``groundtruth.txt``; 0 where there is none.
         ground_truth_dropped: Lines of ``groundtruth.txt`` that hold no usable pose, with the reasons.
@@ -35,6 +36,7 @@ class Dropped:
     duplicate_stamps: int = 0
     unsorted: int = 0
     unnamed: int = 0
+    absent: int = 0
     max_time_difference_s: float = 0.02
     ground_truth_poses: int = 0
     ground_truth_dropped: str = ""
@@ -44,7 +46,14 @@ class Dropped:
     @property
     def any(self) -> bool:
         """Whether anything at all was dropped or put in order."""
-        counts = (self.colour_unpaired, self.bad_stamps, self.duplicate_stamps, self.unsorted, self.unnamed)
+        counts = (
+            self.colour_unpaired,
+            self.bad_stamps,
+            self.duplicate_stamps,
+            self.unsorted,
+            self.unnamed,
+            self.absent,
+        )
         return any(counts) or bool(self.ground_truth_dropped)
 
     def describe(self) -> str:
@@ -60,6 +69,7 @@ class Dropped:
             (self.duplicate_stamps, "duplicate stamps"),
             (self.unsorted, "stamps out of order"),
             (self.unnamed, "lines without a file name"),
+            (self.absent, "listed files that do not exist"),
         ):
             if count:
                 parts.append(f"{count} {what}")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ from .lists import ImageList, list_folder, read_associations, read_image_list
 
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 GROUND_TRUTH_DT_S = 0.02
+MISSING_TOLERATED = 0.02
+"""Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,8 @@ class TumSequence:
     """A folder with colour images, depth images and (maybe) a ground truth; frames are decoded when asked for.
 
     The images are listed by ``rgb.txt`` and ``depth.txt``, which are paired as TUM's ``associate.py`` pairs them; else
-    by an ``associations.txt``; else by the names in the folders ``rgb`` and ``depth``. All listed pairs must exist, and
-    the first one is decoded on opening, so that most damage shows at once.
+    by an ``associations.txt``; else by the names in the folders ``rgb`` and ``depth``. Files are looked for and the
+    first pair is decoded on opening, so that most damage shows at once.
 
     Args:
         folder: The sequence's folder.
@@ -86,7 +89,13 @@ class TumSequence:
         colour, depth, paired = _list_images(folder, description.fps)
         if paired:
             index = np.arange(len(colour)), np.arange(len(colour))
+            sizes = _file_sizes(folder, colour.files, "colour"), _file_sizes(folder, depth.files, "depth")
+            absent = 0
         else:
+            listed = len(colour) + len(depth)
+            (colour, sizes_c), (depth, sizes_d) = _existing(folder, colour, "colour"), _existing(folder, depth, "depth")
+            sizes = sizes_c, sizes_d
+            absent = listed - len(colour) - len(depth)
             index = associate(colour.stamps, depth.stamps, max_time_difference_s)
         if not len(index[0]):
             gap = float(nearest_gap(colour.stamps, depth.stamps).min())
@@ -99,10 +108,17 @@ class TumSequence:
         self._timestamps.flags.writeable = False
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
-        self._sizes = _file_sizes(folder, self._colour, "colour") + _file_sizes(folder, self._depth, "depth")
+        self._sizes = [sizes[0][i] for i in index[0]] + [sizes[1][i] for i in index[1]]
         self._ground_truth, ground_truth_dropped = _read_ground_truth(folder / "groundtruth.txt")
         self.dropped = _count(
-            colour, depth, index, max_time_difference_s, self._timestamps, self._ground_truth, ground_truth_dropped
+            colour,
+            depth,
+            index,
+            absent,
+            max_time_difference_s,
+            self._timestamps,
+            self._ground_truth,
+            ground_truth_dropped,
         )
         self[0]
 
@@ -229,25 +245,40 @@ def _list_images(folder: Path, fps: float | None) -> tuple[ImageList, ImageList,
     return lists[0], lists[1], False
 
 
-def _file_sizes(folder: Path, files: list[str], kind: str) -> list[int]:
-    sizes, missing = [], []
-    for file in files:
-        try:
-            sizes.append((folder / file).stat().st_size)
-        except OSError:
-            missing.append(file)
+def _existing(folder: Path, images: ImageList, kind: str) -> tuple[ImageList, list[int]]:
+    """The images whose files are there, and their sizes; a few may be missing, as in some published sequences."""
+    sizes = [_file_size(folder / file) for file in images.files]
+    missing = [file for file, size in zip(images.files, sizes, strict=True) if size is None]
+    if len(missing) > MISSING_TOLERATED * len(images):
+        _refuse(folder, missing, len(images), kind, "missing")
+    there = [i for i, size in enumerate(sizes) if size is not None]
+    kept = replace(images, stamps=images.stamps[there], files=tuple(images.files[i] for i in there))
+    return kept, _file_sizes(folder, kept.files, kind)
+
+
+def _file_sizes(folder: Path, files: tuple[str, ...], kind: str) -> list[int]:
+    sizes = [_file_size(folder / file) for file in files]
+    missing = [file for file, size in zip(files, sizes, strict=True) if size is None]
     if missing:
-        raise SequenceError(
-            f"{len(missing)} of {len(files)} {kind} images of {folder} are missing, the first is {missing[0]}",
-            "fetch the sequence again, or remove their lines from the list",
-        )
+        _refuse(folder, missing, len(files), kind, "missing")
     empty = [file for file, size in zip(files, sizes, strict=True) if size == 0]
     if empty:
-        raise SequenceError(
-            f"{len(empty)} of {len(files)} {kind} images of {folder} are empty (0 bytes), the first is {empty[0]}",
-            "fetch the sequence again",
-        )
-    return sizes
+        _refuse(folder, empty, len(files), kind, "empty (0 bytes)")
+    return [size for size in sizes if size is not None]
+
+
+def _file_size(path: Path) -> int | None:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
+
+
+def _refuse(folder: Path, files: list[str], listed: int, kind: str, state: str) -> NoReturn:
+    raise SequenceError(
+        f"{len(files)} of {listed} {kind} images of {folder} are {state}, the first is {files[0]}",
+        "fetch the sequence again, or remove their lines from the list",
+    )
 
 
 def _read_ground_truth(path: Path) -> tuple[Trajectory | None, str]:
@@ -262,6 +293,7 @@ def _count(
     colour: ImageList,
     depth: ImageList,
     index: tuple[NDArray[np.intp], NDArray[np.intp]],
+    absent: int,
     max_time_difference_s: float,
     stamps: NDArray[np.float64],
     truth: Trajectory | None,
@@ -281,6 +313,7 @@ def _count(
         bad_stamps=colour.bad_stamps + depth.bad_stamps,
         duplicate_stamps=colour.duplicate_stamps + depth.duplicate_stamps,
         unsorted=colour.unsorted + depth.unsorted,
+        absent=absent,
         unnamed=colour.unnamed + depth.unnamed,
         max_time_difference_s=max_time_difference_s,
         ground_truth_poses=0 if truth is None else len(truth),

@@ -280,3 +280,15 @@ def test_pairing_equals_the_rule_of_tums_script(name):
             free[1].remove(b)
             expected.append(a)
     assert open_sequence(folder).timestamps.tolist() == sorted(expected)
+
+
+def test_few_missing_files_are_tolerated_and_counted(tmp_path):
+    """Bonn's lists name a few depth images that its archives lack."""
+    folder, *_ = make_folder(tmp_path / "seq", frames=60)
+    (folder / "depth" / "17.png").unlink()
+    sequence = open_sequence(folder)
+    assert len(sequence) == 59 and sequence.dropped.absent == 1
+    assert "1 colour images without depth; 1 listed files that do not exist" in sequence.dropped.describe()
+    (folder / "depth" / "18.png").unlink()
+    with pytest.raises(SequenceError, match="2 of 60 depth images"):
+        open_sequence(folder)

@@ -1,0 +1,243 @@
+"""Get public sequences onto this machine, and check those that are there."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.records import Record, atomic_folder, write_atomic
+
+from .archives import extract
+from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
+from .diagnostics import Dropped
+from .download import Report, download, file_sha256
+from .roots import find_data_root
+
+RECEIPT = "fetched.json"
+MANIFEST = "manifest.sha256"
+
+
+class Receipt(Record):
+    """What was fetched, stored inside the sequence's folder.
+
+    Attributes:
+        schema_version: Version of this record.
+        id: The sequence.
+        url: Where it came from.
+        sha256: Checksum of the archive.
+        size_bytes: Size of the archive.
+        checked: Whether the catalogue knew the checksum.
+        files: Number of files extracted; their checksums are in ``manifest.sha256``.
+    """
+
+    schema_version: Literal[1] = 1
+    id: str
+    url: str
+    sha256: str
+    size_bytes: int
+    checked: bool
+    files: int
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The outcome of `verify`.
+
+    Attributes:
+        id: The sequence.
+        folder: Where it lies.
+        frames: Frames that were decoded.
+        faults: One line a fault; empty if all is sound.
+        manifest: Whether every file was compared with the checksum taken when it was fetched.
+        dropped: What was not used on opening; None if the sequence cannot be opened.
+    """
+
+    id: str
+    folder: Path
+    frames: int
+    faults: tuple[str, ...]
+    manifest: bool
+    dropped: Dropped | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether no fault was found."""
+        return not self.faults
+
+
+@dataclass(frozen=True)
+class Status:
+    """A public sequence and whether it is here.
+
+    Attributes:
+        entry: What the catalogue says.
+        folder: Where it lies, or None.
+        place: Where `fetch` puts it.
+    """
+
+    entry: CatalogueEntry
+    folder: Path | None
+    place: Path
+
+
+def status(name: str, *, data_root: str | Path | None = None) -> Status:
+    """What the catalogue says of a sequence, and where it lies.
+
+    Raises:
+        SequenceError: Unknown id.
+    """
+    entry, root = _known(name), find_data_root(data_root)
+    return Status(entry, entry.find(root), entry.folders(root)[0])
+
+
+def fetch(
+    name: str,
+    *,
+    data_root: str | Path | None = None,
+    progress: Report | None = None,
+    checksum: bool = True,
+    keep_archive: bool = False,
+    url: str | None = None,
+    attempts: int = 6,
+    wait_s: float = 1.0,
+    timeout_s: float = 30.0,
+) -> Path:
+    """Download and extract a public sequence; one that is here already is left alone.
+
+    Whatever goes wrong, no half sequence appears, and the next call goes on where this one stopped.
+
+    Args:
+        name: Id or published folder name.
+        data_root: Folder of the sequences.
+        progress: Called with the stage and the bytes done.
+        checksum: False to accept an archive whose checksum differs from the catalogue's.
+        keep_archive: True to keep the archive beside the sequence.
+        url: A mirror, in place of the catalogue's address.
+        attempts: Connections in a row that may fail without bringing a byte.
+        wait_s: Pause before the second attempt.
+        timeout_s: How long a connection may be silent.
+
+    Returns:
+        The sequence's folder.
+
+    Raises:
+        SequenceError: Unknown id, or the download or the archive is faulty; the message says what was found.
+    """
+    found = status(name, data_root=data_root)
+    if found.folder is not None:
+        return found.folder
+    entry, address = found.entry, url or found.entry.url
+    archive = find_data_root(data_root) / ".downloads" / address.rpartition("/")[2]
+    expected = entry.sha256 if checksum else None
+    sha256 = download(
+        address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s, timeout_s=timeout_s
+    )
+    try:
+        with atomic_folder(found.place) as work:
+            sums = extract(archive, work, progress)
+            top = _top(work, entry, archive)
+            prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
+            inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
+            receipt = Receipt(
+                id=entry.id, url=address, sha256=sha256, size_bytes=archive.stat().st_size,
+                checked=expected is not None, files=len(inside),
+            )  # fmt: skip
+            write_atomic(top / RECEIPT, receipt.to_json())
+            write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(inside.items())))
+            open_folder(top, entry=entry)
+            if top != work:
+                _lift(top, work)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise SequenceError(
+            f"no room to extract {archive.name} ({archive.stat().st_size / 1e9:.2f} GB) into {found.place.parent}",
+            "make room and run the same command again, the archive is kept",
+        ) from error
+    except SequenceError:
+        archive.unlink(missing_ok=True)  # the archive itself is at fault: the next call fetches it anew
+        raise
+    if not keep_archive:
+        archive.unlink(missing_ok=True)
+    return found.place
+
+
+def verify(
+    name: str, *, data_root: str | Path | None = None, progress: Callable[[int, int], None] | None = None
+) -> Verification:
+    """Decode every frame, and compare every file with the checksum taken when it was fetched.
+
+    Args:
+        name: Id, published folder name or path of a sequence that is here.
+        data_root: Folder of the sequences.
+        progress: Called with frames done and frames in all.
+
+    Raises:
+        SequenceError: Unknown id, or the sequence is not here.
+    """
+    entry = entry_of(name)
+    folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root).folder
+    if folder is None or not folder.is_dir():
+        open_sequence(name, data_root=data_root)  # says what is missing
+        raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
+    try:
+        sequence = open_folder(folder, entry=entry)
+    except DynslamError as error:
+        return Verification(name, folder, 0, (str(error),), False, None)
+    faults = []
+    for index in range(len(sequence)):
+        try:
+            sequence[index]
+        except SequenceError as error:
+            faults.append(f"frame {index}: {error}")
+        if progress is not None:
+            progress(index + 1, len(sequence))
+    manifest = folder / MANIFEST
+    faults += _compare(folder, manifest) if manifest.is_file() else []
+    dropped = getattr(sequence, "dropped", None)
+    return Verification(sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped)
+
+
+def _compare(folder: Path, manifest: Path) -> list[str]:
+    faults = []
+    for line in manifest.read_text().splitlines():
+        expected, _, name = line.partition("  ")
+        path = folder / name
+        if not path.is_file():
+            faults.append(f"{name} is missing")
+        elif file_sha256(path) != expected:
+            faults.append(f"{name} is not what was fetched")
+    return faults
+
+
+def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:
+    """The folder inside the extracted archive that is the sequence."""
+    candidates = [work / entry.folder, work, *sorted(path for path in work.iterdir() if path.is_dir())]
+    for candidate in candidates:
+        if (candidate / "rgb.txt").is_file():
+            return candidate
+    raise SequenceError(f"{archive.name} holds no rgb.txt", "it is not a sequence in TUM layout")
+
+
+def _lift(top: Path, work: Path) -> None:
+    """Make the sequence's folder the working folder itself."""
+    top = top.rename(work / ".top")
+    for path in sorted(top.iterdir()):
+        destination = work / path.name
+        if destination.exists():
+            raise SequenceError(f"the archive holds {path.name} both inside and beside the sequence's folder, refused")
+        path.rename(destination)
+    top.rmdir()
+
+
+def _known(name: str) -> CatalogueEntry:
+    entry = entry_of(name)
+    if entry is None:
+        if name.startswith("synthetic/"):
+            raise SequenceError(f"'{name}' needs no fetching", "rendered sequences appear when they are first read")
+        raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, catalogue()))
+    return entry

@@ -1,0 +1,181 @@
+"""Finding sequences: ids, aliases, data roots, cameras, plug-ins, and errors that help."""
+
+import numpy as np
+import pytest
+from sequence_folders import make_folder
+
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences import DATASETS, open_sequence, sequence_ids
+from dynslam_bench.sequences.cameras import CAMERAS, read_camera, write_camera
+from dynslam_bench.sequences.catalogue import catalogue, entry_of
+from dynslam_bench.sequences.roots import find_data_root
+
+
+@pytest.fixture
+def vga(tmp_path):
+    """Makes a small sequence of full-size images under a path."""
+
+    def make(path):
+        return make_folder(tmp_path / path, frames=2, width=640, height=480)[0]
+
+    return make
+
+
+def test_the_catalogue_is_complete_and_sound():
+    entries = catalogue()
+    tum = [entry for entry in entries.values() if entry.dataset == "tum"]
+    assert len([entry for entry in tum if entry.ground_truth]) == 47
+    assert len([entry for entry in tum if not entry.ground_truth]) == 33
+    assert len(entries) - len(tum) == 26
+    for people in ("walking", "sitting"):
+        for motion in ("xyz", "static", "halfsphere", "rpy"):
+            assert f"tum/fr3/{people}_{motion}" in entries
+    for name in ("fr2/pioneer_slam", "fr1/teddy", "fr3/teddy", "fr3/cabinet", "fr1/rpy", "fr1/360_validation"):
+        assert f"tum/{name}" in entries
+    assert not entries["tum/fr1/360_validation"].ground_truth
+    assert len({entry.url for entry in entries.values()}) == len(entries)
+    assert len({entry.folder for entry in entries.values()}) == len(entries)
+    for key, entry in entries.items():
+        assert key == entry.id and entry.camera in CAMERAS and entry.tags and entry.license and entry.citation
+        assert entry.url.startswith("https://") and entry.url.split("/")[-1].split(".")[0] == entry.folder
+        assert (entry.split == "") == (not entry.ground_truth)
+        assert entry.camera == ("bonn" if entry.dataset == "bonn" else f"tum-{key.split('/')[1]}")
+
+
+def test_ids_of_all_data_sets_are_listed():
+    ids = sequence_ids()
+    assert "synthetic/walking_xyz" in ids and "bonn/crowd" in ids and len(ids) == len(set(ids))
+    assert len([name for name in ids if name.startswith("synthetic/")]) == 8
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["tum/rgbd_dataset_freiburg3_walking_xyz", "rgbd_dataset_freiburg3_walking_xyz", "tum/fr3/walking_xyz"],
+)
+def test_ids_and_aliases_find_a_folder_below_the_root(vga, tmp_path, place):
+    vga(place)
+    for name in ("tum/fr3/walking_xyz", "rgbd_dataset_freiburg3_walking_xyz"):
+        sequence = open_sequence(name, data_root=tmp_path, camera="tum-fr3")
+        assert sequence.id == "tum/fr3/walking_xyz" and sequence.camera == CAMERAS["tum-fr3"]
+        assert sequence.license == "CC-BY-4.0" and "IROS 2012" in sequence.citation
+        assert sequence.tags == {"high-dynamic"} and sequence.split == "tune" and sequence.fps == 30
+
+
+def test_camera_of_a_published_folder_name(vga):
+    folder = vga("anywhere/rgbd_bonn_crowd2")
+    (folder / "camera.toml").unlink()
+    sequence = open_sequence(folder)
+    assert (sequence.id, sequence.camera) == ("bonn/crowd2", CAMERAS["bonn"])
+
+
+def test_camera_of_a_catalogue_id_in_its_own_folder_name(vga, tmp_path):
+    """Under root/tum/fr3/walking_xyz the folder's name tells nothing, but the catalogue does."""
+    folder = vga("tum/fr3/walking_xyz")
+    (folder / "camera.toml").unlink()
+    assert open_sequence("tum/fr3/walking_xyz", data_root=tmp_path).camera == CAMERAS["tum-fr3"]
+
+
+def test_the_data_root(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
+    assert find_data_root() == tmp_path / "cache" / "dynslam-bench" / "data"
+    monkeypatch.setenv("DYNSLAM_BENCH_DATA", str(tmp_path / "env"))
+    assert find_data_root() == tmp_path / "env"
+    assert find_data_root(tmp_path / "argument") == tmp_path / "argument"
+
+
+def test_a_missing_sequence_says_all_one_needs(tmp_path):
+    with pytest.raises(SequenceError) as caught:
+        open_sequence("tum/fr3/walking_xyz", data_root=tmp_path)
+    text = str(caught.value)
+    for part in (
+        "https://cvg.cit.tum.de/rgbd/dataset/freiburg3/rgbd_dataset_freiburg3_walking_xyz.tgz",
+        "0.53 GB",
+        str(tmp_path / "tum" / "rgbd_dataset_freiburg3_walking_xyz"),
+        "dynslam-bench sequences fetch tum/fr3/walking_xyz",
+    ):
+        assert part in text
+    assert "\n" not in text
+    with pytest.raises(SequenceError, match="size unknown"):
+        open_sequence("tum/fr2/xyz", data_root=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("tum/fr3/walkng_xyz", "did you mean 'tum/fr3/walking_xyz'"),
+        ("bonn/crowd9", "did you mean 'bonn/crowd"),
+        ("rgbd_dataset_freiburg3_walking_xy", "rgbd_dataset_freiburg3_walking_xyz"),
+        ("./nowhere", "there is no sequence folder"),
+        ("zzz", "none is close"),
+    ],
+)
+def test_unknown_names(name, words):
+    with pytest.raises(SequenceError, match=words):
+        open_sequence(name)
+
+
+def test_camera_file_round_trip(tmp_path):
+    camera = Camera(320, 200, 300.1, np.float64(301.2), 159.5, 99.5, (0.1, -0.2, 1e-4, -2e-5, 0.3), 1000.0, 0.05)
+    write_camera(tmp_path / "camera.toml", camera, fps=15)
+    file = read_camera(tmp_path / "camera.toml")
+    assert file.camera() == camera and file.fps == 15
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("fx = ", "not valid TOML"),
+        ("width = 640\nheight = 480\nfx = 500.0", "lacks fy, cx, cy"),
+        ("name = 'tum-fr9'", "unknown camera 'tum-fr9'.*one of tum-fr1"),
+        ("name = 'tum-fr1'\nfocal = 3", "unknown setting 'focal'"),
+        ("width = 640\nheight = 480\nfx = -5.0\nfy = 1.0\ncx = 0.0\ncy = 0.0", "'fx' is -5.0"),
+        ("width = 640\nheight = 480\nfx = 5.0\nfy = 1.0\ncx = 0.0\ncy = 0.0\ndistortion = [1.0]", "distortion"),
+    ],
+)
+def test_bad_camera_files(tmp_path, text, words):
+    folder, *_ = make_folder(tmp_path / "s")
+    (folder / "camera.toml").write_text(text)
+    with pytest.raises(SequenceError, match=words):
+        open_sequence(folder)
+
+
+def test_camera_choices(tmp_path, vga):
+    folder = vga("s")
+    assert open_sequence(folder, camera="tum-fr2").camera == CAMERAS["tum-fr2"]
+    write_camera(tmp_path / "mine.toml", CAMERAS["bonn"])
+    assert open_sequence(folder, camera=tmp_path / "mine.toml").camera == CAMERAS["bonn"]
+    (folder / "camera.toml").unlink()
+    with pytest.raises(SequenceError, match=r"camera of .* is not known.*--camera tum-fr1\|"):
+        open_sequence(folder)
+    with pytest.raises(SequenceError, match="unknown camera 'tum-f3'"):
+        open_sequence(folder, camera="tum-f3")
+
+
+def test_a_data_set_plugs_in(tmp_path, monkeypatch, vga):
+    folder = vga("mine/one")
+    plugin = tmp_path / "my_dataset.py"
+    plugin.write_text(
+        "from dynslam_bench.sequences.datasets import DatasetSpec\n"
+        "from dynslam_bench.sequences.catalogue import open_folder\n"
+        f"SPEC = DatasetSpec('mine', r'{plugin}:load', ('mine/one',))\n"
+        "def load(sequence_id, *, data_root):\n"
+        "    return open_folder(data_root / sequence_id)\n"
+    )
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"sequences={plugin}:SPEC,sequences={tmp_path}/broken.py:SPEC")
+    DATASETS.refresh()
+    try:
+        assert "mine/one" in sequence_ids()
+        assert len(open_sequence("mine/one", data_root=tmp_path)) == 2
+        assert [failure.source for failure in DATASETS.failures()] == [
+            f"DYNSLAM_BENCH_PLUGINS: {tmp_path}/broken.py:SPEC"
+        ]
+    finally:
+        monkeypatch.undo()
+        DATASETS.refresh()
+    assert folder.is_dir()
+
+
+def test_entries_by_alias():
+    assert entry_of("rgbd_bonn_crowd").id == "bonn/crowd" and entry_of("nothing") is None
