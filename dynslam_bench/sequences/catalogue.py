@@ -18,14 +18,12 @@ from ._toml import read_toml
 from .cameras import CAMERAS, find_camera
 from .datasets import DATASETS, DatasetSpec
 from .frame import Sequence, SequenceView
-from .roots import find_data_root
+from .roots import find_data_root, is_writable, user_cache
 from .settings import PreprocessingSettings
+from .synthetic import SYNTHETIC_IDS, open_synthetic
 
 Tag = Literal["static", "low-dynamic", "high-dynamic"]
 Split = Literal["tune", "held-out", ""]
-SYNTHETIC_MOTIONS = tuple(
-    f"{people}_{motion}" for people in ("walking", "sitting") for motion in ("xyz", "static", "halfsphere", "rpy")
-)
 _FILES = ("tum.toml", "bonn.toml")
 
 
@@ -116,10 +114,13 @@ def builtin_datasets() -> Iterator[DatasetSpec]:
             entries[0].license, entries[0].citation,
         )  # fmt: skip
     yield DatasetSpec(
-        "synthetic", "dynslam_bench.sequences.synthetic:open_synthetic",
-        tuple(f"synthetic/{motion}" for motion in SYNTHETIC_MOTIONS), "rendered rooms with exact poses, masks and flow",
-        "MIT", "dynslam-bench",
-    )  # fmt: skip
+        "synthetic",
+        f"{__name__}:open_rendered",
+        SYNTHETIC_IDS,
+        "rendered rooms with exact poses, masks and flow",
+        "MIT",
+        "dynslam-bench",
+    )
 
 
 def open_sequence(
@@ -181,6 +182,19 @@ def open_public(sequence_id: str, *, data_root: Path, **how: Any) -> Sequence:
             f"fetch it with: dynslam-bench sequences fetch {entry.id}",
         )
     return open_folder(folder, entry=entry, **how)
+
+
+def open_rendered(sequence_id: str, *, data_root: Path) -> Sequence:
+    """Open a rendered sequence; its frames are kept below the data root, or in the user's cache if that is read-only.
+
+    Args:
+        sequence_id: For example ``synthetic/walking_xyz@0?frames=150``.
+        data_root: Folder of the sequences.
+
+    Raises:
+        SequenceError: Unknown id.
+    """
+    return open_synthetic(sequence_id, data_root if is_writable(data_root) else user_cache() / "data")
 
 
 def open_folder(

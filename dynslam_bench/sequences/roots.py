@@ -30,3 +30,10 @@ def find_data_root(argument: str | Path | None = None) -> Path:
     if configured:
         return Path(configured).expanduser().absolute()
     return user_cache() / "data"
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether files can be made in a folder, or in the nearest folder above it that exists."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
