@@ -128,6 +128,7 @@ class ProbabilitySettings(Settings):
     threshold: float = tunable(
         0.5, low=0.3, high=0.9, limits=(0.0, 1.0), online=True, meaning="probability above which a point is dropped"
     )
+    soft: bool = tunable(False, meaning="weigh the kept points by their static probability (CFP-SLAM)")
     link_px: float = tunable(
         2.5,
         low=1.0,
@@ -179,3 +180,22 @@ class ClassRuleSettings(Settings):
     vote_share: float = tunable(
         0.3, low=0.05, high=0.9, limits=(0.0, 1.0), meaning="share of an object's points that must fail"
     )
+
+
+class BoxDepthSettings(Settings):
+    """NGD-SLAM's masks: a person is what lies at the depth of the middle of the box."""
+
+    depth_m: float = tunable(
+        0.33, low=0.1, high=1.0, limits=(0.01, 10.0), unit="m", online=True, meaning="half the depth range of a person"
+    )
+    margin_px: int = tunable(30, low=0, high=60, limits=(0, 200), unit="px", meaning="how far the box is enlarged")
+    core: float = tunable(
+        0.7, low=0.3, high=1.0, limits=(0.1, 1.0), meaning="share of the box, around its middle, that gives the depth"
+    )
+    min_valid: float = tunable(
+        0.7, low=0.0, high=0.95, limits=(0.0, 1.0), meaning="share of the core that must have depth"
+    )
+    max_cover: float = tunable(
+        0.8, low=0.3, high=1.0, limits=(0.0, 1.0), meaning="a mask that covers more of the image is ignored"
+    )
+    dilation_px: int = tunable(3, low=0, high=20, limits=(0, 100), unit="px", meaning="radius by which masks are grown")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,10 +57,13 @@ class ProbabilityFilter(DynamicFilter):
             prior = self._update(prior, self._observe(frame))
         self._probability = prior
         mean = float(prior.mean()) if len(prior) else UNKNOWN
-        return FilterResult.of(
+        verdict = FilterResult.of(
             prior <= self.settings.threshold,
             {"linked": float(np.count_nonzero(link >= 0)), "mean_probability": mean},
         )
+        if self.settings.soft:
+            return replace(verdict, weight=np.where(verdict.keep, 1 - prior, 0).astype(np.float32))
+        return verdict
 
     def _observe(self, frame: FrameBundle) -> NDArray[np.bool_]:
         assert frame.instances is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.features.settings import FeatureSettings
@@ -51,7 +52,6 @@ def compose(
         SegmentationError: The semantic source is not available.
     """
     from dynslam_bench.features.build import build_extractor
-    from dynslam_bench.flow.build import build_flow
     from dynslam_bench.segmentation.schedule import build_mask_stage
     from dynslam_bench.slam.backend import RgbdBackend
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -62,11 +62,23 @@ def compose(
             settings.segmentation, sequence_id=context.sequence_id, masks=context.masks, device=context.device,
             threads=context.threads,
         )  # fmt: skip
+    if masks is None:
+        needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
+        if needing:
+            raise SegmentationError(
+                f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'",
+                "sources: auto, oracle, embedded, coco, onnx:PATH, recorded:DIR",
+            )
+    estimator = None
+    if flow is not None:
+        from dynslam_bench.flow.build import build_flow
+
+        estimator = build_flow(flow, device=context.device, threads=context.threads)
     return SlamPipeline(
         extractor=build_extractor(settings.features),
         masks=masks,
         filters=filters,
-        flow=None if flow is None else build_flow(flow, device=context.device, threads=context.threads),
+        flow=estimator,
         backend=RgbdBackend(settings.backend),
         guard=settings.guard,
     )

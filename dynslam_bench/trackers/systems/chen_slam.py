@@ -1,0 +1,50 @@
+"""Chen et al. (Micromachines 2022), the paper's direct parent: masks, Lucas-Kanade, epipolar culling."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
+from dynslam_bench.flow.settings import FlowSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class ChenSlamSettings(SemanticSystemSettings):
+    """Masks and the epipolar test."""
+
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
+    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+
+
+def build(settings: ChenSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B1, then B3 on the rest."""
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
+
+    filters = [
+        SemanticFilter(settings.segmentation),
+        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
+    ]
+    return compose(settings, context, filters, settings.flow)
+
+
+SPEC = TrackerSpec(
+    id="chen-slam",
+    entry_point=f"{__name__}:build",
+    label="Chen et al. 2022 (our back end)",
+    settings=ChenSlamSettings,
+    summary="masks, then the epipolar test on Lucas-Kanade flow",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Chen et al., Micromachines 13(11) 2006, 2022",
+    assumptions=(
+        "epipolar threshold 1 px",
+        "RGB-D back end (theirs is monocular)",
+    ),
+)

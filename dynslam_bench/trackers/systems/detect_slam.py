@@ -1,0 +1,48 @@
+"""Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on keyframes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import ProbabilitySettings
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class DetectSlamSettings(SemanticSystemSettings):
+    """Boxes on keyframes and the moving average."""
+
+    segmentation: SegmentationSettings = SegmentationSettings(schedule="keyframes", dilation_px=0)
+    probability: ProbabilitySettings = ProbabilitySettings(rule="average", threshold=0.75)
+    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+
+
+def build(settings: DetectSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B2 on keyframes feeds B8."""
+    from dynslam_bench.culling.moving_probability import ProbabilityFilter
+
+    block = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")
+    return compose(settings, context, [block], settings.flow)
+
+
+SPEC = TrackerSpec(
+    id="detect-slam",
+    entry_point=f"{__name__}:build",
+    label="Detect-SLAM (our back end)",
+    settings=DetectSlamSettings,
+    summary="moving probability by an exponential average over boxes",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Zhong et al., Detect-SLAM, WACV 2018",
+    assumptions=(
+        "rate 0.3 and threshold 0.75 (no readable source)",
+        "between keyframes boxes are carried by optical flow",
+    ),
+)

@@ -1,0 +1,44 @@
+"""DGS-SLAM (Yan et al. 2022): clusters of high residual move, people more readily."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import ResidualSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class DgsSlamSettings(SemanticSystemSettings):
+    """Residual clusters with a semantic prior."""
+
+    residual: ResidualSettings = ResidualSettings()
+
+
+def build(settings: DgsSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B14."""
+    from dynslam_bench.culling.residual_clusters import ResidualFilter
+
+    return compose(settings, context, [ResidualFilter(settings.residual, settings.segmentation)])
+
+
+SPEC = TrackerSpec(
+    id="dgs-slam",
+    entry_point=f"{__name__}:build",
+    label="DGS-SLAM (Yan 2022) (our back end)",
+    settings=DgsSlamSettings,
+    summary="residual clusters of the warped image with a semantic prior",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
+    assumptions=(
+        "clusters, mixture and priors",
+        "segmentation on every frame instead of selected ones",
+    ),
+    remarks="not the Gaussian-splatting DGS-SLAM of Kong et al. 2024",
+)

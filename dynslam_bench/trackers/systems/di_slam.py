@@ -1,0 +1,50 @@
+"""DI-SLAM (Wei et al. 2025): boxes, epipolar test, multi-view geometry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, MultiViewSettings
+from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.flow.settings import FlowSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class DiSlamSettings(SemanticSystemSettings):
+    """The epipolar test with boxes and multi-view depth."""
+
+    guard: GuardSettings = GuardSettings(min_fraction=0.1)
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0)
+    multiview: MultiViewSettings = MultiViewSettings(grow=False)
+    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+
+
+def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B3 stricter inside boxes, then B4."""
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.multiview_depth import MultiViewFilter
+
+    filters = [
+        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
+        MultiViewFilter(settings.multiview),
+    ]
+    return compose(settings, context, filters, settings.flow)
+
+
+SPEC = TrackerSpec(
+    id="di-slam",
+    entry_point=f"{__name__}:build",
+    label="DI-SLAM (our back end)",
+    settings=DiSlamSettings,
+    summary="epipolar test of 0.2 px inside and 1 px outside boxes, then multi-view depth",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
+    assumptions=("the published code of SG-SLAM stands in for the epipolar half",),
+)

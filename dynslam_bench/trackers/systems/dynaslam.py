@@ -1,0 +1,84 @@
+"""DynaSLAM (Bescos et al. 2018): masks of a-priori dynamic classes, multi-view geometry, or both."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import MultiViewSettings
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.culling.filter import DynamicFilter
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class DynaSlamSettings(SemanticSystemSettings):
+    """Masks of nineteen classes and multi-view geometry, constants of the paper."""
+
+    segmentation: SegmentationSettings = SegmentationSettings(classes="dynaslam19")
+    multiview: MultiViewSettings = MultiViewSettings()
+
+
+class DynaSlamCodeSettings(DynaSlamSettings):
+    """The constants of the authors' code where they differ from the paper."""
+
+    multiview: MultiViewSettings = MultiViewSettings(tau_m=0.6, order="farthest")
+
+
+class DynaSlamGeometrySettings(DynaSlamSettings):
+    """Without semantics."""
+
+    segmentation: SegmentationSettings = SegmentationSettings(source="none")
+
+
+def build(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """N+G: B1, then B4 and B5; without a semantic source G alone.
+
+    The code takes the union of both masks. The paper keeps the geometric mask where both find an object; the union
+    stands for both here.
+    """
+    from dynslam_bench.culling.multiview_depth import MultiViewFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
+
+    filters: list[DynamicFilter] = [MultiViewFilter(settings.multiview)]
+    if settings.segmentation.source != "none":
+        filters.insert(0, SemanticFilter(settings.segmentation))
+    return compose(settings, context, filters)
+
+
+def build_masks_only(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """N: B1 alone."""
+    from dynslam_bench.culling.semantic import SemanticFilter
+
+    return compose(settings, context, [SemanticFilter(settings.segmentation)])
+
+
+def _spec(
+    suffix: str, variant: str, settings: type[DynaSlamSettings], factory: str, faithful_code: bool
+) -> TrackerSpec:
+    return TrackerSpec(
+        id=f"dynaslam{suffix}",
+        entry_point=f"{__name__}:{factory}",
+        label=f"DynaSLAM {variant} (our back end)",
+        settings=settings,
+        summary=f"DynaSLAM, variant {variant}",
+        provenance="faithful-code" if faithful_code else "faithful-paper",
+        license="MIT (re-implemented from the description; the authors' code is GPL-3.0)",
+        citation="Bescos et al., DynaSLAM, IEEE RA-L 2018",
+        assumptions=(
+            "regions grow around the depth of their seed",
+            "the search window is sampled on every fourth pixel",
+        ),
+        remarks="background inpainting is left out: it rejects nothing",
+    )
+
+
+SPECS = [
+    _spec("", "N+G", DynaSlamSettings, "build", False),
+    _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", True),
+    _spec("-n", "N", DynaSlamSettings, "build_masks_only", True),
+    _spec("-g", "G", DynaSlamGeometrySettings, "build", False),
+]

@@ -1,0 +1,43 @@
+"""DynaTM-SLAM (Zhong et al. 2024): template matching over a window inside boxes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import TemplateSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class DynaTmSlamSettings(SemanticSystemSettings):
+    """Boxes and template matching."""
+
+    template: TemplateSettings = TemplateSettings()
+
+
+def build(settings: DynaTmSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B2 with B13."""
+    from dynslam_bench.culling.template_matching import TemplateFilter
+
+    return compose(settings, context, [TemplateFilter(settings.template, settings.segmentation)])
+
+
+SPEC = TrackerSpec(
+    id="dynatm-slam",
+    entry_point=f"{__name__}:build",
+    label="DynaTM-SLAM (our back end)",
+    settings=DynaTmSlamSettings,
+    summary="inside boxes, keeps what is found where the camera's motion predicts it",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Zhong et al., DynaTM-SLAM, Robotics and Autonomous Systems 174, 2024",
+    assumptions=(
+        "patch, window and correlation threshold",
+        "no object constraints in bundle adjustment",
+    ),
+)

@@ -1,0 +1,49 @@
+"""MOR-SLAM (Yao et al. 2023): repaired masks, F from outside them, epipolar test."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class MorSlamSettings(SemanticSystemSettings):
+    """Repaired masks and the epipolar test."""
+
+    segmentation: SegmentationSettings = SegmentationSettings(repair="depth", repair_depth_m=0.1, dilation_px=0)
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
+    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+
+
+def build(settings: MorSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B9, B1, B3."""
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
+
+    filters = [
+        SemanticFilter(settings.segmentation),
+        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
+    ]
+    return compose(settings, context, filters, settings.flow)
+
+
+SPEC = TrackerSpec(
+    id="mor-slam",
+    entry_point=f"{__name__}:build",
+    label="MOR-SLAM (our back end)",
+    settings=MorSlamSettings,
+    summary="masks repaired by closing and depth, then the epipolar test",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Yao et al., MOR-SLAM, Mathematics 11(19) 4037, 2023",
+    assumptions=("closing of 7 px, depth step 0.1 m, 1 px",),
+)

@@ -1,0 +1,42 @@
+"""OPF-SLAM: named in the paper without a citation; nobody knows what it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.settings import EpipolarSettings
+from dynslam_bench.flow.settings import FlowSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class OpfSlamSettings(SystemSettings):
+    """Lucas-Kanade and the epipolar test."""
+
+    epipolar: EpipolarSettings = EpipolarSettings(min_parallax_px=0.0, homography_share=1.0)
+    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+
+
+def build(settings: OpfSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B3 alone, without semantics and without a degeneracy guard."""
+    from dynslam_bench.culling.epipolar import EpipolarFilter
+
+    return compose(settings, context, [EpipolarFilter(settings.epipolar)], settings.flow)
+
+
+SPEC = TrackerSpec(
+    id="opf-slam",
+    entry_point=f"{__name__}:build",
+    label="OPF-SLAM (our back end)",
+    settings=OpfSlamSettings,
+    summary="Lucas-Kanade flow, fundamental matrix, epipolar test; no semantics",
+    provenance="assumed",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="unknown: the paper gives no reference",
+    assumptions=("everything: the name alone is known",),
+)

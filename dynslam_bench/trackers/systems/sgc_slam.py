@@ -1,0 +1,42 @@
+"""SGC-VSLAM (Yang et al. 2020): F from the points outside the boxes, the test for all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
+from dynslam_bench.flow.settings import FlowSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class SgcSlamSettings(SemanticSystemSettings):
+    """The epipolar test with boxes."""
+
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
+    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+
+
+def build(settings: SgcSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B3 with F from outside the boxes."""
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+
+    return compose(settings, context, [BoxEpipolarFilter(settings.box_epipolar, settings.segmentation)], settings.flow)
+
+
+SPEC = TrackerSpec(
+    id="sgc-slam",
+    entry_point=f"{__name__}:build",
+    label="SGC-VSLAM (our back end)",
+    settings=SgcSlamSettings,
+    summary="epipolar test of all points with F from outside the person boxes",
+    provenance="inspired",
+    ranked=False,
+    license="MIT (re-implemented from the description)",
+    citation="Yang et al., SGC-VSLAM, Sensors 2020",
+    assumptions=("RANSAC 1 px, 0.99; distance 1 px",),
+)

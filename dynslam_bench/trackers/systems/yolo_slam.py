@@ -1,0 +1,43 @@
+"""YOLO-SLAM (Wu et al. 2022): depth RANSAC among the features of a person's box."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dynslam_bench.culling.baseline_settings import DepthRansacSettings
+
+from ..protocol import TrackerContext, TrackerSpec
+from .composition import SemanticSystemSettings, compose
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class YoloSlamSettings(SemanticSystemSettings):
+    """Boxes and the depth RANSAC."""
+
+    depth_ransac: DepthRansacSettings = DepthRansacSettings()
+
+
+def build(settings: YoloSlamSettings, context: TrackerContext) -> SlamPipeline:
+    """B2 with B6: the largest set of like depth in a box is the person."""
+    from dynslam_bench.culling.depth_ransac import DepthRansacFilter
+
+    return compose(settings, context, [DepthRansacFilter(settings.depth_ransac, settings.segmentation)])
+
+
+SPEC = TrackerSpec(
+    id="yolo-slam",
+    entry_point=f"{__name__}:build",
+    label="YOLO-SLAM (our back end)",
+    settings=YoloSlamSettings,
+    summary="drops, in a person's box, the largest set of features of like depth",
+    provenance="faithful-paper",
+    ranked=True,
+    license="MIT (re-implemented from the description)",
+    citation="Wu et al., YOLO-SLAM, Neural Computing and Applications 2022",
+    assumptions=(
+        "the set grows by the nearest depth first (order not stated)",
+        "boxes derive from the semantic source that all systems share",
+    ),
+)
