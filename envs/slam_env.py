@@ -133,7 +133,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._observation: ObservationKind = observation
         self._reward = reward_named(reward)
         self._lost_after = lost_after
-        self._device = resolve_device(device)
+        self.device = resolve_device(device)
         self._threads = threads
         self._open = lambda name: open_frames(name, data_root, camera, frames, stride)
         self._control = tuple(control) if not isinstance(control, str) else control
@@ -336,7 +336,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             context = TrackerContext(
                 sequence_id=self.sequence.id,
                 masks=self.sequence.masks,
-                device=self._device,
+                device=self.device,
                 threads=self._threads,
                 fps=self.sequence.fps,
             )

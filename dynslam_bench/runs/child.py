@@ -1,0 +1,147 @@
+"""The process that makes a run: it steps an environment and tells the parent how it goes.
+
+Messages are JSON bytes over the connection, never pickles. The parent sends the job, then perhaps ``stop``. The child
+sends ``started``, ``frame`` (one each, the sign of life), ``progress`` every so many frames, and ends with ``done``,
+``stopped`` or ``failed``. What it found lies in files in the job's folder: `frames.jsonl`, written frame by frame so
+that a crash loses nothing, and at the end the final trajectory and the map.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import faulthandler
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import traceback
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from dynslam_bench.core.errors import DynslamError
+
+FRAMES_FILE = "frames.jsonl"
+
+
+def main(connection: Connection) -> int:
+    """Make one run.
+
+    Args:
+        connection: To the parent.
+
+    Returns:
+        Exit code: 0 even if the tracker failed and could say so.
+    """
+    with contextlib.suppress(OSError):
+        os.setsid()  # so that the parent can end this process together with what a tracker starts
+    die_with_parent()
+    try:
+        job = json.loads(connection.recv_bytes())
+    except EOFError:
+        return 0
+    _redirect(Path(job["folder"]) / "log.txt")
+    stop = threading.Event()
+    threading.Thread(target=_listen, args=(connection, stop), daemon=True).start()
+    try:
+        _prepare(job)
+        from .loop import run_loop
+
+        message = run_loop(job, lambda message: _send(connection, message), stop.is_set)
+    except BaseException as error:
+        traceback.print_exc()
+        message = _failure(error)
+    _send(connection, message | {"peak_memory_mb": peak_memory_mb()})
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return 0
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def die_with_parent() -> None:
+    """Ask Linux to kill this process when the one that forked it ends; elsewhere the closing connection has to do."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGKILL, 0, 0, 0)
+
+
+def _listen(connection: Connection, stop: threading.Event) -> None:
+    """Wait for ``stop``; a connection that closes means that nobody wants the result any more."""
+    while True:
+        try:
+            message = connection.recv_bytes()
+        except (EOFError, OSError):
+            os.killpg(0, signal.SIGKILL)
+            return
+        if message == b"stop":
+            stop.set()
+
+
+def _send(connection: Connection, message: dict[str, Any]) -> None:
+    try:
+        connection.send_bytes(json.dumps(message).encode())
+    except OSError:
+        os.killpg(0, signal.SIGKILL)
+
+
+def _redirect(log: Path) -> None:
+    """Everything that is printed, by whatever library, goes to the log; so does the stack of a fatal signal."""
+    handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.dup2(handle, 1)
+    os.dup2(handle, 2)
+    os.close(handle)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(line_buffering=True)
+    faulthandler.enable(file=2, all_threads=False)
+
+
+def _prepare(job: dict[str, Any]) -> None:
+    os.environ.update(job["environment"])
+    with contextlib.suppress(OSError):
+        os.chdir(job["working_folder"])
+    sys.path[:] = job["path"]
+    limit_threads(job["spec"]["threads"])
+
+
+def limit_threads(threads: int) -> None:
+    """Give OpenCV, torch and numba that many threads; BLAS has one (see `forkserver.THREAD_VARIABLES`)."""
+    import cv2
+
+    cv2.setNumThreads(threads)
+    torch = sys.modules.get("torch")
+    if torch is None:
+        os.environ["OMP_NUM_THREADS"] = str(threads)
+    else:
+        torch.set_num_threads(threads)
+    numba = sys.modules.get("numba")
+    if numba is None:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)
+    else:
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+def _failure(error: BaseException) -> dict[str, Any]:
+    from dynslam_bench.envs.contract import TrackerContractError
+
+    text = (str(error).strip().splitlines() or [""])[0]
+    if isinstance(error, MemoryError) or "out of memory" in text.lower() or type(error).__name__ == "OutOfMemoryError":
+        return {"type": "failed", "status": "out-of-memory", "reason": f"{type(error).__name__}: {text}".rstrip(": ")}
+    if isinstance(error, TrackerContractError):
+        return {"type": "failed", "status": "invalid", "reason": str(error)}
+    reason = str(error) if isinstance(error, DynslamError) else f"{type(error).__name__}: {text}".rstrip(": ")
+    return {"type": "failed", "status": "crashed", "reason": reason}
+
+
+if __name__ == "__main__":
+    sys.exit(main(Connection(int(sys.argv[1]))))

@@ -1,0 +1,186 @@
+"""The one loop: everything that is ever measured was measured by stepping an environment here."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import gymnasium as gym
+import numpy as np
+
+from dynslam_bench.envs.degrade_frames import DegradeFrames
+from dynslam_bench.envs.drop_frames import DropFrames
+from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.evaluation.masks import compare_masks
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.tum_file import write_tum
+
+from .child import FRAMES_FILE
+from .spec import RunSpec
+
+Send = Callable[[dict[str, Any]], None]
+
+
+def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> dict[str, Any]:
+    """Run a tracker over a sequence.
+
+    Args:
+        job: ``spec``, ``folder``, ``protocol`` and ``progress_every``.
+        send: Tells the parent.
+        stopping: Whether the parent wants an early end.
+
+    Returns:
+        The last message: ``done`` or ``stopped``.
+
+    Raises:
+        DynslamError: The environment cannot be made, or the tracker broke its contract.
+    """
+    spec = RunSpec.model_validate(job["spec"])
+    folder = Path(job["folder"])
+    protocol = Protocol.model_validate(job["protocol"])
+    base = SlamEnv(
+        spec.sequence, spec.tracker, settings=spec.settings, frames=spec.frames, stride=spec.stride,
+        device=spec.device, threads=spec.threads, data_root=spec.data_root, camera=spec.camera, protocol=protocol,
+        render_mode="rgb_array" if spec.video else None,
+    )  # fmt: skip
+    env: gym.Env[Any, Any] = base
+    if any(spec.degrade.values()):
+        env = DegradeFrames(env, **spec.degrade)
+    if spec.realtime or spec.drop_share:
+        env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
+    send({"type": "started", "frames": len(base.sequence)})
+    video = _Video(folder / "video.mp4", base) if spec.video else None
+    with (folder / FRAMES_FILE).open("w") as log:
+        writer = _FrameWriter(base, log)
+        env.reset(seed=spec.seed)
+        over = False
+        reported = 0
+        while True:
+            writer.write()
+            if video is not None:
+                video.add()
+            done = base.episode.next_index
+            send({"type": "frame", "index": done - 1})
+            if done - reported >= job["progress_every"] or over:
+                reported = done
+                send({"type": "progress", **_partial(base)})
+            if over:
+                break
+            if stopping():
+                env.close()
+                return {"type": "stopped", "frames": done}
+            _, _, terminated, truncated, _ = env.step(0)
+            over = terminated or truncated
+    if video is not None:
+        video.close()
+    outcome = _finish(base, folder)
+    env.close()
+    return {"type": "done", **outcome}
+
+
+def _partial(env: SlamEnv) -> dict[str, Any]:
+    """What is known so far: frames, coverage, the protocol's metrics of the frames so far, median frame time."""
+    totals = [timing["total"] for timing in env.timings if timing]
+    last = env.episode.outcomes[-1].error
+    partial: dict[str, Any] = {
+        "frames_done": env.episode.next_index,
+        "frames": len(env.sequence),
+        "metrics": env.episode_metrics() if env.protocol.trajectory == "online" else {},
+        "frame_time_s": float(np.median(totals)),
+    }
+    return partial if last is None else partial | {"pose_error_trans_m": last.trans_m}
+
+
+def _finish(env: SlamEnv, folder: Path) -> dict[str, Any]:
+    began = time.perf_counter()
+    final = env.final_trajectory()
+    outcome: dict[str, Any] = {"finalize_s": None, "keyframes": None, "map_points": None, "gpu_memory_mb": None}
+    if final is not None:
+        outcome["finalize_s"] = time.perf_counter() - began
+        write_tum(folder / "trajectory_final.txt", final)
+    outputs = env.map_outputs()
+    if outputs is not None:
+        from dynslam_bench.slam.outputs import write_keyframes_csv, write_ply
+
+        write_keyframes_csv(folder / "keyframes.csv", outputs)
+        write_ply(folder / "map.ply", outputs)
+        outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
+    if env.device.startswith("cuda"):
+        import torch
+
+        outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
+        outcome["gpu"] = torch.cuda.get_device_name(env.device)
+    return outcome
+
+
+class _FrameWriter:
+    """Appends the frames that are new to `frames.jsonl`; each line is complete before the next frame begins."""
+
+    def __init__(self, env: SlamEnv, log: IO[str]) -> None:
+        self._env, self._log = env, log
+        self._written = 0
+
+    def write(self) -> None:
+        outcomes = self._env.episode.outcomes
+        for outcome in outcomes[self._written :]:
+            row = _row(outcome)
+            if outcome is outcomes[-1]:
+                row["mask"] = self._mask_counts(outcome.index)
+            self._log.write(json.dumps(row) + "\n")
+        self._log.flush()
+        self._written = len(outcomes)
+
+    def _mask_counts(self, index: int) -> list[int] | None:
+        """Pixels in both masks, in the tracker's only, in the exact one of people only; None where one is missing."""
+        predicted = self._env.result.dynamic_mask
+        if predicted is None or self._env.sequence.masks is None:
+            return None
+        truth = self._env.sequence.masks[index]
+        people = [number for number, name in truth.class_names.items() if name == "person"]
+        counts = compare_masks(np.asarray(predicted, dtype=bool), np.isin(truth.instances, people))
+        return [counts.true_positive, counts.false_positive, counts.false_negative]
+
+
+class _Video:
+    """Writes the rendered frames as MPEG-4."""
+
+    def __init__(self, path: Path, env: SlamEnv) -> None:
+        self._path, self._env = path, env
+        self._writer: Any = None
+
+    def add(self) -> None:
+        import cv2
+
+        image = self._env.render()
+        assert image is not None
+        if self._writer is None:
+            size = (image.shape[1], image.shape[0])
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            self._writer = cv2.VideoWriter(str(self._path), code, self._env.sequence.fps, size)
+        self._writer.write(np.ascontiguousarray(image[:, :, ::-1]))
+
+    def close(self) -> None:
+        self._writer.release()
+
+
+def _row(outcome: FrameOutcome) -> dict[str, Any]:
+    error = outcome.error
+    pose = None
+    if outcome.T_world_cam is not None:
+        position, quaternion = se3.to_quaternion(outcome.T_world_cam)
+        pose = [*position.tolist(), *quaternion.tolist()]
+    return {
+        "index": outcome.index,
+        "timestamp": outcome.timestamp,
+        "state": outcome.state,
+        "pose": pose,
+        "error": None if error is None else [error.frame_trans_m, error.frame_rot_deg, error.trans_m, error.rot_deg],
+        "reward": outcome.reward,
+        "timings": dict(outcome.timings),
+        "stats": dict(outcome.stats),
+    }

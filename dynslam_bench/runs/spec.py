@@ -1,0 +1,104 @@
+"""What a run is asked to do."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, Field
+
+from dynslam_bench.core.records import Record
+
+
+class Limits(Record):
+    """What a run may take; no part of its identity.
+
+    Attributes:
+        time_s: Wall-clock time of the whole run; None for no limit.
+        start_s: Time until frame 0 is tracked: loading networks, compiling kernels.
+        frame_s: Time for any later frame, and for the final optimisation.
+        memory_mb: Resident memory of the run's process and its children; None for no limit.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    time_s: float | None = Field(default=None, gt=0)
+    start_s: float = Field(default=600.0, gt=0)
+    frame_s: float = Field(default=120.0, gt=0)
+    memory_mb: float | None = Field(default=None, gt=0)
+
+
+class RunSpec(Record):
+    """One run: a tracker with settings, on a sequence, with a seed.
+
+    Attributes:
+        tracker: Id, ``id:value``, ``module:Attr`` or ``file.py:Attr``.
+        sequence: Id or path of a folder in TUM layout.
+        settings: Overrides of the tracker's settings, dotted name to value.
+        frames: Part of the sequence, ``(start, stop)``; None for all.
+        stride: Take every so many frames.
+        seed: Seed of everything random.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        threads: Threads of the run.
+        realtime: Drop the frames that arrive while the tracker is busy.
+        drop_share: Drop this share of the frames at random.
+        degrade: Strengths of `DegradeFrames`, e.g. ``{"blur": 0.5}``.
+        data_root: Folder of the recorded sequences; None for the default one.
+        camera: Camera of a folder that does not say its own.
+        video: Whether to write ``video.mp4``.
+        limits: What it may take.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tracker: str
+    sequence: str
+    settings: dict[str, Any] = Field(default_factory=dict)
+    frames: tuple[int, int | None] | None = None
+    stride: int = Field(default=1, ge=1)
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    device: str = "auto"
+    threads: int = Field(default=1, ge=1)
+    realtime: bool = False
+    drop_share: float = Field(default=0.0, ge=0, lt=1)
+    degrade: dict[str, float] = Field(default_factory=dict)
+    data_root: str | None = None
+    camera: str | None = None
+    video: bool = False
+    limits: Limits = Field(default_factory=Limits)
+
+    def absolute(self) -> RunSpec:
+        """The same run, named independently of the working folder."""
+        return self.model_copy(
+            update={
+                "tracker": absolute_target(self.tracker),
+                "sequence": _absolute_folder(self.sequence),
+                "data_root": None if self.data_root is None else str(Path(self.data_root).expanduser().absolute()),
+                "camera": _absolute_file(self.camera),
+            }
+        )
+
+
+def absolute_target(tracker: str) -> str:
+    """``file.py:Attr`` and ``id:FILE`` with the file's absolute path; other names as they are."""
+    head, separator, tail = tracker.rpartition(":")
+    if separator and head.endswith(".py"):
+        return f"{Path(head).expanduser().resolve()}:{tail}"
+    prefix, separator, value = tracker.partition(":")
+    if separator and value and Path(value).expanduser().is_file():
+        return f"{prefix}:{Path(value).expanduser().resolve()}"
+    return tracker
+
+
+def _absolute_folder(sequence: str) -> str:
+    if sequence.startswith((".", "~", os.sep)):
+        return str(Path(sequence).expanduser().absolute())
+    from dynslam_bench.sequences.catalogue import entry_of
+
+    known = sequence.startswith("synthetic/") or entry_of(sequence) is not None
+    return str(Path(sequence).absolute()) if not known and Path(sequence).is_dir() else sequence
+
+
+def _absolute_file(name: str | None) -> str | None:
+    return str(Path(name).expanduser().absolute()) if name is not None and Path(name).expanduser().is_file() else name

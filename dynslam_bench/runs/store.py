@@ -1,0 +1,262 @@
+"""The run store: one folder a run, which appears whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import shutil
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
+from dynslam_bench.core.records import write_atomic
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.tum_file import format_tum, read_tum
+
+from .record import MetricRecord, RunRecord
+
+RUN_FILE = "run.json"
+_RUN_ID = re.compile(r"[0-9a-f]{16}")
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """A folder of the store that holds no valid record."""
+
+    path: Path
+    reason: str
+
+
+class RunStore:
+    """Runs, their metrics and the sequences' ground truth below one folder.
+
+    ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``, ``frames.csv``,
+    ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``metrics/<protocol digest>/<run_id>.json`` the errors under a
+    protocol; ``sequences/<part>/`` stamps and ground truth, so that a run can be scored again without its data;
+    ``latest`` links the newest run.
+
+    Args:
+        root: The folder; it is made when something is written.
+    """
+
+    def __init__(self, root: str | Path = "results") -> None:
+        self.root = Path(root).expanduser().absolute()
+
+    @property
+    def runs(self) -> Path:
+        """Folder of the runs."""
+        return self.root / "runs"
+
+    def folder(self, run_id: str) -> Path:
+        """Folder of one run, whether it exists or not."""
+        return self.runs / run_id
+
+    # -- writing ---------------------------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Make sure that runs can be stored, and sweep up what killed processes left behind.
+
+        Raises:
+            RunError: The folder cannot be written.
+        """
+        try:
+            self.runs.mkdir(parents=True, exist_ok=True)
+            probe = self.runs / f".probe.{secrets.token_hex(4)}"
+            probe.mkdir()
+            probe.rmdir()
+        except OSError as error:
+            raise RunError(
+                f"cannot write into {self.runs}: {error.strerror}", "name another folder with --results"
+            ) from error
+        for left in self.runs.glob(".*"):
+            if _abandoned(left.name):
+                shutil.rmtree(left, ignore_errors=True)
+
+    @contextmanager
+    def work_folder(self, run_id: str) -> Iterator[Path]:
+        """A hidden folder to make a run in; it vanishes unless `publish` moved it into place.
+
+        Raises:
+            RunError: The store cannot be written.
+        """
+        path = self.runs / f".{run_id}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}"
+        try:
+            path.mkdir(parents=True)
+        except OSError as error:
+            raise RunError(f"cannot write into {self.runs}: {error.strerror}", "name another folder") from error
+        try:
+            yield path
+        finally:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def publish(self, work: Path, record: RunRecord) -> None:
+        """Write the record into its work folder and rename that to the run's; replaces an earlier run of the id.
+
+        Raises:
+            RunError: It cannot be written; then nothing has changed.
+        """
+        target = self.folder(record.run_id)
+        try:
+            (work / RUN_FILE).write_text(record.to_json())
+            work.chmod(0o755)
+            if target.exists():
+                stale = work.with_name(f"{work.name}.old")
+                target.replace(stale)
+                work.replace(target)
+                shutil.rmtree(stale, ignore_errors=True)
+                self._forget_metrics(record.run_id)
+            else:
+                work.replace(target)
+        except OSError as error:
+            raise RunError(f"cannot write {target}: {error.strerror}", "check the free space") from error
+        self._link_latest(target)
+
+    def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
+        """Keep the stamps of a sequence's frames and its ground truth; done once a part."""
+        folder = self.root / "sequences" / part
+        if (folder / "timestamps.txt").is_file():
+            return
+        if ground_truth is not None and len(ground_truth):
+            write_atomic(folder / "groundtruth.txt", format_tum(ground_truth))
+        write_atomic(folder / "timestamps.txt", "".join(f"{stamp:.6f}\n" for stamp in timestamps.tolist()))
+
+    def add_metrics(self, metrics: MetricRecord) -> None:
+        """Write a run's metrics under a protocol."""
+        write_atomic(self._metric_file(metrics.run_id, metrics.protocol_digest), metrics.to_json())
+
+    def remove(self, run_id: str) -> None:
+        """Delete a run and its metrics.
+
+        Raises:
+            RunError: There is no such run, or it cannot be deleted.
+        """
+        run_id = self.find(run_id)
+        try:
+            gone = self.runs / f".{run_id}.{socket.gethostname()}.{os.getpid()}.gone"
+            self.folder(run_id).replace(gone)
+            shutil.rmtree(gone)
+            self._forget_metrics(run_id)
+        except OSError as error:
+            raise RunError(f"cannot remove run {run_id}: {error.strerror}") from error
+        latest = self.root / "latest"
+        if latest.is_symlink() and not latest.exists():
+            latest.unlink()
+
+    # -- reading ---------------------------------------------------------------------------------------------------
+
+    def ids(self) -> list[str]:
+        """Ids of all stored runs, sorted."""
+        if not self.runs.is_dir():
+            return []
+        return sorted(path.name for path in self.runs.iterdir() if _RUN_ID.fullmatch(path.name) and path.is_dir())
+
+    def read(self, run_id: str) -> RunRecord:
+        """The record of a run.
+
+        Raises:
+            RunError: There is no such run.
+            DynslamError: Its record is damaged.
+        """
+        return RunRecord.read(self.folder(self.find(run_id)) / RUN_FILE)
+
+    def get(self, run_id: str) -> RunRecord | None:
+        """The record of a run by its full id, None if it is not stored or damaged."""
+        if not (self.folder(run_id) / RUN_FILE).is_file():
+            return None
+        try:
+            return RunRecord.read(self.folder(run_id) / RUN_FILE)
+        except DynslamError:
+            return None
+
+    def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
+        """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
+        records, unreadable = [], []
+        for run_id in self.ids():
+            try:
+                records.append(RunRecord.read(self.folder(run_id) / RUN_FILE))
+            except DynslamError as error:
+                unreadable.append(Unreadable(self.folder(run_id), str(error)))
+        return sorted(records, key=lambda record: (record.started, record.run_id)), unreadable
+
+    def find(self, prefix: str) -> str:
+        """The full id of a run from its first digits, or of ``latest``.
+
+        Raises:
+            RunError: No run, or more than one, begins so.
+        """
+        known = self.ids()
+        if prefix == "latest" and (self.root / "latest").exists():
+            return (self.root / "latest").resolve().name
+        matching = [run_id for run_id in known if run_id.startswith(prefix)] if prefix else []
+        if len(matching) == 1:
+            return matching[0]
+        if matching:
+            raise RunError(f"{len(matching)} runs begin with '{prefix}'", ", ".join(matching[:5]))
+        hint = did_you_mean(prefix, known) if known else f"there are no runs in {self.root}"
+        raise RunError(f"there is no run '{prefix}'", hint)
+
+    def metrics(self, run_id: str, protocol: Protocol) -> MetricRecord | None:
+        """A run's stored metrics under a protocol; None if it was not scored under it."""
+        path = self._metric_file(run_id, protocol.digest())
+        return MetricRecord.read(path) if path.is_file() else None
+
+    def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
+        """The ``online`` or ``final`` trajectory of a run; None if there is none or no frame was tracked."""
+        path = self.folder(run_id) / f"trajectory_{which}.txt"
+        if not path.is_file() or not any(line and line[0] != "#" for line in path.read_text().splitlines()):
+            return None
+        return read_tum(path)
+
+    def ground_truth(self, part: str) -> Trajectory | None:
+        """The ground truth of a sequence's part; None if it has none."""
+        path = self.root / "sequences" / part / "groundtruth.txt"
+        return read_tum(path) if path.is_file() else None
+
+    def timestamps(self, part: str) -> NDArray[np.float64]:
+        """Stamps in seconds of all input frames of a sequence's part.
+
+        Raises:
+            RunError: They are not stored.
+        """
+        path = self.root / "sequences" / part / "timestamps.txt"
+        try:
+            return np.array([float(line) for line in path.read_text().split()], dtype=np.float64)
+        except (OSError, ValueError) as error:
+            raise RunError(f"cannot read {path}: {error}", "the results folder is incomplete") from error
+
+    def _metric_file(self, run_id: str, protocol_digest: str) -> Path:
+        return self.root / "metrics" / protocol_digest / f"{run_id}.json"
+
+    def _forget_metrics(self, run_id: str) -> None:
+        for metrics in (self.root / "metrics").glob(f"*/{run_id}.json"):
+            metrics.unlink()
+
+    def _link_latest(self, target: Path) -> None:
+        link = self.root / "latest"
+        fresh = self.root / f".latest.{secrets.token_hex(4)}"
+        with contextlib.suppress(OSError):  # a file system without links: the run is stored all the same
+            fresh.symlink_to(target.relative_to(self.root))
+            fresh.replace(link)
+
+
+def _abandoned(name: str) -> bool:
+    """Whether a hidden folder belonged to a process of this machine that is no more."""
+    match = re.fullmatch(r"\.[0-9a-f]{16}\.(.+)\.(\d+)\.(?:[0-9a-f]{8}(?:\.old)?|gone)", name)
+    if not match or match[1] != socket.gethostname():
+        return False
+    try:
+        os.kill(int(match[2]), 0)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        return False
+    return False
