@@ -1,7 +1,7 @@
 """The numba kernels of the renderer: ray casting over tile bins, edge antialiasing, flow and motion blur.
 
-Geometry is a list of primitives, each a unit shape in a local frame that is rigid up to a scale per axis (so that a round
-cone may have an elliptic section). A ray leaves the camera centre with direction ``((u - cx) / fx, (v - cy) / fy, 1)``;
+Geometry is a list of primitives, each a unit shape in a local frame that is rigid up to a scale per axis (so that a
+round cone may have an elliptic section). A ray leaves the camera centre with direction ``((u - cx) / fx, (v - cy) / fy, 1)``;
 its parameter t is therefore the z-depth in metres, in the local frame as well. All arithmetic is IEEE float64 without
 fastmath, every pixel depends on its own inputs only, and every kernel works on a band of rows: the result is the same for
 any number of threads. The kernels release the GIL and start no threads of their own.
@@ -16,9 +16,9 @@ import numpy as np
 from numba import njit
 
 BOX, ROUND_CONE, QUAD = 0, 1, 2
-TILE = 16
+TILE = 8
 _NEAR = 0.05
-_TWO_PI = 2.0 * math.pi
+_PER_TURN = 1.0 / (2.0 * math.pi)
 _jit: Any = njit(cache=True, nogil=True, error_model="numpy")
 _inline: Any = njit(cache=True, nogil=True, error_model="numpy", inline="never")
 
@@ -113,135 +113,6 @@ def _hit_round_cone(ox, oy, oz, dx, dy, dz, h, r1, r2, t_max):  # type: ignore[n
     return best
 
 
-@_inline
-def _trace(x, y, order, zmin, kind, local, shape):  # type: ignore[no-untyped-def]
-    """Nearest primitive along the ray (x, y, 1): (index or -1, face, t)."""
-    best_t, best, best_face = 1e30, -1, 0
-    for n in range(order.shape[0]):
-        p = order[n]
-        if zmin[p] >= best_t:
-            break
-        dx = local[p, 0] * x + local[p, 1] * y + local[p, 2]
-        dy = local[p, 4] * x + local[p, 5] * y + local[p, 6]
-        dz = local[p, 8] * x + local[p, 9] * y + local[p, 10]
-        ox, oy, oz = local[p, 3], local[p, 7], local[p, 11]
-        k = kind[p]
-        if k == QUAD:
-            if dz != 0.0:
-                t = -oz / dz
-                if _NEAR < t < best_t and abs(ox + t * dx) <= shape[p, 0] and abs(oy + t * dy) <= shape[p, 1]:
-                    best_t, best, best_face = t, p, 4
-        elif k == BOX:
-            t, face = _hit_box(ox, oy, oz, dx, dy, dz, shape[p, 0], shape[p, 1], shape[p, 2], best_t)
-            if face >= 0:
-                best_t, best, best_face = t, p, face
-        else:
-            t = _hit_round_cone(ox, oy, oz, dx, dy, dz, shape[p, 0], shape[p, 1], shape[p, 2], best_t)
-            if t < best_t:
-                best_t, best, best_face = t, p, 0
-    return best, best_face, best_t
-
-
-@_inline
-def _texel(atlas, base, log2, u, v, out, weight):  # type: ignore[no-untyped-def]
-    """Add the bilinear, wrapped sample of one mip level at (u, v) in [0, 1) units to `out`."""
-    size = 1 << log2
-    mask = size - 1
-    fu, fv = u * size - 0.5, v * size - 0.5
-    iu, iv = math.floor(fu), math.floor(fv)
-    au, av = fu - iu, fv - iv
-    u0, v0 = int(iu) & mask, int(iv) & mask
-    u1, v1 = (u0 + 1) & mask, (v0 + 1) & mask
-    a, b = base + ((v0 << log2) + u0) * 4, base + ((v0 << log2) + u1) * 4
-    c, d = base + ((v1 << log2) + u0) * 4, base + ((v1 << log2) + u1) * 4
-    wa, wb = (1.0 - au) * (1.0 - av) * weight, au * (1.0 - av) * weight
-    wc, wd = (1.0 - au) * av * weight, au * av * weight
-    for ch in range(3):
-        out[ch] += wa * atlas[a + ch] + wb * atlas[b + ch] + wc * atlas[c + ch] + wd * atlas[d + ch]
-
-
-@_inline
-def _shade(x, y, p, face, t, focal, kind, local, shape, texture, uv, tint, atlas, level_offset, log2_size, lights,
-           out):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Colour (0-255 scale) of primitive p hit at depth t along (x, y, 1), into out[0:3]; out[3] = |cos| of incidence."""
-    dx = local[p, 0] * x + local[p, 1] * y + local[p, 2]
-    dy = local[p, 4] * x + local[p, 5] * y + local[p, 6]
-    dz = local[p, 8] * x + local[p, 9] * y + local[p, 10]
-    lx, ly, lz = local[p, 3] + t * dx, local[p, 7] + t * dy, local[p, 11] + t * dz
-    nx, ny, nz = 0.0, 0.0, 0.0
-    u, v = 0.0, 0.0
-    k = kind[p]
-    if k == ROUND_CONE:
-        h, r1, r2 = shape[p, 0], shape[p, 1], shape[p, 2]
-        nx, ny = lx, ly
-        if h > 0.0:
-            s = (r1 - r2) / h
-            if lz <= r1 * s:
-                nz = lz
-            elif lz >= h + r2 * s:
-                nz = lz - h
-            else:
-                nz = s * (r1 - s * lz) / (1.0 - s * s)
-        else:
-            nz = lz
-        u = math.atan2(lx, ly) / _TWO_PI * uv[p, face, 0] + uv[p, face, 2]
-        v = -lz * uv[p, face, 1] + uv[p, face, 3]
-    else:
-        axis = face >> 1
-        sign = 1.0 if (face & 1) else -1.0
-        if axis == 0:
-            nx = sign
-            u, v = ly * sign, -lz
-        elif axis == 1:
-            ny = sign
-            u, v = -lx * sign, -lz
-        else:
-            nz = sign
-            u, v = lx, -ly
-        u = u * uv[p, face, 0] + uv[p, face, 2]
-        v = v * uv[p, face, 1] + uv[p, face, 3]
-    # Normal into the camera frame: transpose of the (camera to local) linear part.
-    cx = local[p, 0] * nx + local[p, 4] * ny + local[p, 8] * nz
-    cy = local[p, 1] * nx + local[p, 5] * ny + local[p, 9] * nz
-    cz = local[p, 2] * nx + local[p, 6] * ny + local[p, 10] * nz
-    inv = 1.0 / math.sqrt(cx * cx + cy * cy + cz * cz)
-    cos = -(cx * x + cy * y + cz) * inv / math.sqrt(x * x + y * y + 1.0)
-    if cos < 0.0:
-        cos, inv = -cos, -inv
-    cx, cy, cz = cx * inv, cy * inv, cz * inv
-    # Texel footprint: texels a pixel along the surface, between the isotropic and the slanted one.
-    tex = texture[p, face]
-    log2 = log2_size[tex]
-    if k == ROUND_CONE:
-        density = max(
-            abs(uv[p, face, 0]) / (_TWO_PI * max(0.5 * (shape[p, 1] + shape[p, 2]), 1e-3)), abs(uv[p, face, 1])
-        )
-    else:
-        density = max(abs(uv[p, face, 0]), abs(uv[p, face, 1]))
-    footprint = density * (1 << log2) * t / (focal * math.sqrt(max(cos, 0.05)))
-    out[0], out[1], out[2] = 0.0, 0.0, 0.0
-    level, blend = 0, 0.0
-    top = log2
-    while footprint > 2.0 and level < top - 1:
-        footprint *= 0.5
-        level += 1
-    if footprint > 1.0:
-        blend = min(footprint - 1.0, 1.0)
-    u -= math.floor(u)
-    v -= math.floor(v)
-    _texel(atlas, level_offset[tex, level], log2 - level, u, v, out, 1.0 - blend)
-    if blend > 0.0:
-        _texel(atlas, level_offset[tex, level + 1], log2 - level - 1, u, v, out, blend)
-    light = lights[0, 3]
-    for i in range(1, lights.shape[0]):
-        d = cx * lights[i, 0] + cy * lights[i, 1] + cz * lights[i, 2]
-        if d > 0.0:
-            light += d * lights[i, 3]
-    for ch in range(3):
-        out[ch] *= tint[p, ch] * light
-    out[3] = cos
-
-
 @_jit
 def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
     """Primitive lists of all tiles, nearest bound first.
@@ -275,59 +146,209 @@ def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
     return start, members
 
 
+# The two kernels below repeat the loop over a tile's primitives: numba counts references of every array that is passed to a
+# function that it does not inline, which costs more than the tracing.
+
+
 @_jit
 def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, hit, depth):  # type: ignore[no-untyped-def]
-    """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows."""
+    """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows.
+
+    What the neighbouring pixel of the tile saw is tried first, which bounds the search.
+    """
     fx, fy, cx, cy = intrinsics
     width = hit.shape[1]
     for row in range(row0, row1):
         y = (row - cy) / fy
+        last = -1
         for column in range(width):
             tile = (row // TILE) * tiles_x + column // TILE
+            first, end = start[tile], start[tile + 1]
+            if column % TILE == 0:
+                last = -1
             x = (column - cx) / fx
-            p, face, t = _trace(x, y, members[start[tile] : start[tile + 1]], zmin, kind, local, shape)
+            t, p, face = 1e30, -1, 0
+            for n in range(first - 1 if last >= 0 else first, end):
+                q = last
+                if n >= first:
+                    q = members[n]
+                    if zmin[q] >= t:
+                        break
+                    if q == last:
+                        continue
+                dx = local[q, 0] * x + local[q, 1] * y + local[q, 2]
+                dy = local[q, 4] * x + local[q, 5] * y + local[q, 6]
+                dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
+                ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
+                a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
+                if kind[q] == ROUND_CONE:
+                    t_hit = _hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                    if t_hit < t:
+                        t, p, face = t_hit, q, 0
+                elif kind[q] == BOX:
+                    t_hit, face_hit = _hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                    if face_hit >= 0:
+                        t, p, face = t_hit, q, face_hit
+                else:
+                    t_hit = -oz / dz
+                    if _NEAR < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
+                        t, p, face = t_hit, q, 4
+            last = p
             hit[row, column] = 8 * p + face if p >= 0 else -1
             depth[row, column] = t if p >= 0 else 0.0
 
 
 @_jit
-def shade_pixels(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, texture, uv, tint, atlas,
-                 level_offset, log2_size, lights, hit, depth, jitter, color, cosine):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Colour (float32, 0-255 scale) and cosine of incidence of rows; pixels on an edge get `jitter` [S, 2] samples."""
+def shade_pixels(
+    row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, texture, uv, tint, facets, atlas,
+    level_offset, log2_size, lights, hit, depth, jitter, color, cosine
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Colour (float32, 0-255 scale) and cosine of incidence of rows.
+
+    ``facets`` [P, 6, 5] holds for each face its unit normal in the camera frame (boxes and quads), its light, and for
+    all primitives the texels a pixel at 1 m. Pixels on an edge are the mean of the ``jitter`` [S, 2] samples (offsets
+    in pixels); each surface that these meet is shaded once, at the first of its samples.
+    """
     fx, fy, cx, cy = intrinsics
     height, width = hit.shape
-    out = np.zeros(4)
+    samples = jitter.shape[0]
+    share = 1.0 / samples
     for row in range(row0, row1):
-        y = (row - cy) / fy
         for column in range(width):
             key = hit[row, column]
-            x = (column - cx) / fx
-            if key < 0:
-                color[row, column, 0] = color[row, column, 1] = color[row, column, 2] = 0.0
-                cosine[row, column] = 0.0
-            else:
-                _shade(x, y, key >> 3, key & 7, depth[row, column], fx, kind, local, shape, texture, uv, tint, atlas,
-                       level_offset, log2_size, lights, out)  # fmt: skip
-                color[row, column, 0], color[row, column, 1], color[row, column, 2] = out[0], out[1], out[2]
-                cosine[row, column] = out[3]
-            if (
+            edge = (
                 (column > 0 and hit[row, column - 1] != key)
                 or (column + 1 < width and hit[row, column + 1] != key)
                 or (row > 0 and hit[row - 1, column] != key)
                 or (row + 1 < height and hit[row + 1, column] != key)
-            ):
-                tile = (row // TILE) * tiles_x + column // TILE
-                order = members[start[tile] : start[tile + 1]]
-                r, g, b = 0.0, 0.0, 0.0
-                for s in range(jitter.shape[0]):
-                    xs, ys = (column + jitter[s, 0] - cx) / fx, (row + jitter[s, 1] - cy) / fy
-                    p, face, t = _trace(xs, ys, order, zmin, kind, local, shape)
-                    if p >= 0:
-                        _shade(xs, ys, p, face, t, fx, kind, local, shape, texture, uv, tint, atlas, level_offset,
-                               log2_size, lights, out)  # fmt: skip
-                        r, g, b = r + out[0], g + out[1], b + out[2]
-                scale = 1.0 / jitter.shape[0]
-                color[row, column, 0], color[row, column, 1], color[row, column, 2] = r * scale, g * scale, b * scale
+            )
+            red, green, blue = 0.0, 0.0, 0.0
+            own_red, own_green, own_blue = 0.0, 0.0, 0.0
+            new_red, new_green, new_blue = 0.0, 0.0, 0.0
+            own_cos, last = 0.0, -2
+            centre = key >> 3
+            tile = (row // TILE) * tiles_x + column // TILE
+            first, end = start[tile], start[tile + 1]
+            # Sample -1 is the pixel centre, which the first pass has traced.
+            for sample in range(-1, samples if edge else 0):
+                x, y = (column - cx) / fx, (row - cy) / fy
+                seen, t, p, face = key, depth[row, column], centre, key & 7
+                if sample >= 0:
+                    x, y = (column + jitter[sample, 0] - cx) / fx, (row + jitter[sample, 1] - cy) / fy
+                    t, p, face = 1e30, -1, 0
+                    for n in range(first - 1 if centre >= 0 else first, end):
+                        q = centre
+                        if n >= first:
+                            q = members[n]
+                            if zmin[q] >= t:
+                                break
+                            if q == centre:
+                                continue
+                        dx = local[q, 0] * x + local[q, 1] * y + local[q, 2]
+                        dy = local[q, 4] * x + local[q, 5] * y + local[q, 6]
+                        dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
+                        ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
+                        a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
+                        if kind[q] == ROUND_CONE:
+                            t_hit = _hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                            if t_hit < t:
+                                t, p, face = t_hit, q, 0
+                        elif kind[q] == BOX:
+                            t_hit, face_hit = _hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                            if face_hit >= 0:
+                                t, p, face = t_hit, q, face_hit
+                        else:
+                            t_hit = -oz / dz
+                            if _NEAR < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
+                                t, p, face = t_hit, q, 4
+                    seen = 8 * p + face if p >= 0 else -1
+                    if seen == key:
+                        red, green, blue = red + own_red, green + own_green, blue + own_blue
+                        continue
+                if seen == last:
+                    red, green, blue = red + new_red, green + new_green, blue + new_blue
+                    continue
+                last = seen
+                new_red, new_green, new_blue, cos = 0.0, 0.0, 0.0, 0.0
+                if seen >= 0:
+                    su, sv = uv[p, face, 0], uv[p, face, 1]
+                    u, v = uv[p, face, 2], uv[p, face, 3]
+                    lx = local[p, 3] + t * (local[p, 0] * x + local[p, 1] * y + local[p, 2])
+                    ly = local[p, 7] + t * (local[p, 4] * x + local[p, 5] * y + local[p, 6])
+                    lz = local[p, 11] + t * (local[p, 8] * x + local[p, 9] * y + local[p, 10])
+                    norm = math.sqrt(x * x + y * y + 1.0)
+                    if kind[p] == ROUND_CONE:
+                        h, r1, r2 = shape[p, 0], shape[p, 1], shape[p, 2]
+                        nz = lz
+                        if h > 0.0:
+                            s = (r1 - r2) / h
+                            if lz >= h + r2 * s:
+                                nz = lz - h
+                            elif lz > r1 * s:
+                                nz = s * (r1 - s * lz) / (1.0 - s * s)
+                        u += math.atan2(lx, ly) * _PER_TURN * su
+                        v -= lz * sv
+                        # Normal into the camera frame: transpose of the (camera to local) linear part.
+                        nu = local[p, 0] * lx + local[p, 4] * ly + local[p, 8] * nz
+                        nv = local[p, 1] * lx + local[p, 5] * ly + local[p, 9] * nz
+                        nw = local[p, 2] * lx + local[p, 6] * ly + local[p, 10] * nz
+                        inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
+                        cos = abs(nu * x + nv * y + nw) * inv / norm
+                        light = lights[0, 3]
+                        for i in range(1, lights.shape[0]):
+                            facing = (nu * lights[i, 0] + nv * lights[i, 1] + nw * lights[i, 2]) * inv
+                            if facing > 0.0:
+                                light += facing * lights[i, 3]
+                    else:
+                        cos = abs(facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]) / norm
+                        light = facets[p, face, 3]
+                        if face < 4:
+                            side = su if (face & 1) else -su
+                            u += ly * side if face < 2 else -lx * side
+                            v -= lz * sv
+                        else:
+                            u += lx * su
+                            v -= ly * sv
+                    # Texel footprint squared, between those along and across a slanted surface; then two mip levels.
+                    tex = texture[p, face]
+                    log2 = log2_size[tex]
+                    footprint = facets[p, face, 4] * t
+                    footprint = footprint * footprint / max(cos, 0.05)
+                    level = 0
+                    while footprint > 4.0 and level < log2 - 1:
+                        footprint *= 0.25
+                        level += 1
+                    blend = min(max((footprint - 1.0) * (1.0 / 3.0), 0.0), 1.0)
+                    u -= math.floor(u)
+                    v -= math.floor(v)
+                    for upper in range(2 if blend > 0.0 else 1):
+                        bits = log2 - level - upper
+                        size = 1 << bits
+                        base = level_offset[tex, level + upper]
+                        fu, fv = u * size + (size - 0.5), v * size + (size - 0.5)  # positive, so that int() floors
+                        iu, iv = int(fu), int(fv)
+                        au, av = fu - iu, fv - iv
+                        u0, v0 = iu & (size - 1), (iv & (size - 1)) << bits
+                        u1, v1 = (iu + 1) & (size - 1), ((iv + 1) & (size - 1)) << bits
+                        a, b = base + ((v0 + u0) << 2), base + ((v0 + u1) << 2)
+                        c, d = base + ((v1 + u0) << 2), base + ((v1 + u1) << 2)
+                        weight = light * (blend if upper else 1.0 - blend)
+                        wa, wb = (1.0 - au) * (1.0 - av) * weight, au * (1.0 - av) * weight
+                        wc, wd = (1.0 - au) * av * weight, au * av * weight
+                        new_red += wa * atlas[a] + wb * atlas[b] + wc * atlas[c] + wd * atlas[d]
+                        new_green += wa * atlas[a + 1] + wb * atlas[b + 1] + wc * atlas[c + 1] + wd * atlas[d + 1]
+                        new_blue += wa * atlas[a + 2] + wb * atlas[b + 2] + wc * atlas[c + 2] + wd * atlas[d + 2]
+                    new_red, new_green, new_blue = new_red * tint[p, 0], new_green * tint[p, 1], new_blue * tint[p, 2]
+                if sample < 0:
+                    own_red, own_green, own_blue, own_cos = new_red, new_green, new_blue, cos
+                else:
+                    red, green, blue = red + new_red, green + new_green, blue + new_blue
+            if edge:
+                red, green, blue = red * share, green * share, blue * share
+            else:
+                red, green, blue = own_red, own_green, own_blue
+            color[row, column, 0], color[row, column, 1], color[row, column, 2] = red, green, blue
+            cosine[row, column] = own_cos
 
 
 @_jit

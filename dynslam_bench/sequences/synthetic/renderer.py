@@ -54,6 +54,7 @@ class Renderer:
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
+        self._density = self._texel_density()
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 
     def render(self, index: int) -> Rendered:
@@ -68,7 +69,7 @@ class Renderer:
         jitter = _JITTER if settings.antialias else np.zeros((1, 2))
         self._rows(lambda a, b: kernels.shade_pixels(
             a, b, self._intrinsics, tiles[0], tiles[1], tiles[2], tiles[3], scene.kind, now.local, scene.shape,
-            scene.texture, scene.uv, scene.tint, self.atlas.texels, self.atlas.level_offset, self.atlas.log2_size, lights,
+            scene.texture, scene.uv, scene.tint, self._facets(now, lights), self.atlas.texels, self.atlas.level_offset, self.atlas.log2_size, lights,
             hit, depth, jitter, color, cosine))  # fmt: skip
         raw = self._measure(index, depth, cosine, color)
         if settings.color.shutter > 0:
@@ -164,6 +165,30 @@ class Renderer:
                 rows[2, 3] += 0.25
         rows[:, :3] = rows[:, :3] @ snap.T_world_cam[:3, :3]
         return np.ascontiguousarray(rows)
+
+    def _facets(self, snap: Snapshot, lights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What is the same all over a face ``[P, 6, 5]``: normal in the camera frame, light, texels a pixel at 1 m."""
+        scene = self.scene
+        axes = (snap.T_world_cam[:3, :3].T @ snap.rotation).transpose(0, 2, 1)
+        facets = np.empty((len(axes), 6, 5))
+        facets[:, 0::2, :3], facets[:, 1::2, :3] = -axes, axes
+        facets[scene.kind == kernels.QUAD, 4:, :3] = axes[scene.kind == kernels.QUAD, 2:]
+        seen = snap.T_world_cam[:3, 3] - snap.origin
+        behind = (np.einsum("pij,pi->pj", snap.rotation, seen) < 0)[:, 2] & (scene.kind == kernels.QUAD)
+        facets[behind, 4:, :3] *= -1
+        facets[:, :, 3] = lights[0, 3] + np.maximum(facets[:, :, :3] @ lights[1:, :3].T, 0) @ lights[1:, 3]
+        facets[:, :, 4] = self._density
+        return facets
+
+    def _texel_density(self) -> NDArray[np.float64]:
+        """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
+        scene = self.scene
+        repeats = np.abs(scene.uv[:, :, :2])
+        cones = scene.kind == kernels.ROUND_CONE
+        girth = math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3)
+        repeats[cones, :, 0] /= girth[:, None]
+        repeats[cones] /= scene.scale[cones].mean(axis=1)[:, None, None]
+        return repeats.max(axis=2) * (1 << self.atlas.log2_size[scene.texture]) / CAMERA.fx
 
     def _measure(self, index: int, depth: NDArray[np.float64], cosine: NDArray[np.float32], color: NDArray[np.float32]
                  ) -> NDArray[np.uint16]:  # fmt: skip

@@ -27,14 +27,21 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _KINDS = ("masks", "depth", "rgb")
 
 
-def encode_png(image: NDArray[Any], level: int = 1) -> bytes:
+# Huffman coding after the SUB filter: as small as level 1 on noisy images, and more than twice as fast.
+_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+if hasattr(cv2, "IMWRITE_PNG_FILTER"):
+    _FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+_MASK_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+def encode_png(image: NDArray[Any]) -> bytes:
     """A PNG of an RGB (uint8, three channels) or single-channel (uint8, uint16) image.
 
     Raises:
         SequenceError: The encoder refuses the image.
     """
     stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    done, data = cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, level])
+    done, data = cv2.imencode(".png", stored, _MASK_PNG if image.ndim == 2 and image.dtype == np.uint8 else _FAST_PNG)
     if not done:
         raise SequenceError(f"cannot encode an image of shape {image.shape} and type {image.dtype} as PNG")
     return bytes(data.tobytes())
