@@ -39,13 +39,14 @@ OnProgress = Callable[[str, dict[str, Any]], bool]
 """
 
 
-def execute(
+def run_one(
     run: RunSpec | ResolvedRun,
     store: RunStore,
     *,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
     progress_every: int = PROGRESS_EVERY,
+    cancelled: Callable[[], bool] | None = None,
 ) -> RunRecord:
     """Make a run in a child process and store it, whatever becomes of it.
 
@@ -58,6 +59,7 @@ def execute(
         on_progress: Told of the partial metrics; may stop the run.
         protocol: Protocol of the partial metrics.
         progress_every: Frames between two of them.
+        cancelled: Asked many times a second; True ends the run at once, as stopped.
 
     Returns:
         The record.
@@ -80,7 +82,7 @@ def execute(
             "path": list(sys.path),
         }
         listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
-        verdict = supervise(start_child(), job, resolved.spec.limits, listener)
+        verdict = supervise(start_child(), job, resolved.spec.limits, listener, cancelled)
         frames = FrameLog.read(work / FRAMES_FILE)
         frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
         (work / FRAMES_FILE).unlink(missing_ok=True)

@@ -118,6 +118,7 @@ class RunRecord(Record):
         command: The command line of the parent process.
         identity: What `run_id` stands for.
         provenance: For imported trajectories: where it came from.
+        stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
         notes: Anything a reader should know, one line each.
     """
 
@@ -161,6 +162,7 @@ class RunRecord(Record):
     command: list[str] = Field(default_factory=list)
     identity: dict[str, Any] = Field(default_factory=dict)
     provenance: str = ""
+    stamps_match: bool = True
     notes: list[str] = Field(default_factory=list)
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from dynslam_bench.core.errors import EvaluationError, TrajectoryError
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
@@ -42,7 +44,7 @@ def score(
             found[which], reasons[which] = None, str(error)
     metrics = MetricRecord(
         run_id=record.run_id, protocol_id=protocol.id, protocol_digest=protocol.digest(),
-        trajectory=protocol.trajectory, online=found["online"], final=found["final"], reasons=reasons,
+        trajectory=_which(store, record, protocol), online=found["online"], final=found["final"], reasons=reasons,
     )  # fmt: skip
     store.add_metrics(metrics)
     return metrics
@@ -55,4 +57,12 @@ def _evaluate(
         raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
     if trajectory is None:
         raise EvaluationError("there is no such trajectory, or it holds no tracked frame")
-    return evaluate(trajectory, truth, protocol, input_timestamps=store.timestamps(record.sequence.part))
+    stamps = store.timestamps(record.sequence.part) if record.stamps_match else None
+    return evaluate(trajectory, truth, protocol, input_timestamps=stamps)
+
+
+def _which(store: RunStore, record: RunRecord, protocol: Protocol) -> Literal["online", "final"]:
+    """The trajectory that the protocol asks for; an imported run has only one."""
+    if record.kind == "imported":
+        return "online" if (store.folder(record.run_id) / "trajectory_online.txt").is_file() else "final"
+    return protocol.trajectory

@@ -39,7 +39,11 @@ class Verdict:
 
 
 def supervise(
-    child: Child, job: Message, limits: Limits, on_progress: Callable[[Message], bool] | None = None
+    child: Child,
+    job: Message,
+    limits: Limits,
+    on_progress: Callable[[Message], bool] | None = None,
+    cancelled: Callable[[], bool] | None = None,
 ) -> Verdict:
     """Give a child its job and watch it to its end.
 
@@ -48,11 +52,12 @@ def supervise(
         job: The job.
         limits: What it may take.
         on_progress: Called with every ``progress`` message; False asks the child to stop.
+        cancelled: Asked all the time; True ends the child at once.
 
     Returns:
         How it ended. The child has ended, too.
     """
-    watch = _Watch(child, limits, on_progress)
+    watch = _Watch(child, limits, on_progress, cancelled)
     try:
         child.connection.send_bytes(json.dumps(job).encode())
         return watch.run()
@@ -63,8 +68,14 @@ def supervise(
 
 
 class _Watch:
-    def __init__(self, child: Child, limits: Limits, on_progress: Callable[[Message], bool] | None) -> None:
-        self.child, self.limits, self.on_progress = child, limits, on_progress
+    def __init__(
+        self,
+        child: Child,
+        limits: Limits,
+        on_progress: Callable[[Message], bool] | None,
+        cancelled: Callable[[], bool] | None,
+    ) -> None:
+        self.child, self.limits, self.on_progress, self.cancelled = child, limits, on_progress, cancelled
         self.began = self.sign_of_life = time.monotonic()
         self.frame = -1
         self.n_frames = 0
@@ -133,6 +144,8 @@ class _Watch:
         limits = self.limits
         if self.final:
             return None
+        if self.cancelled is not None and self.cancelled():
+            return self._verdict("stopped", f"cancelled, {self._where()}")
         if self.stop_sent is not None and now - self.stop_sent > _STOP_GRACE_S:
             return self._verdict("stopped", f"stopped on request after frame {self.frame}")
         if limits.time_s is not None and now - self.began > limits.time_s:

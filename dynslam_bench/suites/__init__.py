@@ -1,1 +1,7 @@
 """Named benchmark suites, as TOML files."""
+
+from __future__ import annotations
+
+from .suite import Suite, Variant, load_suite, suite_names
+
+__all__ = ["Suite", "Variant", "load_suite", "suite_names"]
