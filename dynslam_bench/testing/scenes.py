@@ -1,0 +1,149 @@
+"""A small exact scene for conformance checks: a camera moves before a textured corner, a panel moves within."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame, FrameMasks, MaskSource
+
+CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+class CornerSequence:
+    """Two textured walls that meet in a corner, and a textured panel that slides along; everything is exact.
+
+    It is drawn by intersecting each pixel's ray with three planes, so that it needs no renderer and no data.
+
+    Args:
+        frames: Number of frames at 30 Hz.
+        camera: Intrinsics; distortion is ignored.
+        id: Id of the sequence; under ``synthetic/`` exact masks count as available.
+    """
+
+    license = "CC0-1.0"
+    citation = "dynslam-bench"
+    fps = 30.0
+
+    def __init__(self, frames: int = 8, camera: Camera = CAMERA, id: str = "synthetic/conformance") -> None:
+        self.id = id
+        self.camera = camera.undistorted()
+        self._count = frames
+        self.timestamps: NDArray[np.float64] = np.round(100.0 + np.arange(frames) / 30, 6)
+        steps = np.arange(frames)
+        poses = np.tile(np.eye(4), (frames, 1, 1))
+        poses[:, 0, 3] = 0.012 * steps
+        poses[:, 1, 3] = 0.004 * np.sin(steps)
+        poses[:, 2, 3] = 0.006 * steps
+        self.ground_truth: Trajectory | None = Trajectory(self.timestamps, poses)
+        self._texture = _texture(np.random.default_rng(5))
+
+    @property
+    def masks(self) -> MaskSource | None:
+        """Exact masks of the panel, which counts as a person that moves."""
+        return _Masks(self)
+
+    def digest(self) -> str:
+        """A function of the parameters."""
+        return f"corner-{self._count}-{self.camera!r}"
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> Frame:
+        index = range(self._count)[index]
+        rgb, depth, _ = self._draw(index)
+        return Frame(index, float(self.timestamps[index]), rgb, depth)
+
+    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+        camera = self.camera
+        assert self.ground_truth is not None
+        centre = self.ground_truth.T_world_cam[index, :3, 3]
+        v, u = np.mgrid[: camera.height, : camera.width]
+        ray_x, ray_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
+        walls = [(2.6 + slope * centre[0] - centre[2]) / (1 - slope * ray_x) for slope in (0.5, -0.7)]
+        depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
+        x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
+        left = -0.35 + 0.03 * index
+        panel_depth = 1.5 - centre[2]
+        panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
+        panel = (panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4)
+        depth = np.where(panel, panel_depth, depth)
+        rgb = _sample(self._texture, np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y))
+        return rgb, depth.astype(np.float32), panel
+
+
+class _Masks:
+    def __init__(self, sequence: CornerSequence) -> None:
+        self._sequence = sequence
+
+    def __getitem__(self, index: int) -> FrameMasks:
+        panel = self._sequence._draw(range(len(self._sequence))[index])[2]
+        return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index else ()))
+
+
+class Replaced:
+    """A sequence in which some frames are replaced.
+
+    Args:
+        base: The sequence.
+        frames: The replacement by index.
+    """
+
+    def __init__(self, base: CornerSequence, frames: dict[int, Frame]) -> None:
+        self.base = base
+        self.frames = frames
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("__") or name in ("base", "frames"):
+            raise AttributeError(name)
+        return getattr(self.base, name)
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+    def __getitem__(self, index: int) -> Frame:
+        index = range(len(self))[index]
+        return self.frames.get(index) or self.base[index]
+
+
+def hard_frames(like: Frame) -> dict[str, Frame]:
+    """Frames that a tracker must survive, by name.
+
+    Args:
+        like: A frame whose index, stamp and size they take.
+    """
+    black, zero = np.zeros_like(like.rgb), np.zeros_like(like.depth)
+    speckle = np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)
+    return {
+        "all-black": Frame(like.index, like.timestamp, black, zero),
+        "saturated": Frame(like.index, like.timestamp, np.full_like(like.rgb, 255), like.depth),
+        "zero depth": Frame(like.index, like.timestamp, like.rgb, zero),
+        "textureless": Frame(like.index, like.timestamp, np.full_like(like.rgb, 128), np.full_like(like.depth, 2.0)),
+        "noise": Frame(like.index, like.timestamp, speckle, like.depth),
+    }
+
+
+def _texture(rng: np.random.Generator, size: int = 512) -> NDArray[np.float64]:
+    """Random rectangles over smooth noise, ``[size, size, 3]``, which repeats at its edges."""
+    texture = rng.uniform(60, 200, (size // 32, size // 32, 3)).repeat(32, 0).repeat(32, 1)
+    for _ in range(900):
+        x, y, w, h = rng.integers([0, 0, 4, 4], [size, size, 40, 40])
+        texture[y : y + h, x : x + w] = rng.uniform(0, 255, 3)
+    return texture
+
+
+def _sample(texture: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours at metres (x, y), bilinear, 250 texels a metre."""
+    size = len(texture)
+    x, y = x * 250, y * 250
+    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    x0, y0 = x0 % size, y0 % size
+    x1, y1 = (x0 + 1) % size, (y0 + 1) % size
+    top = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
+    bottom = texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx
+    return np.round(top * (1 - fy) + bottom * fy).astype(np.uint8)

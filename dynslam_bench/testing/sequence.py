@@ -1,0 +1,151 @@
+"""Conformance of sequences: readers and data sets of one's own."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.frame import Frame, Sequence
+
+from .report import ConformanceReport, NotApplicable, require
+
+
+def check_sequence(sequence: Sequence | str | Path, *, frames: int = 3) -> None:
+    """Check that a sequence keeps its contract.
+
+    Args:
+        sequence: A sequence, or the name of one.
+        frames: How many frames to read, spread over the sequence.
+
+    Raises:
+        ConformanceError: Names every failed check, what was found and the likely cause.
+    """
+    sequence_report(sequence, frames=frames).raise_for_failures()
+
+
+def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> ConformanceReport:
+    """Run all checks of `check_sequence` and report each."""
+    if isinstance(sequence, (str, Path)):
+        sequence = open_sequence(sequence)
+    report = ConformanceReport(f"sequence {getattr(sequence, 'id', type(sequence).__name__)!r}")
+    if not report.run("protocol", lambda: _protocol(sequence)):
+        return report
+    chosen = sorted(set(np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int).tolist()))
+    report.run("timestamps", lambda: _timestamps(sequence))
+    report.run("frames", lambda: _frames(sequence, chosen))
+    report.run("end of the sequence", lambda: _end(sequence))
+    report.run("reading twice", lambda: _twice(sequence, chosen[-1]))
+    report.run("ground truth", lambda: _ground_truth(sequence))
+    report.run("masks", lambda: _masks(sequence, chosen))
+    report.run("digest", lambda: _digest(sequence))
+    report.run("pickling", lambda: _pickling(sequence))
+    return report
+
+
+def _protocol(sequence: Sequence) -> None:
+    missing = [name for name in ("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation",
+                                 "digest", "__len__", "__getitem__") if not hasattr(sequence, name)]  # fmt: skip
+    require(
+        not missing, f"a {type(sequence).__name__} lacks {', '.join(missing)}", "see dynslam_bench.sequences.Sequence"
+    )
+    require(isinstance(sequence.id, str) and sequence.id, f"the id is {sequence.id!r}, not a text")
+    require(isinstance(sequence.camera, Camera), f"the camera is a {type(sequence.camera).__name__}, not a Camera")
+    require(len(sequence) >= 1, "the sequence has no frame")
+    require(isinstance(sequence.license, str) and isinstance(sequence.citation, str), "license or citation is no text")
+
+
+def _timestamps(sequence: Sequence) -> None:
+    stamps = sequence.timestamps
+    require(isinstance(stamps, np.ndarray) and stamps.dtype == np.float64, "timestamps are no float64 array",
+            "float32 holds stamps of today to 100 s only")  # fmt: skip
+    require(stamps.shape == (len(sequence),), f"{stamps.shape} timestamps for {len(sequence)} frames")
+    require(np.isfinite(stamps).all(), "a timestamp is not finite")
+    intervals = np.diff(stamps)
+    require((intervals > 0).all(), "timestamps are not strictly increasing", "the list is unsorted or has duplicates")
+    require(sequence.fps > 0, f"fps is {sequence.fps}")
+    if len(intervals):
+        rate = 1 / float(np.median(intervals))
+        require(1 / 3 < rate / sequence.fps < 3, f"fps is {sequence.fps:g}, but the median rate is {rate:g} Hz",
+                "timestamps have to be in seconds")  # fmt: skip
+
+
+def _frames(sequence: Sequence, chosen: list[int]) -> None:
+    height, width = sequence.camera.height, sequence.camera.width
+    for index in chosen:
+        frame = sequence[index]
+        require(isinstance(frame, Frame), f"frame {index} is a {type(frame).__name__}, not a Frame")
+        require(frame.index == index, f"frame {index} says that its index is {frame.index}")
+        stamp = float(sequence.timestamps[index])
+        require(
+            frame.timestamp == stamp, f"frame {index} is stamped {frame.timestamp!r}, but timestamps[{index}] {stamp}"
+        )
+        require(frame.rgb.dtype == np.uint8 and frame.rgb.shape == (height, width, 3),
+                f"rgb of frame {index} is {frame.rgb.dtype} {frame.rgb.shape}, expected uint8 {(height, width, 3)}",
+                "the camera's size is not the image's, or the image is grey")  # fmt: skip
+        depth = frame.depth
+        require(depth.dtype == np.float32 and depth.shape == (height, width),
+                f"depth of frame {index} is {depth.dtype} {depth.shape}, not float32 {(height, width)}")  # fmt: skip
+        require(np.isfinite(depth).all() and (depth >= 0).all(),
+                f"depth of frame {index} has values below 0 or not finite", "missing depth is 0")  # fmt: skip
+        valid = depth[depth > 0]
+        if len(valid):
+            median = float(np.median(valid))
+            require(0.05 < median < 200, f"the median depth of frame {index} is {median:g} m", "wrong depth_factor")
+
+
+def _end(sequence: Sequence) -> None:
+    try:
+        sequence[len(sequence)]
+    except IndexError:
+        return
+    require(False, f"sequence[{len(sequence)}] gives a frame beyond the end", "without an IndexError, loops never end")
+
+
+def _twice(sequence: Sequence, index: int) -> None:
+    first, second = sequence[index], sequence[index]
+    same = np.array_equal(first.rgb, second.rgb) and np.array_equal(first.depth, second.depth)
+    require(same, f"frame {index} differs when it is read again", "randomness, or a buffer that is written again")
+
+
+def _ground_truth(sequence: Sequence) -> None:
+    truth = sequence.ground_truth
+    if truth is None:
+        raise NotApplicable("the sequence has none")
+    require(isinstance(truth, Trajectory), f"the ground truth is a {type(truth).__name__}, not a Trajectory")
+    stamps = sequence.timestamps
+    overlap = (truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)
+    require(overlap.any(),
+            f"the ground truth spans {truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s, the frames "
+            f"{stamps[0]:.3f} to {stamps[-1]:.3f} s", "they use different clocks")  # fmt: skip
+
+
+def _masks(sequence: Sequence, chosen: list[int]) -> None:
+    source = sequence.masks
+    if source is None:
+        raise NotApplicable("the sequence has none")
+    shape = (sequence.camera.height, sequence.camera.width)
+    for index in chosen:
+        masks = source[index]
+        kind = masks.instances.dtype
+        require(masks.instances.shape == shape and np.issubdtype(kind, np.integer),
+                f"the mask of frame {index} is {kind} {masks.instances.shape}, expected integers {shape}")  # fmt: skip
+        unnamed = set(np.unique(masks.instances).tolist()) - {0} - set(masks.class_names)
+        require(not unnamed, f"instances {sorted(unnamed)} of frame {index} have no class name", "0 is the background")
+        require(set(masks.moving) <= set(masks.class_names), f"moving instances of frame {index} have no class name")
+
+
+def _digest(sequence: Sequence) -> None:
+    first = sequence.digest()
+    require(isinstance(first, str) and first, f"the digest is {first!r}, not a text")
+    require(sequence.digest() == first, "two digests of one sequence differ", "it must depend on the content only")
+
+
+def _pickling(sequence: Sequence) -> None:
+    copy = pickle.loads(pickle.dumps(sequence))
+    require(len(copy) == len(sequence) and copy.digest() == sequence.digest(), "a pickled copy is another sequence")
+    require(np.array_equal(copy[0].rgb, sequence[0].rgb), "frame 0 of a pickled copy differs")

@@ -1,0 +1,327 @@
+"""Conformance of trackers."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from dynslam_bench.core.settings import Settings, apply_overrides, build
+from dynslam_bench.geometry.se3 import inverse, is_pose
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame, Sequence
+from dynslam_bench.slam.result import TrackResult
+from dynslam_bench.trackers.protocol import Tracker, TrackerContext, TrackerSpec
+from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
+
+from .report import ConformanceError, ConformanceReport, NotApplicable, require
+from .scenes import CornerSequence, hard_frames
+
+Subject = TrackerSpec | str | Callable[[], Tracker]
+
+
+def check_tracker(
+    subject: Subject,
+    *,
+    settings: Settings | Mapping[str, Any] | None = None,
+    sequence: Sequence | None = None,
+    frames: int = 6,
+    seed: int = 0,
+) -> None:
+    """Check that a tracker keeps its contract, on a small exact scene and on frames that hurt.
+
+    Args:
+        subject: A spec, an id, ``module:Attr``, ``file.py:Attr``, or a function that constructs a tracker.
+        settings: Its settings, or overrides of the defaults by dotted name.
+        sequence: What to track; the built-in scene by default.
+        frames: How many frames to track in each check.
+        seed: Seed of the randomness.
+
+    Raises:
+        ConformanceError: Names every failed check, what was found and the likely cause.
+    """
+    tracker_report(subject, settings=settings, sequence=sequence, frames=frames, seed=seed).raise_for_failures()
+
+
+def tracker_report(
+    subject: Subject,
+    *,
+    settings: Settings | Mapping[str, Any] | None = None,
+    sequence: Sequence | None = None,
+    frames: int = 6,
+    seed: int = 0,
+) -> ConformanceReport:
+    """Run all checks of `check_tracker` and report each.
+
+    Raises:
+        PluginError: There is no such tracker.
+    """
+    spec = TRACKERS.get(subject) if isinstance(subject, str) else subject if isinstance(subject, TrackerSpec) else None
+    report = ConformanceReport(f"tracker {spec.id!r}" if spec else f"tracker {getattr(subject, '__name__', subject)!r}")
+    scene = sequence if sequence is not None else CornerSequence(frames)
+    context = TrackerContext(scene.id, scene.masks, fps=scene.fps)
+    if spec is not None:
+        report.run("spec", lambda: _spec(spec, settings))
+        construct: Callable[[], Tracker] = _Builder(spec, settings, context)
+    else:
+        assert callable(subject)
+        construct = subject
+    if not report.run("construction", lambda: _construct(construct)):
+        return report
+    run = _Runner(construct, scene, frames, seed)
+    if not report.run("results", lambda: _results(run)):
+        return report
+    report.run("frames are left alone", lambda: _frames_left_alone(run))
+    report.run("results are kept", lambda: _results_are_kept(run))
+    deterministic = spec is None or spec.deterministic
+    report.run("determinism", lambda: _determinism(run, deterministic))
+    report.run("two resets", lambda: _two_resets(run, deterministic))
+    for name in hard_frames(scene[0]):
+        report.run(f"{name} frame", lambda name=name: _hard_frame(run, name))  # type: ignore[misc]
+    report.run("one frame", lambda: _one_frame(run))
+    report.run("final trajectory", lambda: _finalize(run))
+    report.run("closing", lambda: _closing(run))
+    return report
+
+
+class _Builder:
+    def __init__(
+        self, spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None, context: TrackerContext
+    ) -> None:
+        self.arguments = spec, settings, context
+
+    def __call__(self) -> Tracker:
+        return build_tracker(*self.arguments)
+
+
+class _Runner:
+    """Tracks the scene, or variants of it, with fresh or given trackers."""
+
+    def __init__(self, construct: Callable[[], Tracker], scene: Sequence, frames: int, seed: int) -> None:
+        self.construct, self.scene, self.seed = construct, scene, seed
+        self.count = min(frames, len(scene))
+        self.frames = [scene[index] for index in range(self.count)]
+
+    def track(self, frames: list[Frame], tracker: Tracker | None = None, *, global_seed: int = 0) -> list[TrackResult]:
+        """Reset a tracker and feed it frames, after seeding the generators that it must not use."""
+        own = tracker is None
+        tracker = self.construct() if tracker is None else tracker
+        random.seed(global_seed)
+        np.random.seed(global_seed)  # noqa: NPY002 - the legacy generator is what a tracker might use by mistake
+        tracker.reset(self.scene.camera, rng=np.random.default_rng(self.seed))
+        results = []
+        for frame in frames:
+            result = tracker.track(frame)
+            check_result(result, frame)
+            results.append(result)
+        if own:
+            _close(tracker)
+        return results
+
+
+def check_result(result: TrackResult, frame: Frame) -> None:
+    """Check what a tracker gave for one frame.
+
+    Raises:
+        ConformanceError: Something in it breaks the contract.
+    """
+    at = f"frame {frame.index}"
+    require(isinstance(result, TrackResult), f"{at}: track() gave a {type(result).__name__}, not a TrackResult",
+            "a bare pose has to be wrapped: TrackResult(T_world_cam, 'ok')")  # fmt: skip
+    require(result.state in ("initialising", "ok", "lost"), f"{at}: the state is {result.state!r}")
+    pose = result.T_world_cam
+    require(pose is not None or result.state != "ok", f"{at}: state 'ok' without a pose", "a lost frame says 'lost'")
+    if pose is not None:
+        shape = getattr(pose, "shape", type(pose).__name__)
+        require(
+            isinstance(pose, np.ndarray) and shape == (4, 4), f"{at}: the pose is {shape}, expected an array (4, 4)"
+        )
+        require(np.isfinite(pose).all(), f"{at}: the pose holds values that are not finite",
+                "a solver diverged; say 'lost' instead")  # fmt: skip
+        require(is_pose(pose), f"{at}: the pose is no rigid transformation (det {np.linalg.det(pose[:3, :3]):.4f})",
+                "the rotation drifted from orthonormal, or world-to-camera scale is mixed in")  # fmt: skip
+    for name, values in (("stats", result.stats), ("timings", result.timings)):
+        bad = {
+            key: value for key, value in values.items() if not isinstance(value, (int, float)) or not np.isfinite(value)
+        }
+        require(not bad, f"{at}: {name} hold values that are no finite numbers: {bad}")
+    require(all(value >= 0 for value in result.timings.values()), f"{at}: a timing is negative")
+    mask = result.dynamic_mask
+    if mask is not None:
+        require(mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
+                f"{at}: the dynamic mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}")  # fmt: skip
+    xy, keep = result.keypoints_xy, result.keypoints_keep
+    require(xy is None or (xy.ndim == 2 and xy.shape[1] == 2), f"{at}: keypoints_xy is no [N, 2] array")
+    require(
+        keep is None or (xy is not None and keep.shape == (len(xy),)), f"{at}: keypoints_keep does not fit keypoints_xy"
+    )
+
+
+def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> None:
+    require(spec.id and spec.label, "the spec has no id or label")
+    default = spec.settings()
+    copy = build(spec.settings, json.loads(default.model_dump_json()))
+    require(copy == default, "the default settings change when they are written as JSON and read again",
+            "a field's type does not survive JSON")  # fmt: skip
+    for name, overrides in spec.presets.items():
+        try:
+            apply_overrides(default, overrides)
+        except Exception as error:
+            raise ConformanceError(f"preset {name!r} does not fit the settings: {error}") from error
+    if not isinstance(settings, Settings):
+        resolve_settings(spec, settings)
+
+
+def _construct(construct: Callable[[], Tracker]) -> None:
+    tracker = construct()
+    missing = [name for name in ("reset", "track") if not callable(getattr(tracker, name, None))]
+    require(not missing, f"a {type(tracker).__name__} lacks {', '.join(missing)}()")
+    _close(tracker)
+
+
+def _results(run: _Runner) -> None:
+    results = run.track(run.frames)
+    keys = set(results[0].stats)
+    for frame, result in zip(run.frames, results, strict=True):
+        changed = keys ^ set(result.stats)
+        require(not changed, f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}",
+                "the keys must be the same on every frame; use 0 where there is nothing to say")  # fmt: skip
+    states = [result.state for result in results]
+    require("ok" in states, f"no frame of an easy scene was tracked: {states}",
+            "on this scene features abound and depth is exact")  # fmt: skip
+    _direction(run, results)
+
+
+def _direction(run: _Runner, results: list[TrackResult]) -> None:
+    """Recognise world-to-camera poses by how they move."""
+    truth = run.scene.ground_truth
+    posed = [(frame.timestamp, result.T_world_cam) for frame, result in zip(run.frames, results, strict=True)]
+    ends = [
+        (stamp, pose) for stamp, pose in posed if pose is not None and truth is not None and stamp in truth.timestamps
+    ]
+    if truth is None or len(ends) < 2:
+        return
+    (t0, first), (t1, last) = ends[0], ends[-1]
+    true = [truth.T_world_cam[np.searchsorted(truth.timestamps, stamp)] for stamp in (t0, t1)]
+    motion = inverse(true[0]) @ true[1]
+    distance = np.linalg.norm(motion[:3, 3])
+    error = np.linalg.norm((inverse(first) @ last - motion)[:3, 3])
+    error_inverse = np.linalg.norm((first @ inverse(last) - motion)[:3, 3])
+    require(not (error > distance > 0 and error_inverse < 0.3 * error),
+            f"the camera moved {distance:.3f} m; T_world_cam is off by {error:.3f} m, its inverse by {error_inverse:.3f} m",
+            "the poses are world-to-camera; return their inverse")  # fmt: skip
+
+
+def _frames_left_alone(run: _Runner) -> None:
+    before = [(frame.rgb.copy(), frame.depth.copy()) for frame in run.frames]
+    run.track(run.frames)
+    for frame, (rgb, depth) in zip(run.frames, before, strict=True):
+        require(np.array_equal(frame.rgb, rgb) and np.array_equal(frame.depth, depth),
+                f"frame {frame.index} was changed by the tracker", "draw on a copy")  # fmt: skip
+
+
+def _results_are_kept(run: _Runner) -> None:
+    tracker = run.construct()
+    tracker.reset(run.scene.camera, rng=np.random.default_rng(run.seed))
+    given, copies = [], []
+    for frame in run.frames:
+        pose = tracker.track(frame).T_world_cam
+        given.append(pose)
+        copies.append(None if pose is None else pose.copy())
+    _close(tracker)
+    for index, (pose, copy) in enumerate(zip(given, copies, strict=True)):
+        require(pose is None or copy is None or np.array_equal(pose, copy), f"the pose of frame {index} changed after it was returned",
+                "return a copy of the state, not the state itself")  # fmt: skip
+
+
+def _determinism(run: _Runner, deterministic: bool) -> None:
+    if not deterministic:
+        raise NotApplicable("the spec says that it is not deterministic")
+    first, second = run.track(run.frames, global_seed=1), run.track(run.frames, global_seed=2)
+    cause = "randomness that does not come from rng (numpy.random, random, cv2.theRNG), threads, or hashing order"
+    _same(first, second, "two runs with one seed differ", cause)
+
+
+def _two_resets(run: _Runner, deterministic: bool) -> None:
+    tracker = run.construct()
+    first = run.track(run.frames, tracker)
+    other = [Frame(f.index, f.timestamp, f.rgb[:, ::-1].copy(), f.depth[:, ::-1].copy()) for f in run.frames[:3]]
+    run.track(other, tracker)
+    again = run.track(run.frames, tracker)
+    _close(tracker)
+    if deterministic:
+        _same(first, again, "the same frames give other results after a second reset()",
+              "reset() leaves something of the sequence before: map, last pose, motion model, generator")  # fmt: skip
+
+
+def _hard_frame(run: _Runner, name: str) -> None:
+    for position in (0, run.count // 2):
+        frames = list(run.frames)
+        frames[position] = hard_frames(frames[position])[name]
+        try:
+            run.track(frames)
+        except ConformanceError:
+            raise
+        except Exception as error:
+            where = "the first frame" if position == 0 else "a frame in the middle"
+            raise ConformanceError(
+                f"{name} as {where} raised {type(error).__name__}: {error} "
+                "(likely cause: no features or no depth is taken for granted; say 'lost' instead)"
+            ) from error
+
+
+def _one_frame(run: _Runner) -> None:
+    tracker = run.construct()
+    run.track(run.frames[:1], tracker)
+    if callable(finalize := getattr(tracker, "finalize", None)):
+        _check_final(finalize(), run.frames[:1])
+    _close(tracker)
+
+
+def _finalize(run: _Runner) -> None:
+    tracker = run.construct()
+    finalize = getattr(tracker, "finalize", None)
+    if not callable(finalize):
+        _close(tracker)
+        raise NotApplicable("the tracker has no finalize()")
+    run.track(run.frames, tracker)
+    _check_final(finalize(), run.frames)
+    _close(tracker)
+
+
+def _check_final(final: object, frames: list[Frame]) -> None:
+    require(isinstance(final, Trajectory), f"finalize() gave a {type(final).__name__}, not a Trajectory")
+    assert isinstance(final, Trajectory)
+    foreign = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
+    require(not foreign, f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}",
+            "stamps have to be those of the frames, unrounded")  # fmt: skip
+    bad = [stamp for stamp, pose in zip(final.timestamps, final.T_world_cam, strict=True) if not is_pose(pose)]
+    require(not bad, f"{len(bad)} poses of the final trajectory are no rigid transformations")
+
+
+def _closing(run: _Runner) -> None:
+    tracker = run.construct()
+    if not callable(getattr(tracker, "close", None)):
+        raise NotApplicable("the tracker has no close()")
+    run.track(run.frames[:2], tracker)
+    _close(tracker)
+    _close(tracker)  # twice must do no harm
+
+
+def _close(tracker: Tracker) -> None:
+    if callable(close := getattr(tracker, "close", None)):
+        close()
+
+
+def _same(first: list[TrackResult], second: list[TrackResult], found: str, cause: str) -> None:
+    for index, (a, b) in enumerate(zip(first, second, strict=True)):
+        poses = (a.T_world_cam is None and b.T_world_cam is None) or (
+            a.T_world_cam is not None and b.T_world_cam is not None and np.array_equal(a.T_world_cam, b.T_world_cam)
+        )
+        different = [key for key in a.stats if a.stats[key] != b.stats.get(key)]
+        same = poses and a.state == b.state and not different
+        what = f"pose {'equal' if poses else 'different'}, states {a.state} and {b.state}, stats {different[:3]}"
+        require(same, f"{found} at frame {index}: {what}", cause)
