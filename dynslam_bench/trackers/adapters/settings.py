@@ -97,3 +97,6 @@ class Open3dOdometrySettings(Settings):
     max_depth_difference_m: float = tunable(
         0.07, meaning="largest depth difference of corresponding pixels", low=0.02, high=0.3, scale="log", unit="m"
     )
+    iterations_coarse: int = tunable(10, meaning="iterations at a quarter of the resolution", low=5, high=40)
+    iterations_middle: int = tunable(5, meaning="iterations at half the resolution", low=2, high=40)
+    iterations_fine: int = tunable(3, meaning="iterations at full resolution", low=1, high=40)

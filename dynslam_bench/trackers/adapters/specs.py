@@ -83,7 +83,7 @@ ORBSLAM3 = TrackerSpec(
 
 OPENCV_ODOMETRY = TrackerSpec(
     id="opencv-odometry",
-    entry_point=f"{_HERE}.opencv_odometry:build",
+    entry_point=f"{_HERE}.opencv_odometry:OpenCvOdometry",
     label="OpenCV RGB-D odometry",
     settings=OpenCvOdometrySettings,
     summary="OpenCV's dense frame-to-frame RGB-D odometry.",

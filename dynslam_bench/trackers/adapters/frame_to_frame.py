@@ -1,0 +1,104 @@
+"""What dense frame-to-frame odometries share: undistortion, the chain of relative motions, and what counts as lost."""
+
+from __future__ import annotations
+
+import time
+from typing import Generic, Protocol, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.slam.result import TrackResult
+
+LEAST_DEPTH_PIXELS = 1000
+PATIENCE = 5
+
+Prepared = TypeVar("Prepared")
+
+
+class Aligner(Protocol[Prepared]):
+    """The alignment of two RGB-D images of one camera."""
+
+    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Prepared:
+        """What is computed once an image: colour uint8 ``[H, W, 3]``, depth float32 ``[H, W]``, metres, 0 = missing."""
+        ...
+
+    def align(self, reference: Prepared, current: Prepared) -> NDArray[np.float64] | None:
+        """``T_reference_current`` ``[4, 4]``; None if they cannot be aligned."""
+        ...
+
+
+class FrameToFrame(Generic[Prepared]):
+    """Chains the motions from frame to frame; subclasses say how two frames are aligned.
+
+    A frame that cannot be aligned is lost. The next one is aligned to the last good frame again, at most five times in
+    a row; then the chain goes on from the newest frame as if the camera had not moved since.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._aligner: Aligner[Prepared] | None = None
+
+    def make_aligner(self, camera: Camera) -> Aligner[Prepared]:
+        """The alignment for images of this (undistorted) camera."""
+        raise NotImplementedError
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence; nothing here is random."""
+        self._aligner = self.make_aligner(camera.undistorted())
+        self._maps = undistortion_maps(camera)
+        self._reference: Prepared | None = None
+        self._pose: NDArray[np.float64] = np.eye(4)
+        self._failures = 0
+
+    def track(self, frame: Frame) -> TrackResult:
+        """``initialising`` until a frame has depth, then ``ok``, or ``lost`` where it cannot be aligned.
+
+        Raises:
+            TrackerError: `reset` was not called.
+        """
+        if self._aligner is None:
+            raise TrackerError(f"{self._name} was given a frame before reset()")
+        start = time.perf_counter()
+        rgb, depth = self._undistort(frame)
+        known = float((depth > 0).mean())
+        stats = {"depth_fraction": known}
+        if known * depth.size < LEAST_DEPTH_PIXELS:
+            state = "initialising" if self._reference is None else "lost"
+            return TrackResult(None, state, stats, {"tracking": time.perf_counter() - start})  # type: ignore[arg-type]
+        current = self._aligner.prepare(rgb, depth)
+        motion = np.eye(4) if self._reference is None else self._aligner.align(self._reference, current)
+        good = motion is not None and se3.is_pose(motion)
+        if good:
+            self._pose = self._pose @ motion
+        self._failures = 0 if good else self._failures + 1
+        if good or self._failures >= PATIENCE:
+            self._reference = current
+        timings = {"tracking": time.perf_counter() - start}
+        if not good:
+            return TrackResult(None, "lost", stats, timings)
+        return TrackResult(self._pose.copy(), "ok", stats, timings)
+
+    def _undistort(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        depth = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        if self._maps is None:
+            return frame.rgb, depth
+        rgb = cv2.remap(frame.rgb, *self._maps, cv2.INTER_LINEAR)
+        depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
+        return np.asarray(rgb, dtype=np.uint8), np.asarray(depth, dtype=np.float32)
+
+
+def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Column and row ``[H, W]`` in the distorted image of each undistorted pixel; None without distortion."""
+    if not camera.is_distorted:
+        return None
+    columns, rows = cv2.initUndistortRectifyMap(
+        camera.matrix, np.asarray(camera.distortion), np.eye(3), camera.matrix, (camera.width, camera.height),
+        cv2.CV_32FC1,
+    )  # fmt: skip
+    return np.asarray(columns, dtype=np.float32), np.asarray(rows, dtype=np.float32)
