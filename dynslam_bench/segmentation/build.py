@@ -200,7 +200,7 @@ def build_embedded(settings: SegmentationSettings, context: SegmenterContext) ->
     path = embedded_weights()
     if path is None:
         raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
-    return _mask_rcnn(path, settings, context)
+    return _mask_rcnn(path, settings.model_copy(update={"network_side": 0}), context)
 
 
 def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:

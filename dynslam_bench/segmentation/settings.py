@@ -21,8 +21,8 @@ class SegmentationSettings(Settings):
 
     `source` is one of ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint), ``none``,
     ``oracle`` (exact masks), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN
-    checkpoint: torchvision's or our own) and ``plugin:ID``. `classes` is a comma-separated list of COCO names and presets
-    (``person``, ``dynaslam19``, ``all``).
+    checkpoint: torchvision's or our own) and ``plugin:ID``. `classes` is a comma-separated list of COCO names and
+    presets (``person``, ``dynaslam19``, ``all``).
 
     Pixel quantities are pixels of the input frame. `dilation_px` is the *radius* of the elliptic structuring element:
     15 grows a mask by 15 pixels on every side (an element of 31 x 31 pixels, as in DynaSLAM).
@@ -80,6 +80,10 @@ class SegmentationSettings(Settings):
     repair_band_px: int = tunable(
         8, low=2, high=20, limits=(1, 100), unit="px", when={"repair": ["depth"]},
         meaning="width of the border in which depth decides, on both sides of the mask's edge",
+    )  # fmt: skip
+    network_side: int = tunable(
+        480, low=240, high=800, limits=(0, 2000), unit="px",
+        meaning="shorter side of the input of coco and weights networks; 0 = as they were trained",
     )  # fmt: skip
     onnx_normalisation: Literal["auto", "unit", "symmetric", "imagenet"] = "auto"
     """Input scaling of an ONNX network: [0, 1], [-1, 1], ImageNet's statistics, or what its kind usually takes."""
