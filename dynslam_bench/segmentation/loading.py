@@ -146,7 +146,7 @@ def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
     if ratios != 3:
         raise SegmentationError(f"{where} has {ratios} anchors a cell, torchvision's models have 3")
     return NetworkConfig(
-        blocks=blocks,  # type: ignore[arg-type]
+        blocks=blocks,
         bottleneck=bottleneck,
         stem=int(state["backbone.body.conv1.weight"].shape[0]),
         channels=int(state["backbone.fpn.inner_blocks.0.0.weight"].shape[0]),

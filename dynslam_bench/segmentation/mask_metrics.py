@@ -114,9 +114,7 @@ class MaskTally:
         large = np.count_nonzero(true, axis=(1, 2)) >= max(self.min_area, 1) if len(true) else np.zeros(0, bool)
         sure = scores >= self.confidence
         if len(true) or sure.any():
-            shape = true.shape[1:]
-            counts = compare_masks(guess[sure].any(axis=0) if sure.any() else np.zeros(shape, bool),
-                                   true.any(axis=0) if len(true) else np.zeros(shape, bool))  # fmt: skip
+            counts = compare_masks(np.asarray(guess[sure].any(axis=0)), np.asarray(true.any(axis=0)))
             tally.counts = tally.counts + counts
             if counts.iou is not None:
                 tally.frames.append(counts.iou)

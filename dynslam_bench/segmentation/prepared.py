@@ -151,7 +151,7 @@ def vary(
 
 
 def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    value = rgb.astype(np.float32) / 255
+    value: NDArray[np.float32] = rgb.astype(np.float32) / np.float32(255)
     if rng.random() < 0.8:
         value = value ** np.float32(np.exp(rng.normal(0, 0.25)))
         value = (value - 0.5) * np.float32(rng.uniform(0.7, 1.3)) + np.float32(0.5 + rng.uniform(-0.15, 0.15))
@@ -170,9 +170,9 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
         half = (length - 1) / 2
         for t in np.linspace(-half, half, 4 * length):
             kernel[round(half + t * np.sin(angle)), round(half + t * np.cos(angle))] = 1
-        value = cv2.filter2D(value, -1, kernel / kernel.sum())
+        value = np.asarray(cv2.filter2D(value, -1, kernel / kernel.sum()), np.float32)
     elif rng.random() < 0.2:
-        value = cv2.GaussianBlur(value, (0, 0), float(rng.uniform(0.4, 1.5)))
+        value = np.asarray(cv2.GaussianBlur(value, (0, 0), float(rng.uniform(0.4, 1.5))), np.float32)
     if rng.random() < 0.4:
         value = value + rng.standard_normal(value.shape, np.float32) * np.float32(rng.uniform(0, 0.05))
     return np.asarray(np.rint(np.clip(value, 0, 1) * 255), np.uint8)

@@ -178,11 +178,13 @@ class _Run:
             _initialise(self.network, Path(settings.init))
         self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval()
-        decay, plain = [], []
+        decay: list[nn.Parameter] = []
+        plain: list[nn.Parameter] = []
         for parameter in self.network.parameters():
             (decay if parameter.dim() > 1 else plain).append(parameter)
+        groups: list[dict[str, Any]] = [{"params": decay}, {"params": plain, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(
-            [{"params": decay}, {"params": plain, "weight_decay": 0.0}],
+            groups,
             lr=settings.learning_rate, weight_decay=settings.weight_decay,
         )  # fmt: skip
         self.step = 0
@@ -321,7 +323,7 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
                     for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]  # fmt: skip
             best.append(max(ious, default=0.0))
         union = np.any(masks, axis=0) if masks else np.zeros((height, width), bool)
-        counts = counts + compare_masks(union, example.masks.any(axis=0))
+        counts = counts + compare_masks(union, np.asarray(example.masks.any(axis=0)))
     return {
         "iou": float(np.mean(best)) if best else 0.0,
         "pixel_iou": counts.iou or 0.0,
