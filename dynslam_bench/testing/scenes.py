@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,13 +34,8 @@ class CornerSequence:
         self.camera = camera.undistorted()
         self._count = frames
         self.timestamps: NDArray[np.float64] = np.round(100.0 + np.arange(frames) / 30, 6)
-        steps = np.arange(frames)
-        poses = np.tile(np.eye(4), (frames, 1, 1))
-        poses[:, 0, 3] = 0.012 * steps
-        poses[:, 1, 3] = 0.004 * np.sin(steps)
-        poses[:, 2, 3] = 0.006 * steps
+        poses = np.stack([_pose(index) for index in range(frames)])
         self.ground_truth: Trajectory | None = Trajectory(self.timestamps, poses)
-        self._texture = _texture(np.random.default_rng(5))
 
     @property
     def masks(self) -> MaskSource | None:
@@ -54,26 +51,8 @@ class CornerSequence:
 
     def __getitem__(self, index: int) -> Frame:
         index = range(self._count)[index]
-        rgb, depth, _ = self._draw(index)
-        return Frame(index, float(self.timestamps[index]), rgb, depth)
-
-    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-        camera = self.camera
-        assert self.ground_truth is not None
-        centre = self.ground_truth.T_world_cam[index, :3, 3]
-        v, u = np.mgrid[: camera.height, : camera.width]
-        ray_x, ray_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-        # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
-        walls = [(2.6 + slope * centre[0] - centre[2]) / (1 - slope * ray_x) for slope in (0.5, -0.7)]
-        depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
-        x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
-        left = -0.35 + 0.03 * index
-        panel_depth = 1.5 - centre[2]
-        panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
-        panel = (panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4)
-        depth = np.where(panel, panel_depth, depth)
-        rgb = _sample(self._texture, np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y))
-        return rgb, depth.astype(np.float32), panel
+        rgb, depth, _ = _draw(self.camera, index)
+        return Frame(index, float(self.timestamps[index]), rgb.copy(), depth.copy())
 
 
 class _Masks:
@@ -81,33 +60,8 @@ class _Masks:
         self._sequence = sequence
 
     def __getitem__(self, index: int) -> FrameMasks:
-        panel = self._sequence._draw(range(len(self._sequence))[index])[2]
+        panel = _draw(self._sequence.camera, range(len(self._sequence))[index])[2]
         return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index else ()))
-
-
-class Replaced:
-    """A sequence in which some frames are replaced.
-
-    Args:
-        base: The sequence.
-        frames: The replacement by index.
-    """
-
-    def __init__(self, base: CornerSequence, frames: dict[int, Frame]) -> None:
-        self.base = base
-        self.frames = frames
-
-    def __getattr__(self, name: str) -> object:
-        if name.startswith("__") or name in ("base", "frames"):
-            raise AttributeError(name)
-        return getattr(self.base, name)
-
-    def __len__(self) -> int:
-        return len(self.base)
-
-    def __getitem__(self, index: int) -> Frame:
-        index = range(len(self))[index]
-        return self.frames.get(index) or self.base[index]
 
 
 def hard_frames(like: Frame) -> dict[str, Frame]:
@@ -127,8 +81,35 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
     }
 
 
-def _texture(rng: np.random.Generator, size: int = 512) -> NDArray[np.float64]:
-    """Random rectangles over smooth noise, ``[size, size, 3]``, which repeats at its edges."""
+def _pose(index: int) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, 3] = 0.012 * index, 0.004 * np.sin(index), 0.006 * index
+    return pose
+
+
+@lru_cache(maxsize=12)
+def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    """Colour, depth and the panel's mask."""
+    centre = _pose(index)[:3, 3]
+    v, u = np.mgrid[: camera.height, : camera.width]
+    ray_x, ray_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
+    walls = [(2.6 + slope * centre[0] - centre[2]) / (1 - slope * ray_x) for slope in (0.5, -0.7)]
+    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
+    x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
+    left = -0.35 + 0.03 * index
+    panel_depth = 1.5 - centre[2]
+    panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
+    panel = np.asarray((panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4))
+    depth = np.where(panel, panel_depth, depth)
+    rgb = _sample(_texture(), np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y))
+    return rgb, depth.astype(np.float32), panel
+
+
+@lru_cache(maxsize=1)
+def _texture(size: int = 512) -> NDArray[np.float64]:
+    """Random rectangles over a coarse pattern, ``[size, size, 3]``, which repeats at its edges."""
+    rng = np.random.default_rng(5)
     texture = rng.uniform(60, 200, (size // 32, size // 32, 3)).repeat(32, 0).repeat(32, 1)
     for _ in range(900):
         x, y, w, h = rng.integers([0, 0, 4, 4], [size, size, 40, 40])

@@ -210,15 +210,18 @@ def _direction(run: _Runner, results: list[TrackResult]) -> None:
     distance = np.linalg.norm(motion[:3, 3])
     error = np.linalg.norm((inverse(first) @ last - motion)[:3, 3])
     error_inverse = np.linalg.norm((first @ inverse(last) - motion)[:3, 3])
-    require(not (error > distance > 0 and error_inverse < 0.3 * error),
-            f"the camera moved {distance:.3f} m; T_world_cam is off by {error:.3f} m, its inverse by {error_inverse:.3f} m",
+    found = (
+        f"the camera moved {distance:.3f} m; the poses are off by {error:.3f} m, their inverses by {error_inverse:.3f}"
+    )
+    require(not (error > distance > 0 and error_inverse < 0.3 * error), found,
             "the poses are world-to-camera; return their inverse")  # fmt: skip
 
 
 def _frames_left_alone(run: _Runner) -> None:
-    before = [(frame.rgb.copy(), frame.depth.copy()) for frame in run.frames]
-    run.track(run.frames)
-    for frame, (rgb, depth) in zip(run.frames, before, strict=True):
+    frames = [run.scene[index] for index in range(run.count)]  # those of earlier checks may be spoilt already
+    before = [(frame.rgb.copy(), frame.depth.copy()) for frame in frames]
+    run.track(frames)
+    for frame, (rgb, depth) in zip(frames, before, strict=True):
         require(np.array_equal(frame.rgb, rgb) and np.array_equal(frame.depth, depth),
                 f"frame {frame.index} was changed by the tracker", "draw on a copy")  # fmt: skip
 
@@ -233,8 +236,8 @@ def _results_are_kept(run: _Runner) -> None:
         copies.append(None if pose is None else pose.copy())
     _close(tracker)
     for index, (pose, copy) in enumerate(zip(given, copies, strict=True)):
-        require(pose is None or copy is None or np.array_equal(pose, copy), f"the pose of frame {index} changed after it was returned",
-                "return a copy of the state, not the state itself")  # fmt: skip
+        require(pose is None or copy is None or np.array_equal(pose, copy),
+                f"the pose of frame {index} changed later", "return a copy of the state, not the state")  # fmt: skip
 
 
 def _determinism(run: _Runner, deterministic: bool) -> None:

@@ -1,0 +1,100 @@
+"""Everything that comes with the package passes its own conformance checks."""
+
+import importlib
+import inspect
+import pkgutil
+import typing
+from pathlib import Path
+
+import pytest
+
+import dynslam_bench.culling
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.culling.filter import DynamicFilter
+from dynslam_bench.segmentation.build import build_segmenter
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences import open_sequence
+from dynslam_bench.testing import (
+    CornerSequence,
+    check_filter,
+    check_segmenter,
+    check_sequence,
+    check_tracker,
+    filter_scene,
+)
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+
+
+def filters():
+    """Every filter class of the culling room, found by looking."""
+    found = {}
+    for module in pkgutil.iter_modules(dynslam_bench.culling.__path__):
+        loaded = importlib.import_module(f"dynslam_bench.culling.{module.name}")
+        for name, value in vars(loaded).items():
+            if inspect.isclass(value) and value.__module__ == loaded.__name__ and DynamicFilter in value.__mro__[1:]:
+                found[name] = value
+    return found
+
+
+def construct(filter_class):
+    """A filter with default settings, by the types of its parameters."""
+    hints = typing.get_type_hints(filter_class.__init__)
+    parameters = list(inspect.signature(filter_class).parameters.values())
+    needed = [hints[p.name] for p in parameters if p.default is p.empty]
+    assert all(issubclass(kind, Settings) for kind in needed), needed
+    return filter_class(*[kind() for kind in needed])
+
+
+@pytest.mark.parametrize("name", sorted(filters()))
+def test_filters(name):
+    check_filter(lambda: construct(filters()[name]))
+
+
+def test_every_filter_was_found():
+    assert {"SemanticFilter", "EpipolarFilter", "MotionFilter", "MultiViewFilter"} <= set(filters())
+
+
+def test_the_filter_scene_is_exact():
+    """Undoing the flow of static points by the true motion leaves nothing; the panel's points move."""
+    import numpy as np
+
+    from dynslam_bench.geometry import se3
+
+    scene = filter_scene(3)
+    (before, _), (frame, state) = scene.steps[1:3]
+    world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy, frame.z))
+    expected = state.camera.project(se3.transform(se3.inverse(state.T_world_prev), world))
+    error = np.linalg.norm(expected - state.flow.xy, axis=1)
+    assert error[~scene.moving[2] & state.flow.valid].max() < 1e-3
+    assert error[scene.moving[2]].min() > 5 and scene.moving[2].sum() > 10
+    column, row = np.rint(state.flow.xy).astype(int).T
+    patch = frame.gray[np.rint(frame.xy[:, 1]).astype(int), np.rint(frame.xy[:, 0]).astype(int)].astype(int)
+    same = np.abs(before.gray[row.clip(0, 479), column.clip(0, 639)].astype(int) - patch)[state.flow.valid]
+    assert (same < 25).mean() > 0.8  # the images agree with the flow
+
+
+@pytest.mark.parametrize("name", ["never-move", "constant-velocity", "orb-slam2", "mask-rcnn"])
+def test_trackers(name):
+    check_tracker(name, frames=4, settings={"segmentation.source": "oracle"} if name == "mask-rcnn" else None)
+
+
+def test_sequences():
+    check_sequence(CornerSequence(3))
+    check_sequence(CornerSequence(1))
+
+
+def test_rendered_sequences(tmp_path):
+    check_sequence(open_sequence("synthetic/sitting_rpy@2?frames=5", data_root=tmp_path))
+
+
+@pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")
+@pytest.mark.parametrize("name", ["bonn/crowd", "tum/fr1/xyz", "tum/fr1/rpy"])
+def test_real_sequences(name):
+    check_sequence(open_sequence(name, data_root=SHARED / "data", frames="3:", stride=2))
+
+
+def test_segmenters():
+    scene = CornerSequence(2)
+    settings = SegmentationSettings(source="oracle")
+    check_segmenter(lambda: build_segmenter(settings, sequence_id=scene.id, masks=scene.masks))

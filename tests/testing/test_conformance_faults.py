@@ -1,0 +1,286 @@
+"""Each check finds the fault that it is for, and names it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynslam_bench.culling.filter import FilterResult
+from dynslam_bench.geometry.se3 import inverse
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.sequences import Frame
+from dynslam_bench.slam.result import TrackResult
+from dynslam_bench.testing import (
+    ConformanceError,
+    CornerSequence,
+    check_filter,
+    check_segmenter,
+    check_sequence,
+    check_tracker,
+    tracker_report,
+)
+from dynslam_bench.trackers import TrackerSpec
+
+TRUTH = CornerSequence(4).ground_truth.T_world_cam
+
+
+class Good:
+    """Knows the scene's poses by heart."""
+
+    def reset(self, camera, *, rng):
+        self.rng, self.stamps = rng, []
+
+    def track(self, frame):
+        self.stamps.append(frame.timestamp)
+        return TrackResult(TRUTH[frame.index].copy(), "ok", {"matches": 1.0}, {"all": 0.001})
+
+    def finalize(self):
+        return Trajectory(np.array(self.stamps), TRUTH[: len(self.stamps)])
+
+    def close(self):
+        pass
+
+
+def faulty(**methods):
+    return type("Faulty", (Good,), methods)
+
+
+def gave(change):
+    return faulty(track=lambda self, frame: change(self, Good.track(self, frame), frame))
+
+
+def test_a_good_tracker_passes():
+    report = tracker_report(Good, frames=4)
+    assert report.ok and {check.status for check in report.checks} == {"passed"}
+    assert len(report.checks) == 14
+
+
+class Drifting:
+    """One pose array for all results."""
+
+    def reset(self, camera, *, rng):
+        self.pose = np.eye(4)
+
+    def track(self, frame):
+        self.pose[:] = TRUTH[frame.index]
+        return TrackResult(self.pose, "ok")
+
+
+class Forgetful(Good):
+    total = 0
+
+    def track(self, frame):
+        self.total += 1
+        return TrackResult(TRUTH[frame.index], "ok", {"total": float(self.total)})
+
+
+def skew(pose):
+    pose = pose.copy()
+    pose[0, 0] = 1.1
+    return pose
+
+
+def scribble(self, result, frame):
+    frame.rgb[0, 0] = 77  # the same on every call: only fresh frames show it
+    return result
+
+
+@pytest.mark.parametrize(
+    ("tracker", "check", "words"),
+    [
+        (gave(lambda s, r, f: r.T_world_cam), "results", "gave a ndarray, not a TrackResult"),
+        (gave(lambda s, r, f: replace(r, state="fine")), "results", "the state is 'fine'"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=None)), "results", "state 'ok' without a pose"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam * np.nan)), "results", "a solver diverged"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=skew(r.T_world_cam))), "results", "no rigid transformation"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam[:3])), "results", r"the pose is \(3, 4\)"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=inverse(r.T_world_cam))), "results", "world-to-camera"),
+        (gave(lambda s, r, f: replace(r, state="lost")), "results", "no frame of an easy scene was tracked"),
+        (gave(lambda s, r, f: replace(r, stats={f"n{f.index}": 1.0})), "results", "the same on every frame"),
+        (gave(lambda s, r, f: replace(r, stats={"n": float("nan")})), "results", "no finite numbers"),
+        (gave(lambda s, r, f: replace(r, timings={"t": -1.0})), "results", "a timing is negative"),
+        (gave(lambda s, r, f: replace(r, dynamic_mask=np.zeros((4, 4), bool))), "results", "the dynamic mask is"),
+        (gave(scribble), "frames are left alone", "draw on a copy"),
+        (Drifting, "results are kept", "the pose of frame 0 changed"),
+        (
+            gave(lambda s, r, f: replace(r, stats={"matches": float(np.random.rand())})),  # noqa: NPY002
+            "determinism",
+            "randomness that does not come from rng",
+        ),
+        (Forgetful, "two resets", "leaves something of the sequence before"),
+        (
+            faulty(finalize=lambda self: Trajectory(np.array([1.0]), np.eye(4)[None])),
+            "final trajectory",
+            "1 stamps of no frame",
+        ),
+        (faulty(finalize=lambda self: TRUTH), "final trajectory", "not a Trajectory"),
+        (faulty(__init__=lambda self: 1 / 0), "construction", "raised ZeroDivisionError"),
+        (faulty(track=None), "construction", r"lacks track\(\)"),
+    ],
+)
+def test_faulty_trackers(tracker, check, words):
+    with pytest.raises(ConformanceError, match=words) as caught:
+        check_tracker(tracker, frames=4)
+    assert f"\n  {check}: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("condition", "name"),
+    [
+        (lambda f: not f.rgb.any(), "all-black"),
+        (lambda f: (f.rgb == 255).all(), "saturated"),
+        (lambda f: f.rgb.any() and not f.depth.any(), "zero depth"),
+        (lambda f: (f.rgb == 128).all(), "textureless"),
+    ],
+)
+def test_trackers_that_break_on_hard_frames(condition, name):
+    def track(self, frame):
+        if condition(frame):
+            raise IndexError("no features")
+        return Good.track(self, frame)
+
+    report = tracker_report(faulty(track=track), frames=4)
+    assert [check.name for check in report.failed] == [f"{name} frame"]
+    assert "raised IndexError: no features" in report.failed[0].message
+
+
+def test_the_spec_is_checked_too(tmp_path):
+    spec = TrackerSpec("mine", f"{__name__}:Good", "Mine", presets={"fast": {"nothing": 1}})
+    report = tracker_report(spec, frames=2)
+    assert report.checks[0].status == "failed" and "preset 'fast' does not fit" in report.checks[0].message
+
+
+class Sequence(CornerSequence):
+    """A sequence with one fault."""
+
+    def __init__(self, fault):
+        super().__init__(4)
+        self.fault = fault
+        if fault == "float32":
+            self.timestamps = self.timestamps.astype(np.float32)
+        if fault == "unsorted":
+            self.timestamps = self.timestamps[::-1].copy()
+        if fault == "milliseconds":
+            self.timestamps = self.timestamps * 1000
+        if fault == "clock":
+            self.ground_truth = Trajectory(self.timestamps + 1e6, TRUTH)
+
+    def __getitem__(self, index):
+        if self.fault == "endless" and index >= 4:
+            index = 3
+        frame = super().__getitem__(index)
+        if self.fault == "grey":
+            return replace(frame, rgb=frame.rgb[..., 0])
+        if self.fault == "raw depth":
+            return replace(frame, depth=frame.depth * 5000)
+        if self.fault == "nan depth":
+            return replace(frame, depth=np.where(frame.depth > 2, np.float32(np.nan), frame.depth))
+        if self.fault == "index":
+            return Frame(0, frame.timestamp, frame.rgb, frame.depth)
+        if self.fault == "random":
+            return replace(frame, depth=frame.depth + np.random.default_rng().random(frame.depth.shape, np.float32))
+        return frame
+
+    @property
+    def masks(self):
+        base = super().masks
+        if self.fault != "unnamed":
+            return base
+        return [replace(base[i], class_names={}) for i in range(4)]
+
+    def digest(self):
+        return str(np.random.default_rng().random()) if self.fault == "digest" else super().digest()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("float32", "no float64 array"),
+        ("unsorted", "not strictly increasing"),
+        ("milliseconds", "in seconds"),
+        ("clock", "different clocks"),
+        ("endless", "beyond the end"),
+        ("grey", "the image is grey"),
+        ("raw depth", "wrong depth_factor"),
+        ("nan depth", "missing depth is 0"),
+        ("index", "says that its index is 0"),
+        ("random", "differs when it is read again"),
+        ("unnamed", "have no class name"),
+        ("digest", "two digests of one sequence differ"),
+    ],
+)
+def test_faulty_sequences(fault, words):
+    with pytest.raises(ConformanceError, match=words):
+        check_sequence(Sequence(fault))
+
+
+class Keep:
+    """Keeps everything."""
+
+    name, needs, provenance = "keep", frozenset({"depth"}), "own"
+
+    def reset(self, camera):
+        self.calls = 0
+
+    def apply(self, frame, state):
+        return FilterResult.of(np.ones(len(frame), bool))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"needs": frozenset({"magic"})}, "unknown needs"),
+        ({"provenance": "copied"}, "provenance is 'copied'"),
+        ({"apply": lambda s, f, st: FilterResult.of(np.ones(3, bool))}, "not only on those that earlier filters kept"),
+        ({"apply": lambda s, f, st: FilterResult(np.ones(len(f), bool), np.full(len(f), 2, np.float32))}, "outside"),
+        ({"apply": lambda s, f, st: FilterResult.of(st.flow.valid)}, "raised AttributeError"),
+        (
+            {"apply": lambda s, f, st: replace(FilterResult.of(np.ones(len(f), bool)), stats={f"n{f.index}": 1.0})},
+            "other keys",
+        ),
+        ({"apply": lambda s, f, st: FilterResult.of(np.random.rand(len(f)) > 0.5)}, "state.seed"),  # noqa: NPY002
+    ],
+)
+def test_faulty_filters(change, words):
+    check_filter(Keep)
+    with pytest.raises(ConformanceError, match=words):
+        check_filter(type("Faulty", (Keep,), change))
+
+
+def test_a_filter_that_needs_keypoints():
+    def apply(self, frame, state):
+        return FilterResult.of(frame.z > frame.z.min())
+
+    with pytest.raises(ConformanceError, match="no keypoints: raised ValueError"):
+        check_filter(type("Faulty", (Keep,), {"apply": apply}))
+
+
+def instances(frame, **change):
+    mask = np.zeros((1, *frame.depth.shape), bool)
+    mask[0, 10:20, 30:60] = True
+    whole = Instances(mask, np.array([[30, 10, 60, 20]], np.float32), ("person",), np.ones(1, np.float32))
+    return replace(whole, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"masks": np.zeros((1, 9, 9), bool)}, "at the frame's resolution"),
+        ({"boxes": np.array([[10, 30, 20, 60]], np.float32)}, "y before x"),
+        ({"boxes": np.array([[30, 10, 25, 20]], np.float32)}, "not x, y, w, h"),
+        ({"scores": np.array([3], np.float32)}, "logits, not scores"),
+        ({"class_names": ("",)}, "a class has no name"),
+    ],
+)
+def test_faulty_segmenters(change, words):
+    class Segmenter:
+        def segment(self, frame):
+            return instances(frame, **change)
+
+    with pytest.raises(ConformanceError, match=words):
+        check_segmenter(Segmenter)
+
+
+def test_a_good_segmenter_passes():
+    check_segmenter(type("Segmenter", (), {"segment": lambda self, frame: instances(frame)}))
