@@ -6,12 +6,16 @@ import time
 
 import numpy as np
 
-from dynslam_bench.core.cache import StageCache, content_digest, machine_digest
+from dynslam_bench.core.cache import Arrays, StageCache, content_digest, machine_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.sequences.frame import Frame
 
+from .build import LOWEST_CONFIDENCE, ConfiguredSegmenter, weights_digest
 from .instances import Instances, Segmenter
+from .schedule import MaskScheduler
 
+NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
+"""Sources whose masks depend on the colour image alone."""
 VERSION = 1
 """Raise it when a change of a segmenter changes its masks."""
 
@@ -26,36 +30,72 @@ class CachedSegmenter:
         threads: Threads of the network, part of the cost.
 
     Attributes:
-        cost_s: What the last call cost when it was computed, seconds; None if it was computed just now.
+        hit: Whether the last call found its result stored.
+        saved_s: Seconds to add to the last call's wall time for what it costs without the cache: what computing it cost
+            less the look-up, or minus the time that storing it took.
     """
 
     def __init__(self, segmenter: Segmenter, identity: object, cache: StageCache, threads: int) -> None:
         self._segmenter = segmenter
         self._cache = cache
         self._prefix = digest([VERSION, identity, machine_digest(), threads])
-        self.cost_s: float | None = None
+        self.hit = False
+        self.saved_s = 0.0
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame."""
+        begin = time.perf_counter()
         key = digest([self._prefix, content_digest(frame.rgb)], 32)
         entry = self._cache.get("masks", key)
+        self.hit = entry is not None
         if entry is not None:
-            self.cost_s = entry.cost_s
-            stored = entry.arrays
-            shape = tuple(stored["shape"].tolist())
-            masks = np.unpackbits(stored["masks"], count=int(np.prod(shape))).astype(bool).reshape(shape)
-            names = tuple(stored["class_names"].tolist())
-            moving = stored.get("moving")
-            return Instances(masks, stored["boxes"], names, stored["scores"], moving)
+            found = _unpack(entry.arrays)
+            self.saved_s = entry.cost_s - (time.perf_counter() - begin)
+            return found
         start = time.perf_counter()
         found = self._segmenter.segment(frame)
         cost = time.perf_counter() - start
-        arrays = {
-            "masks": np.packbits(found.masks), "shape": np.array(found.masks.shape), "boxes": found.boxes,
-            "class_names": np.array(found.class_names, dtype=np.str_), "scores": found.scores,
-        }  # fmt: skip
-        if found.moving is not None:
-            arrays["moving"] = found.moving
-        self._cache.put("masks", key, arrays, cost)
-        self.cost_s = None
+        self._cache.put("masks", key, _pack(found), cost)
+        self.saved_s = cost - (time.perf_counter() - begin)
         return found
+
+
+def _pack(found: Instances) -> Arrays:
+    arrays: Arrays = {
+        "masks": np.packbits(found.masks),
+        "shape": np.array(found.masks.shape),
+        "boxes": found.boxes,
+        "class_names": np.array(found.class_names, dtype=np.str_),
+        "scores": found.scores,
+    }
+    return arrays if found.moving is None else {**arrays, "moving": found.moving}
+
+
+def _unpack(stored: Arrays) -> Instances:
+    shape = tuple(stored["shape"].tolist())
+    masks = np.unpackbits(stored["masks"], count=int(np.prod(shape))).astype(bool).reshape(shape)
+    names = tuple(stored["class_names"].tolist())
+    return Instances(masks, stored["boxes"], names, stored["scores"], stored.get("moving"))
+
+
+def cache_segmenter(
+    stage: MaskScheduler, cache: StageCache, sequence_id: str, device: str, threads: int
+) -> CachedSegmenter | None:
+    """Put the cache between a segmentation stage and its network; None for sources that are no network.
+
+    Selection by class and confidence comes after the cache, so that studies over them share its entries.
+    """
+    configured = stage.segmenter
+    if not isinstance(configured, ConfiguredSegmenter) or configured.source.partition(":")[0] not in NETWORKS:
+        return None
+    settings = configured.settings
+    identity = {
+        "source": configured.source,
+        "weights": weights_digest(settings, sequence_id),
+        "confidence": min(LOWEST_CONFIDENCE, settings.confidence),
+        "settings": {name: getattr(settings, name) for name in ("mask_threshold", "nms_iou", "onnx_normalisation")},
+        "device": device,
+    }
+    cached = CachedSegmenter(configured.inner, identity, cache, threads)
+    configured.inner = cached
+    return cached

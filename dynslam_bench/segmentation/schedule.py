@@ -40,6 +40,11 @@ class MaskScheduler:
         self.settings = settings
 
     @property
+    def segmenter(self) -> Segmenter:
+        """Who segments."""
+        return self._segmenter
+
+    @property
     def settings(self) -> SegmentationSettings:
         """The settings in force."""
         return self._settings

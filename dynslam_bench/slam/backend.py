@@ -19,6 +19,7 @@ from .history import History
 from .map import Map
 from .mapping import LocalMapper
 from .observation import Observations, observe
+from .motion import MotionState, pose_covariance, smooth
 from .outputs import KeyframeRecord, MapOutputs
 from .relocalisation import locate
 from .result import TrackResult
@@ -30,8 +31,6 @@ State = Literal["initialising", "ok", "lost"]
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
-MAX_EXTRAPOLATION_S = 0.25
-"""After a longer gap between frames the motion model is not trusted: the prediction is the last pose."""
 
 
 class RgbdBackend:
@@ -62,10 +61,11 @@ class RgbdBackend:
         self.history = History()
         self.state: State = "initialising"
         self._last: Tracked | None = None
-        self._velocity: Array | None = None
-        self._velocity_dt = 0.0
+        self._motion: MotionState | None = None
+        self._dt = 1.0 / 30.0
         self._reference = -1
         self._last_keyframe_frame = -1
+        self._peak = 0
         self._frame = -1
         self._next_stamp: float | None = None
         self._depth_images: dict[int, NDArray[np.float32]] = {}
@@ -84,17 +84,21 @@ class RgbdBackend:
 
     def _predicted(self, stamp: float | None) -> Array:
         assert self._last is not None
-        if self._velocity is None or self.state != "ok":
+        dt = self._dt if stamp is None else stamp - self._last.timestamp
+        if self._motion is None or self.state != "ok" or not 0 < dt <= self.settings.motion.max_gap_s:
             return self._last.T_cam_world
-        motion = self._velocity
-        if stamp is not None and self._velocity_dt > 0:
-            dt = stamp - self._last.timestamp
-            if not 0 < dt <= MAX_EXTRAPOLATION_S:
-                return self._last.T_cam_world
-            ratio = dt / self._velocity_dt
-            if abs(ratio - 1.0) > 0.2:
-                motion = se3.exp(se3.log(motion) * ratio)
-        return np.asarray(motion @ self._last.T_cam_world)
+        return self._motion.predicted(dt, self.settings.motion).T_cam_world
+
+    def _filtered(self, measured: Array, information: Array, dt: float) -> Array:
+        """Weigh the image's pose against the motion model, and remember the motion."""
+        s = self.settings.motion
+        covariance = pose_covariance(measured, information, s.inflation)
+        if self._motion is None or self.state != "ok" or not 0 < dt <= s.max_gap_s:
+            self._motion = MotionState.at(measured, covariance)
+            return measured
+        self._dt = dt
+        self._motion = self._motion.predicted(dt, s).updated(measured, covariance)
+        return self._motion.T_cam_world if s.filter else measured
 
     # ------------------------------------------------------------------ one frame
 
@@ -145,7 +149,7 @@ class RgbdBackend:
         self._make_keyframe(frame, tracked, timings)
         stats["keyframe"] = 1.0
         stats["matches"] = stats["inliers"] = float(np.count_nonzero(tracked.point >= 0))
-        self.history.append(frame.timestamp, self._reference, np.eye(4))
+        self.history.append(frame.timestamp, self._reference, np.eye(4), 1e6 * np.eye(6))
         return pose
 
     def _localise(
@@ -174,7 +178,7 @@ class RgbdBackend:
             stats["inliers"] = float(np.count_nonzero(inliers))
         if matches is None or np.count_nonzero(inliers) < self._needed_inliers() or not np.isfinite(pose).all():
             self.state = "lost"
-            self._velocity = None
+            self._motion = None
             return prediction
         stats["residual_px"] = residual
         points = matches.point[inliers]
@@ -183,9 +187,7 @@ class RgbdBackend:
         point[matches.feature[inliers]] = points
         tracked = Tracked(seen, point, pose, frame.timestamp)
         dt = frame.timestamp - last.timestamp
-        fresh = self.state == "ok" and 0 < dt <= MAX_EXTRAPOLATION_S
-        self._velocity = pose @ se3.inverse(last.T_cam_world) if fresh else None
-        self._velocity_dt = dt
+        tracked.T_cam_world = self._filtered(pose, estimate.information, dt)
         self.state = "ok"
         self._last = tracked
         near, _ = self.world.covisible_of(points)
@@ -194,9 +196,13 @@ class RgbdBackend:
         if self._wants_keyframe(tracked):
             self._make_keyframe(frame, tracked, timings)
             stats["keyframe"] = 1.0
-        pose = tracked.T_cam_world
-        self.history.append(frame.timestamp, self._reference, pose @ se3.inverse(self.world.kf_pose[self._reference]))
-        return pose
+            if self.settings.bundle_adjustment.enabled:
+                pose = tracked.T_cam_world
+                if self._motion is not None:
+                    self._motion = self._motion.relocated(pose)
+        relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
+        self.history.append(frame.timestamp, self._reference, relative, estimate.information)
+        return tracked.T_cam_world
 
     def _needed_inliers(self) -> int:
         return self.settings.tracking.min_inliers if self.state == "ok" else self.settings.relocalisation.min_inliers
@@ -237,12 +243,9 @@ class RgbdBackend:
         tracked_close = int(np.count_nonzero(close & known))
         new_close = int(np.count_nonzero(close & ~known))
         hungry = tracked_close < s.min_close and new_close > s.new_close
-        reference = self.world.kf_point[self._reference, : self.world.kf_count[self._reference]]
-        reference = reference[reference >= 0]
-        mature = 2 if self.world.keyframe_count <= 2 else 3
-        total = int(np.count_nonzero(self.world.n_obs[reference] >= mature)) or len(reference)
         inliers = int(np.count_nonzero(known))
-        weak = inliers < s.tracked_share * total
+        self._peak = max(self._peak, inliers)
+        weak = inliers < s.tracked_share * self._peak
         return bool((weak or hungry or (gap >= s.max_gap and new_close > s.new_close)) and inliers > 15)
 
     def _make_keyframe(self, frame: FrameBundle, tracked: Tracked, timings: dict[str, float]) -> None:
@@ -250,6 +253,7 @@ class RgbdBackend:
         timings.update(spent)
         self._reference = slot
         self._last_keyframe_frame = frame.index
+        self._peak = 0
         for dropped, heir, relative in self.mapper.dropped:
             self.history.inherit(dropped, heir, relative)
             self._depth_images.pop(dropped, None)
@@ -295,6 +299,7 @@ class RgbdBackend:
                     world.kf_xy[slot, :n],
                     world.kf_z[slot, :n],
                     self._depth_images.get(slot),
+                    float(world.kf_stamp[slot]),
                 )  # fmt: skip
             )
         return tuple(views)
@@ -306,10 +311,16 @@ class RgbdBackend:
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes."""
-        stamps, poses = self.history.poses(self.world)
+        stamps, poses, information = self.history.poses(self.world)
         order = np.argsort(stamps, kind="stable")
         fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
-        return Trajectory(stamps[order][fresh], poses[order][fresh])
+        rows = order[fresh]
+        stamps, poses = stamps[rows], poses[rows]
+        motion = self.settings.motion
+        if motion.smooth and len(stamps) > 2:
+            spread = [pose_covariance(*pair, motion.inflation) for pair in zip(poses, information[rows], strict=True)]
+            poses = smooth(stamps, poses, np.array(spread), motion)
+        return Trajectory(stamps, se3.inverse(poses))
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""

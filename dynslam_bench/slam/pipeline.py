@@ -6,7 +6,7 @@ Every published system runs this file; it differs only in its list of filters, i
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Protocol
@@ -46,6 +46,13 @@ class MaskStage(Protocol):
         ...
 
 
+class CachedStage(Protocol):
+    """A stage that may have answered its last call from the stage cache."""
+
+    hit: bool
+    saved_s: float
+
+
 class SlamPipeline:
     """A tracker: features, masks, culling, flow, culling, tracking and mapping, one frame at a time.
 
@@ -56,6 +63,8 @@ class SlamPipeline:
         flow: Flow of the keypoints that are left to the previous image; run before the first filter that needs it.
         backend: Tracking and mapping.
         guard: What the filters must leave.
+        cached: Stages that answer from the stage cache, by name (``features``, ``segmentation``); their times are
+            reported as they are without it, and ``cached_stages`` in `stats` says how many answered from it.
     """
 
     def __init__(
@@ -67,6 +76,7 @@ class SlamPipeline:
         flow: FlowEstimator | None,
         backend: RgbdBackend,
         guard: GuardSettings,
+        cached: Mapping[str, CachedStage] | None = None,
     ) -> None:
         needing = [f.name for f in filters if "flow" in f.needs]
         if needing and flow is None:
@@ -77,6 +87,7 @@ class SlamPipeline:
         self._flow = flow
         self._backend = backend
         self._guard = guard
+        self._cached = dict(cached or {})
         self._camera: Camera | None = None
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
@@ -100,7 +111,7 @@ class SlamPipeline:
             TrackerError: `reset` was not called, or the frame's size is not the camera's.
         """
         camera = self._check(frame)
-        clock = _Clock()
+        clock = _Clock(self._cached)
         with clock("features"):
             bundle = self._extract(frame, camera)
         with clock("segmentation"):
@@ -148,6 +159,8 @@ class SlamPipeline:
             stats |= {f"flow_{key}": value for key, value in state.flow.stats.items()}
         elif self._flow is not None:
             stats["flow_valid"] = 0.0
+        if self._cached:
+            stats["cached_stages"] = float(sum(stage.hit for stage in self._cached.values()))
         self._remember(bundle, keep, image, result)
         return replace(
             result,
@@ -254,15 +267,20 @@ def _union(masks: list[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:
 
 
 class _Clock:
-    """Wall-clock seconds by stage, in the order of first use."""
+    """Wall-clock seconds by stage, in the order of first use; what the stage cache saved is added again."""
 
-    def __init__(self) -> None:
+    def __init__(self, cached: Mapping[str, CachedStage]) -> None:
         self.seconds: dict[str, float] = {}
+        self._cached = cached
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        cached = self._cached.get(stage)
+        if cached is not None:
+            cached.hit, cached.saved_s = False, 0.0
         start = time.perf_counter()
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+            elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed

@@ -55,6 +55,7 @@ class TrackerContext:
         device: ``cpu`` or ``cuda:N``.
         threads: Threads it may use.
         fps: Nominal frame rate of the sequence.
+        cache: Folder of the stage cache; None to compute everything.
     """
 
     sequence_id: str = ""
@@ -62,6 +63,7 @@ class TrackerContext:
     device: str = "cpu"
     threads: int = 1
     fps: float = 30.0
+    cache: str | None = None
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dynslam_bench.core.errors import SegmentationError
@@ -51,11 +52,19 @@ def compose(
     Raises:
         SegmentationError: The semantic source is not available.
     """
+    from dynslam_bench.core.cache import StageCache
     from dynslam_bench.features.build import build_extractor
+    from dynslam_bench.features.cached import CachedExtractor
+    from dynslam_bench.segmentation.cached import cache_segmenter
     from dynslam_bench.segmentation.schedule import build_mask_stage
     from dynslam_bench.slam.backend import RgbdBackend
-    from dynslam_bench.slam.pipeline import SlamPipeline
+    from dynslam_bench.slam.pipeline import CachedStage, SlamPipeline
 
+    cache = None if context.cache is None else StageCache(Path(context.cache))
+    cached: dict[str, CachedStage] = {}
+    extractor = build_extractor(settings.features)
+    if cache is not None:
+        extractor = cached["features"] = CachedExtractor(extractor, settings.features, cache, context.threads)
     masks = None
     if isinstance(settings, SemanticSystemSettings):
         masks = build_mask_stage(
@@ -69,16 +78,21 @@ def compose(
                 f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'",
                 "sources: auto, oracle, embedded, coco, onnx:PATH, recorded:DIR",
             )
+    elif cache is not None:
+        segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
+        if segmenter is not None:
+            cached["segmentation"] = segmenter
     estimator = None
     if flow is not None:
         from dynslam_bench.flow.build import build_flow
 
         estimator = build_flow(flow, device=context.device, threads=context.threads)
     return SlamPipeline(
-        extractor=build_extractor(settings.features),
+        extractor=extractor,
         masks=masks,
         filters=filters,
         flow=estimator,
         backend=RgbdBackend(settings.backend),
         guard=settings.guard,
+        cached=cached,
     )

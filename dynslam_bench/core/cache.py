@@ -1,0 +1,197 @@
+"""The stage cache: what does not depend on the settings under study is computed once and stored with its cost.
+
+Entries are addressed by content: the key digests the stage, its version, its settings, the machine, the threads and the
+input itself, so that nothing stale is ever returned. Each entry is one file that appears by atomic rename, so many
+processes may share a cache; the least recently used entries go when it grows over its bound.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import DynslamError
+from .records import digest
+
+ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_CACHE"
+DEFAULT_MAX_BYTES = 8 * 2**30
+_PRUNE_EVERY = 512
+"""Writes between two looks at the cache's size."""
+_SHRINK_TO = 0.8
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A stored stage result.
+
+    Attributes:
+        arrays: The result.
+        cost_s: Seconds that computing it took when it was computed.
+    """
+
+    arrays: Arrays
+    cost_s: float
+
+
+@dataclass(frozen=True)
+class CacheInfo:
+    """How full a cache is: bytes and entries by stage."""
+
+    folder: Path
+    max_bytes: int
+    bytes_by_stage: Mapping[str, int]
+    entries_by_stage: Mapping[str, int]
+
+
+def default_folder() -> Path:
+    """``DYNSLAM_BENCH_CACHE``, or `dynslam-bench` in the user's cache folder; stages lie below ``stages/``."""
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    base = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "dynslam-bench"
+    return base / "stages"
+
+
+@cache
+def machine_digest() -> str:
+    """Short digest of the machine and the versions that change a stage's result or its cost."""
+    import importlib.metadata
+
+    versions = {}
+    for name in ("numpy", "opencv-python-headless", "torch", "dynslam-bench"):
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = ""
+    return digest({"node": platform.node(), "cpu": _cpu_name(), "versions": versions})
+
+
+def content_digest(*arrays: NDArray[Any]) -> str:
+    """Digest of the bytes, shapes and types of arrays."""
+    state = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        state.update(f"{array.dtype.str}{array.shape}".encode())
+        state.update(np.ascontiguousarray(array).data)
+    return state.hexdigest()
+
+
+class StageCache:
+    """A folder of stage results, bounded in size.
+
+    Args:
+        folder: Where; created when first written to.
+        max_bytes: Bound; when it is passed, the least recently used entries go until four fifths are left.
+    """
+
+    def __init__(self, folder: Path | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        self.folder = default_folder() if folder is None else folder
+        self.max_bytes = max_bytes
+        self._writes = 0
+
+    def get(self, stage: str, key: str) -> Entry | None:
+        """The stored result, or None; a damaged entry is deleted and counts as missing."""
+        path = self._path(stage, key)
+        try:
+            data = path.read_bytes()
+        except OSError:
+            return None
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            cost = float(arrays.pop("cost_s"))
+        except (ValueError, KeyError, OSError, EOFError):
+            path.unlink(missing_ok=True)
+            return None
+        try:
+            os.utime(path)
+        except OSError:
+            return Entry(arrays, cost)  # evicted by another process meanwhile: the content is in hand
+        return Entry(arrays, cost)
+
+    def put(self, stage: str, key: str, arrays: Mapping[str, NDArray[Any]], cost_s: float) -> None:
+        """Store a result; another process may have stored the same meanwhile, which does not matter.
+
+        Raises:
+            DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
+        """
+        path = self._path(stage, key)
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(buffer.getbuffer())
+            temporary.replace(path)
+        except OSError as error:
+            temporary.unlink(missing_ok=True)
+            raise DynslamError(
+                f"cannot write the stage cache {self.folder}: {error.strerror}",
+                f"free some space, or name another folder by {ENVIRONMENT_VARIABLE}",
+            ) from error
+        self._writes += 1
+        if self._writes % _PRUNE_EVERY == 1:
+            self.prune()
+
+    def prune(self) -> int:
+        """Delete the least recently used entries if the cache is over its bound; returns the bytes freed."""
+        entries = self._entries()
+        total = sum(size for _, _, size in entries)
+        if total <= self.max_bytes:
+            return 0
+        freed = 0
+        for _, path, size in sorted(entries, key=lambda entry: entry[0]):
+            if total - freed <= _SHRINK_TO * self.max_bytes:
+                break
+            path.unlink(missing_ok=True)
+            freed += size
+        return freed
+
+    def info(self) -> CacheInfo:
+        """How full the cache is, by stage."""
+        sizes: dict[str, int] = {}
+        counts: dict[str, int] = {}
+        for _, path, size in self._entries():
+            stage = path.parent.parent.name
+            sizes[stage] = sizes.get(stage, 0) + size
+            counts[stage] = counts.get(stage, 0) + 1
+        return CacheInfo(self.folder, self.max_bytes, dict(sorted(sizes.items())), dict(sorted(counts.items())))
+
+    def clear(self) -> int:
+        """Delete every entry; returns the bytes freed. Entries that other processes write meanwhile stay."""
+        freed = 0
+        for _, path, size in self._entries():
+            path.unlink(missing_ok=True)
+            freed += size
+        return freed
+
+    def _path(self, stage: str, key: str) -> Path:
+        return self.folder / stage / key[:2] / f"{key}.npz"
+
+    def _entries(self) -> list[tuple[float, Path, int]]:
+        """(last use, path, bytes) of every entry; files that vanish meanwhile are left out."""
+        found = []
+        for path in self.folder.glob("*/*/*.npz"):
+            try:
+                status = path.stat()
+            except OSError:
+                continue
+            found.append((status.st_mtime, path, status.st_size))
+        return found
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
