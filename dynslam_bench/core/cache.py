@@ -12,7 +12,9 @@ import io
 import os
 import platform
 import time
+import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -109,7 +111,7 @@ class StageCache:
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             cost = float(arrays.pop("cost_s"))
-        except (ValueError, KeyError, OSError, EOFError):
+        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
             path.unlink(missing_ok=True)
             return None
         try:
@@ -133,7 +135,8 @@ class StageCache:
             temporary.write_bytes(buffer.getbuffer())
             temporary.replace(path)
         except OSError as error:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
             raise DynslamError(
                 f"cannot write the stage cache {self.folder}: {error.strerror}",
                 f"free some space, or name another folder by {ENVIRONMENT_VARIABLE}",
