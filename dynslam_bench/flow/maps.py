@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from . import layout
 from ._jit import kernel
+from .refinement import BORDER, pad_image
 from .workers import run_stripes
 
 NORM_FLOOR = 0.01 * 255.0
@@ -47,13 +48,15 @@ class OrientationMaps:
 
     Attributes:
         gray: uint8 ``[H, W]``, the image.
-        half: uint8 ``[H / 2, W / 2]``, its mean over 2 x 2 pixels.
+        framed: uint8 ``[H + 96, W + 96]``, the image with its edges repeated (`refinement.BORDER`).
+        framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
         histograms: uint8 ``[total, 8]``, all levels; a unit-norm histogram has Euclidean length 255.
         geometry: How to index them.
     """
 
     gray: NDArray[np.uint8]
-    half: NDArray[np.uint8]
+    framed: NDArray[np.uint8]
+    framed_half: NDArray[np.uint8]
     histograms: NDArray[np.uint8]
     geometry: MapGeometry
 
@@ -105,7 +108,14 @@ def orientation_maps(
             int(geometry.stride[level]), np.float32(NORM_FLOOR),
         )  # fmt: skip
         source, sigma = target, wanted
-    return OrientationMaps(gray, half, histograms, geometry)
+    return OrientationMaps(gray, framed(gray), framed(half), histograms, geometry)
+
+
+def framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image with `refinement.BORDER` pixels of repeated edge around it."""
+    out = np.empty((image.shape[0] + 2 * BORDER, image.shape[1] + 2 * BORDER), dtype=np.uint8)
+    pad_image(image, BORDER, out)
+    return out
 
 
 @lru_cache(maxsize=64)

@@ -185,6 +185,56 @@ def describe(start, stop, points, image, tables, out):  # type: ignore[no-untype
 
 
 @inlined
+def describe_once(x, y, a, image, tables, out, first):  # type: ignore[no-untyped-def]
+    """The descriptor of one position for rotation index `a`, without support: 136 bytes of `out` from `first` on."""
+    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
+    cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
+    cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
+    sixths = a - 6
+    whole = sixths // 6
+    far_weight = np.int32((sixths - 6 * whole) * 171)
+    near_weight = np.int32(1026) - far_weight
+    for k in range(17):
+        cell = cell0 + tables.samples[neutral, straight, phase0, k]
+        if k >= 9:
+            cell = cell1 + tables.samples[neutral, straight, phase1, k]
+        rotated = out[first + 8 * k : first + 8 * k + 8]
+        if a == 6:
+            for b in range(8):
+                rotated[b] = image.histograms[cell + b]
+            continue
+        for b in range(8):
+            near = np.int32(image.histograms[cell + ((b - whole) & 7)])
+            far = np.int32(image.histograms[cell + ((b - whole - 1) & 7)])
+            rotated[b] = np.uint8((near_weight * near + far_weight * far + np.int32(512)) >> 10)
+
+
+@inlined
+def descriptor_distance(x, y, si, ti, mine, descriptor, target, tables):  # type: ignore[no-untyped-def]
+    """First term of Eq. 1: truncated distance of 136 bytes at `mine` to the target at (x, y), scale si, rotation ti."""
+    truncation = np.int32(tables.truncation)
+    total = np.int32(0)
+    mine = np.uint64(mine)
+    cell, phase = cell_of(x, y, tables.ring0[si])
+    for k in range(9):
+        theirs = np.uint64(cell + tables.samples[si, ti, phase, k])
+        total += min(sum_abs_diff8(target.histograms, theirs, descriptor, mine + np.uint64(8 * k)), truncation)
+    cell, phase = cell_of(x, y, tables.ring1[si])
+    for k in range(9, 17):
+        theirs = np.uint64(cell + tables.samples[si, ti, phase, k])
+        total += min(sum_abs_diff8(target.histograms, theirs, descriptor, mine + np.uint64(8 * k)), truncation)
+    return total
+
+
+@inlined
+def quantised(s, theta):  # type: ignore[no-untyped-def]
+    """Scale and rotation index of a label."""
+    si = np.int64(np.floor(s * np.float32(4) + np.float32(0.5))) - layout.SCALE_LOW
+    ti = np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5))) - layout.ANGLE_LOW
+    return min(max(si, 0), 9), min(max(ti, 0), 12)
+
+
+@inlined
 def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ignore[no-untyped-def]
     """Eq. 1 of one label at point i, summed over the support; may stop early once `bound` is reached.
 
@@ -203,11 +253,8 @@ def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ig
     cx, cy = reference.points[i, 0] + u, reference.points[i, 1] + v
     if not (cx >= 0 and cy >= 0 and cx <= width - 1 and cy <= height - 1):
         return np.int64(OUTSIDE)
-    si = np.int64(np.floor(s * np.float32(4) + np.float32(0.5))) - layout.SCALE_LOW
-    ti = np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5))) - layout.ANGLE_LOW
-    si, ti = min(max(si, 0), 9), min(max(ti, 0), 12)
+    si, ti = quantised(s, theta)
     supports = len(tables.support)
-    truncation = np.int32(tables.truncation)
     total = np.int32(0)
     for q in range(supports):
         tx, ty = cx, cy
@@ -217,17 +264,8 @@ def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ig
             dx, dy = np.float32(tables.support[q, 0]), np.float32(tables.support[q, 1])
             tx = min(max(cx + c * dx - n * dy, np.float32(0)), np.float32(width - 1))
             ty = min(max(cy + n * dx + c * dy, np.float32(0)), np.float32(height - 1))
-        mine = np.uint64(((i * supports + q) * 13 + ti) * 136)
-        cell, phase = cell_of(tx, ty, tables.ring0[si])
-        for k in range(9):
-            theirs = np.uint64(cell + tables.samples[si, ti, phase, k])
-            part = sum_abs_diff8(target.histograms, theirs, reference.descriptors, mine + np.uint64(8 * k))
-            total += min(part, truncation)
-        cell, phase = cell_of(tx, ty, tables.ring1[si])
-        for k in range(9, 17):
-            theirs = np.uint64(cell + tables.samples[si, ti, phase, k])
-            part = sum_abs_diff8(target.histograms, theirs, reference.descriptors, mine + np.uint64(8 * k))
-            total += min(part, truncation)
+        mine = ((i * supports + q) * 13 + ti) * 136
+        total += descriptor_distance(tx, ty, si, ti, mine, reference.descriptors, target, tables)
         if tables.appearance:
             gray, gradient = appearance(target.gray, tx, ty)
             total += tables.intensity[abs(gray - reference.appearance[i, q, 0])]

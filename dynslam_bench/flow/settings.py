@@ -90,7 +90,7 @@ class FlowSettings(Settings):
         17, low=9, high=31, limits=(5, 41), unit="px", when=_REFINED, meaning="side of the refinement's window, odd"
     )
     refinement_iterations: int = tunable(
-        6, low=1, high=20, limits=(1, 50), when=_REFINED, meaning="most iterations of the refinement at full resolution"
+        3, low=1, high=10, limits=(1, 50), when=_REFINED, meaning="most translation steps a warp of the refinement"
     )
     window_px: int = tunable(
         21, low=9, high=41, limits=(3, 101), unit="px", when=_LUCAS_KANADE, meaning="side of Lucas-Kanade's window, odd"
@@ -108,4 +108,22 @@ class FlowSettings(Settings):
     max_cost: float = tunable(
         0.75, low=0.3, high=1.0, limits=(0.0, 1.0), online=True, when=_DAISY,
         meaning="matching cost, as a share of its largest value, above which a point is not found",
+    )  # fmt: skip
+    dense_superpixel_px: int = tunable(
+        16, low=8, high=32, limits=(4, 128), unit="px", when=_DAISY, meaning="dense mode: side of a superpixel"
+    )
+    dense_candidates: int = tunable(
+        7, low=2, high=9, limits=(1, 9), when=_DAISY,
+        meaning="dense mode: labels tried at each pixel, its superpixel's own and its neighbours'",
+    )  # fmt: skip
+    dense_filter_radius_px: int = tunable(
+        9, low=2, high=16, limits=(2, 32), unit="px", when=_DAISY, meaning="dense mode: guided filter's radius (Eq. 2)"
+    )
+    dense_filter_epsilon: float = tunable(
+        0.01, low=1e-4, high=0.1, limits=(1e-9, 10.0), scale="log", when=_DAISY,
+        meaning="dense mode: guided filter's regularisation, images in [0, 1] (Eq. 2)",
+    )  # fmt: skip
+    dense_forward_backward_px: float = tunable(
+        3.0, low=0.5, high=15.0, limits=(0.0, 100.0), scale="log", unit="px", when=_DAISY,
+        meaning="dense mode: largest distance between a pixel and its way there and back",
     )  # fmt: skip

@@ -13,23 +13,28 @@ from numpy.typing import NDArray
 
 from . import layout
 from .checks import empty_result, same_image, unseen_result, usable_points
+from .consensus import dissenting_labels
 from .estimator import FlowResult
 from .maps import OrientationMaps, orientation_maps
 from .matching import CostTables, Reference, describe, reference_appearance, side, tables_for
 from .neighbours import nearest_neighbours
-from .refinement import parabola, similarity_lucas_kanade
+from .refinement import BORDER, similarity_lucas_kanade
 from .searches.common import SearchState, new_state
 from .searches.propagation import common_motions, transported_labels
 from .searches.schedule import PROPAGATING, make_plan, phase_runner
 from .settings import FlowSettings
+from .subpixel import parabola
 from .workers import run_stripes
 
 MOTION_HYPOTHESES = 192
 MOTION_TOLERANCE_PX = 5.0
 NEIGHBOUR_WINDOW = 40
 PARABOLA_STEP_PX = 2.0
-COARSE_RADIUS, COARSE_ITERATIONS = 6, 4
+COARSE_RADIUS, COARSE_MARGIN, COARSE_WARPS = 7, 3, 2
+FINE_MARGIN, FINE_WARPS, BACK_MARGIN = 2, 2, 3
+TOLERANCE_PX = 0.03
 MIN_CORRELATION = 0.5
+MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
 
 
 class SparseDaisyFlow:
@@ -43,11 +48,11 @@ class SparseDaisyFlow:
     def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
         self.settings = settings or FlowSettings()
         self.threads = max(1, threads)
-        self._pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
+        self.pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
 
     def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
         """The orientation maps of a uint8 ``[H, W]`` image."""
-        return orientation_maps(gray, threads=self.threads, pool=self._pool)
+        return orientation_maps(gray, threads=self.threads, pool=self.pool)
 
     def track(
         self,
@@ -78,19 +83,22 @@ class SparseDaisyFlow:
     ) -> FlowResult:  # fmt: skip
         settings = self.settings
         tables = tables_for(*reference.gray.shape, settings)
-        described = self._describe(reference, points, tables)
-        state = self._search(described, target, tables, guess, seed)
+        described = self.describe(reference, points, tables)
+        neighbours = self.neighbours(points)
+        state = self.search(described, target, tables, neighbours, guess, seed)
         labels, cost = state.flames[:, 0].copy(), state.costs[:, 0]
         evaluations = state.used.copy()
         n = len(points)
         if settings.refinement != "none":
             run_stripes(
-                parabola, n, self.threads, self._pool, labels, np.float32(PARABOLA_STEP_PX), described, side(target),
+                parabola, n, self.threads, self.pool, labels, np.float32(PARABOLA_STEP_PX), described, side(target),
                 tables, evaluations,
             )  # fmt: skip
         valid = (cost < settings.max_cost * tables.ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
-            correlation = self._refine(points, labels, reference, target)
+            correlation = self.refine(points, labels, reference, target)
+            if settings.search in PROPAGATING and n > 2:
+                self.second_opinion(points, labels, correlation, neighbours, reference, target)
             valid &= correlation > MIN_CORRELATION
         xy = points + labels[:, :2]
         height, width = target.gray.shape
@@ -105,19 +113,33 @@ class SparseDaisyFlow:
         }
         return FlowResult(xy, valid, np.asarray(cost / tables.ceiling, dtype=np.float32), stats)
 
-    def _describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
+    def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
+        """What the search needs of the reference points: their rotated descriptors and appearance."""
         count, supports = len(points), len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
-        run_stripes(describe, count, self.threads, self._pool, points, side(image), tables, descriptors)
+        run_stripes(describe, count, self.threads, self.pool, points, side(image), tables, descriptors)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
         if tables.appearance:
             reference_appearance(points, side(image), tables, appearance)
         return Reference(points, descriptors, appearance)
 
-    def _search(
-        self, reference: Reference, target: OrientationMaps, tables: CostTables, guess: NDArray[np.float32] | None,
-        seed: int,
+    def neighbours(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Indices ``[N, K]`` of each point's nearest others; none for searches without propagation."""
+        n = len(points)
+        count = min(MOST_NEIGHBOURS, n - 1) if self.settings.search in PROPAGATING else 0
+        found = np.empty((n, count), dtype=np.int64)
+        nearest_neighbours(points, np.argsort(points[:, 0], kind="stable"), NEIGHBOUR_WINDOW, found)
+        return found
+
+    def search(
+        self, reference: Reference, target: OrientationMaps, tables: CostTables, neighbours: NDArray[np.int64],
+        guess: NDArray[np.float32] | None, seed: int,
     ) -> SearchState:  # fmt: skip
+        """The label search alone: phases of `FlowSettings.search` with propagation between them.
+
+        Returns:
+            The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
+        """
         settings, points = self.settings, reference.points
         n = len(points)
         start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
@@ -132,11 +154,10 @@ class SparseDaisyFlow:
         plan = make_plan(settings)
         state = new_state(n, plan.population, lower, upper, tables.ceiling)
         state.flames[:, :] = start
-        run = phase_runner(plan, settings, reference, side(target), tables, state, seed, self.threads, self._pool)
+        run = phase_runner(plan, settings, reference, side(target), tables, state, seed, self.threads, self.pool)
         run(0, start)
         if settings.search in PROPAGATING:
-            neighbours = np.empty((n, min(settings.neighbours, n - 1)), dtype=np.int64)
-            nearest_neighbours(points, np.argsort(points[:, 0], kind="stable"), NEIGHBOUR_WINDOW, neighbours)
+            neighbours = neighbours[:, : settings.neighbours]
             motions = np.full((2, 4), np.nan, dtype=np.float32)
             candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
             for number in range(1, len(plan.ends)):
@@ -147,27 +168,48 @@ class SparseDaisyFlow:
                         np.uint64(seed + number), motions,
                     )  # fmt: skip
                 run_stripes(
-                    transported_labels, n, self.threads, self._pool, points, best, neighbours, motions, lower, upper,
+                    transported_labels, n, self.threads, self.pool, points, best, neighbours, motions, lower, upper,
                     candidates,
                 )  # fmt: skip
                 run(number, candidates)
         return state
 
-    def _refine(
+    def refine(
         self, points: NDArray[np.float32], labels: NDArray[np.float32], reference: OrientationMaps,
         target: OrientationMaps,
     ) -> NDArray[np.float32]:  # fmt: skip
+        """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
         correlation = np.empty(len(points), dtype=np.float32)
-        for first, second, step, radius, iterations in (
-            (reference.half, target.half, 2, COARSE_RADIUS, COARSE_ITERATIONS),
-            (reference.gray, target.gray, 1, self.settings.refinement_window_px // 2,
-             self.settings.refinement_iterations),
-        ):  # fmt: skip
+        radius, iterations = self.settings.refinement_window_px // 2, self.settings.refinement_iterations
+        for first, second, step, size, margin, warps in (
+            (reference.framed_half, target.framed_half, 2, COARSE_RADIUS, COARSE_MARGIN, COARSE_WARPS),
+            (reference.framed, target.framed, 1, radius, FINE_MARGIN, FINE_WARPS),
+        ):
             run_stripes(
-                similarity_lucas_kanade, len(points), self.threads, self._pool, points, labels, first, second, step,
-                radius, iterations, np.float32(0.03), np.float32(4.0), correlation,
+                similarity_lucas_kanade, len(points), self.threads, self.pool, points, labels, first, second, BORDER,
+                step, size, margin, warps, iterations, np.float32(TOLERANCE_PX), correlation,
             )  # fmt: skip
         return correlation
+
+    def second_opinion(
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], correlation: NDArray[np.float32],
+        neighbours: NDArray[np.int64], reference: OrientationMaps, target: OrientationMaps,
+    ) -> None:  # fmt: skip
+        """Give points that contradict agreeing neighbours the neighbours' label, if that looks as good there."""
+        n = len(points)
+        predictions = np.empty((n, neighbours.shape[1], 4), dtype=np.float32)
+        extent = np.full((n, 4), 8.0, dtype=np.float32)
+        transported_labels(0, n, points, labels, neighbours, np.empty((0, 4), np.float32), -extent, extent, predictions)
+        alternative = np.empty((n, 4), dtype=np.float32)
+        dissents = np.empty(n, dtype=np.bool_)
+        dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
+        chosen = np.flatnonzero(dissents)
+        if not len(chosen):
+            return
+        other = alternative[chosen]
+        seen = self.refine(points[chosen], other, reference, target)
+        better = seen > correlation[chosen] - CONSENSUS_MARGIN
+        labels[chosen[better]], correlation[chosen[better]] = other[better], seen[better]
 
     def _way_back(
         self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32],
@@ -177,9 +219,9 @@ class SparseDaisyFlow:
         inverse = -labels
         correlation = np.empty(len(points), dtype=np.float32)
         run_stripes(
-            similarity_lucas_kanade, len(points), self.threads, self._pool, np.ascontiguousarray(xy), inverse,
-            target.gray, reference.gray, 1, self.settings.refinement_window_px // 2,
-            self.settings.refinement_iterations, np.float32(0.03), np.float32(8.0), correlation,
+            similarity_lucas_kanade, len(points), self.threads, self.pool, np.ascontiguousarray(xy), inverse,
+            target.framed, reference.framed, BORDER, 1, self.settings.refinement_window_px // 2, BACK_MARGIN, 1,
+            self.settings.refinement_iterations, np.float32(TOLERANCE_PX), correlation,
         )  # fmt: skip
         distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
         return distance

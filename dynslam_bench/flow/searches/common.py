@@ -83,3 +83,11 @@ def insert(state, i, u, v, s, theta, cost):  # type: ignore[no-untyped-def]
         k -= 1
     costs[k] = cost
     flames[k, 0], flames[k, 1], flames[k, 2], flames[k, 3] = u, v, s, theta
+
+
+@inlined
+def widen(lower, upper, best):  # type: ignore[no-untyped-def]
+    """Let a point's box contain the surroundings of its best displacement, which a neighbour may have brought."""
+    room = np.float32(8)
+    for j in range(2):
+        lower[j], upper[j] = min(lower[j], best[j] - room), max(upper[j], best[j] + room)

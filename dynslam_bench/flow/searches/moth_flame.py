@@ -10,7 +10,7 @@ import numpy as np
 
 from .._jit import inlined, kernel
 from ..matching import label_cost
-from .common import advance, insert, stream, uniform
+from .common import advance, insert, stream, uniform, widen
 
 
 @kernel
@@ -56,6 +56,7 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
             if phase == 0 and placed < population:
                 moths[placed, 0], moths[placed, 1], moths[placed, 2], moths[placed, 3] = u, v, s, theta
                 placed += 1
+        widen(lower, upper, flames[0])
         if phase == 0:
             for m in range(placed, population):
                 for j in range(4):  # LB + (UB - LB) rand

@@ -1,4 +1,4 @@
-"""PatchMatch's random search: windows around the best label that halve, as in PatchMatch Filter and DAISY Filter Flow."""
+"""PatchMatch's random search: windows around the best label that halve (PatchMatch Filter, DAISY Filter Flow)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from .._jit import kernel
 from ..matching import label_cost
-from .common import advance, insert, stream, uniform
+from .common import advance, insert, stream, uniform, widen
 
 
 @kernel
@@ -38,6 +38,7 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
             if used < end and np.isfinite(u + v + s + theta):
                 used += 1
                 insert(state, i, u, v, s, theta, label_cost(i, u, v, s, theta, reference, target, tables, costs[worst]))
+        widen(lower, upper, best)
         window = np.float32(0.5)
         while used < end:
             for j in range(4):

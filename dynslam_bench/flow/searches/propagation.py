@@ -12,7 +12,8 @@ def transported_labels(start, stop, points, labels, neighbours, motions, lower, 
     """Labels of neighbours and of common motions, as seen from each point.
 
     A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
-    gives p. Labels that leave the point's box are clipped in scale and rotation and dropped in displacement.
+    gives p. Scale and rotation are clipped to the point's box; the displacement is not, since what neighbours have found
+    is no random guess (the box is where the search starts, not what the scene obeys).
 
     Args:
         start: First point.
@@ -49,10 +50,8 @@ def transported_labels(start, stop, points, labels, neighbours, motions, lower, 
 
 @inlined
 def admit(out, u, v, s, theta, lower, upper):  # type: ignore[no-untyped-def]
-    """Store a candidate, or NaN if its displacement lies outside the box."""
-    inside = lower[0] <= u <= upper[0] and lower[1] <= v <= upper[1]
-    out[0] = u if inside else np.float32(np.nan)
-    out[1] = v
+    """Store a candidate."""
+    out[0], out[1] = u, v
     out[2] = min(max(s, lower[2]), upper[2])
     out[3] = min(max(theta, lower[3]), upper[3])
 
