@@ -73,8 +73,9 @@ class FrameToFrame(Generic[Prepared]):
             return TrackResult(None, state, stats, {"tracking": time.perf_counter() - start})  # type: ignore[arg-type]
         current = self._aligner.prepare(rgb, depth)
         motion = np.eye(4) if self._reference is None else self._aligner.align(self._reference, current)
-        good = motion is not None and se3.is_pose(motion)
-        if good:
+        good = False
+        if motion is not None and se3.is_pose(motion):
+            good = True
             self._pose = self._pose @ motion
         self._failures = 0 if good else self._failures + 1
         if good or self._failures >= PATIENCE:
@@ -85,11 +86,11 @@ class FrameToFrame(Generic[Prepared]):
         return TrackResult(self._pose.copy(), "ok", stats, timings)
 
     def _undistort(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        depth = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        known = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
         if self._maps is None:
-            return frame.rgb, depth
+            return frame.rgb, known
         rgb = cv2.remap(frame.rgb, *self._maps, cv2.INTER_LINEAR)
-        depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
+        depth = cv2.remap(known, *self._maps, cv2.INTER_NEAREST)
         return np.asarray(rgb, dtype=np.uint8), np.asarray(depth, dtype=np.float32)
 
 

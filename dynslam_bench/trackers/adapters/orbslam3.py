@@ -20,8 +20,7 @@ from .subprocess_tracker import FinalizingProgramTracker
 from .vocabulary import find_vocabulary
 
 WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
-CELL_PX = 35  # ORB-SLAM3 looks for corners in cells of this size
-BORDER_PX = 16  # and leaves this border out on each side
+BORDER_PX = 16  # ORB-SLAM3 looks for no corners so near to the edge of a pyramid level
 _VIEWER = (
     ("KeyFrameSize", 0.05), ("KeyFrameLineWidth", 1.0), ("GraphLineWidth", 0.9), ("PointSize", 2.0),
     ("CameraSize", 0.08), ("CameraLineWidth", 3.0), ("ViewpointX", 0.0), ("ViewpointY", -0.7), ("ViewpointZ", -1.8),
@@ -94,17 +93,19 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
             f"orbslam3 cannot take {len(camera.distortion)} distortion coefficients", "it knows k1 k2 p1 p2 k3"
         )
     shrunk = settings.scale_factor ** (settings.levels - 1)
-    needed = math.ceil((CELL_PX + 2 * BORDER_PX) * shrunk)
-    if min(camera.width, camera.height) < needed:
+    columns, rows = (round(side / shrunk) - 2 * BORDER_PX for side in (camera.width, camera.height))
+    size = (
+        f"images of {camera.width}x{camera.height} with {settings.levels} pyramid levels of {settings.scale_factor:g}"
+    )
+    if min(columns, rows) < 1:
         raise TrackerError(
-            f"orbslam3 cannot take images of {camera.width}x{camera.height}: with {settings.levels} pyramid levels of "
-            f"scale {settings.scale_factor:g} each side needs {needed} pixels",
-            "resize the sequence or lower levels",
+            f"orbslam3 cannot take {size}: the smallest level has no pixel inside its border of {BORDER_PX}",
+            f"each side needs {math.ceil((2 * BORDER_PX + 0.5) * shrunk)} pixels; resize the sequence or lower levels",
         )
-    if camera.height > 2 * camera.width:
+    if columns / rows < 0.5:
         raise TrackerError(
-            f"orbslam3 cannot take images of {camera.width}x{camera.height}",
-            "its feature distribution needs a height of at most twice the width",
+            f"orbslam3 cannot take {size}: the smallest level is {rows / columns:.2f} times as high as wide",
+            "it crashes above 2; turn the images, or lower levels",
         )
 
 

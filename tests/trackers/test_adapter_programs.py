@@ -1,0 +1,385 @@
+"""Programs over JSON lines: what is exchanged, and every way in which a program can fail."""
+
+import os
+import shlex
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.testing import check_tracker
+from dynslam_bench.trackers import TrackerContext, build_tracker
+
+CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.002, 0.3), baseline_m=0.08)
+
+PRELUDE = """
+import json, os, sys, time
+def say(answer):
+    sys.stdout.write(json.dumps(answer) + "\\n"); sys.stdout.flush()
+STILL = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+requests = (json.loads(line) for line in sys.stdin)
+"""
+
+GOOD = """
+for request in requests:
+    if request["op"] == "reset":
+        say({"ok": True})
+    elif request["op"] == "track":
+        say({"state": "ok", "T_world_cam": STILL})
+    elif request["op"] == "close":
+        break
+"""
+
+
+def frame(index, seed=0):
+    rng = np.random.default_rng([seed, index])
+    depth = rng.uniform(0.5, 4, (48, 64)).astype(np.float32)
+    depth[:5] = 0
+    return Frame(index, 1.5 + index / 30, rng.integers(0, 256, (48, 64, 3), dtype=np.uint8), depth)
+
+
+@pytest.fixture
+def program(tmp_path):
+    """Makes a tracker of a program's text; all of them are closed at the end."""
+    made = []
+
+    def make(text, context=None, **settings):
+        path = tmp_path / f"program{len(made)}.py"
+        path.write_text(PRELUDE + textwrap.dedent(text))
+        command = shlex.join([sys.executable, str(path)])
+        made.append(build_tracker(f"subprocess:{command}", settings, context))
+        return made[-1]
+
+    yield make
+    for tracker in made:
+        tracker.close()
+
+
+def reset(tracker, seed=0):
+    tracker.reset(CAMERA, rng=np.random.default_rng(seed))
+    return tracker
+
+
+def gone(pid):
+    """Whether a process has ended (or is a zombie of somebody else's)."""
+    for _ in range(100):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        status = Path(f"/proc/{pid}/stat")
+        if status.exists() and status.read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_a_program_keeps_the_contract(program):
+    made = program(GOOD)
+    check_tracker(lambda: made)
+
+
+def test_reset_tells_all(program, tmp_path):
+    told = tmp_path / "told.json"
+    text = f"""
+    for request in requests:
+        if request["op"] == "reset":
+            open({str(told)!r}, "w").write(json.dumps([request, os.environ["OMP_NUM_THREADS"], os.getcwd()]))
+            say({{"ok": True}})
+    """
+    context = TrackerContext(sequence_id="tum/fr1/xyz", device="cuda:1", threads=3, fps=25.0)
+    reset(program(text, context, folder=str(tmp_path)))
+    import json
+
+    request, threads, folder = json.loads(told.read_text())
+    camera = request["camera"]
+    assert (camera["width"], camera["height"], camera["fx"], camera["fy"]) == (64, 48, 60.0, 61.0)
+    assert camera["distortion"] == [0.1, -0.2, 0.001, 0.002, 0.3] and camera["baseline_m"] == 0.08
+    assert camera["fps"] == 25.0 and request["threads"] == 3 and request["device"] == "cuda:1"
+    assert request["sequence"] == "tum/fr1/xyz" and threads == "3"
+    assert Path(folder).resolve() == tmp_path.resolve()
+
+
+def test_seed_comes_from_the_generator(program):
+    text = """
+    for request in requests:
+        if request["op"] == "reset":
+            seed = request["seed"]; say({"ok": True})
+        elif request["op"] == "track":
+            say({"state": "ok", "T_world_cam": STILL, "stats": {"seed": float(seed % 1000003)}})
+    """
+    seen = []
+    for seed in (1, 1, 2):
+        seen.append(reset(program(text), seed).track(frame(0)).stats["seed"])
+    assert seen[0] == seen[1] != seen[2]
+
+
+RAW = """
+import struct
+for request in requests:
+    if request["op"] == "reset":
+        images, camera = request["images"], request["camera"]
+        say({"ok": True})
+    elif request["op"] == "track":
+        with open(images["file"], "rb") as file:
+            data = file.read()
+        assert len(data) == images["bytes"]
+        size = camera["width"] * camera["height"]
+        rgb = data[images["rgb_offset"]:][:size * 3]
+        depth = struct.unpack(f"<{size}f", data[images["depth_offset"]:][:size * 4])
+        weights = sum((i % 251) * v for i, v in enumerate(rgb))
+        say({"state": "ok", "T_world_cam": [STILL[i:i + 4] for i in (0, 4, 8, 12)],
+             "stats": {"rgb": weights, "depth": sum((i % 251) * v for i, v in enumerate(depth)),
+                       "index": request["index"], "timestamp": request["timestamp"]},
+             "timings": {"tracking": 0.001}})
+"""
+
+
+def test_raw_images_arrive_exactly(program):
+    tracker = reset(program(RAW))
+    for index in range(3):
+        sent = frame(index)
+        result = tracker.track(sent)
+        weights = np.arange(48 * 64 * 3) % 251
+        assert result.stats["rgb"] == float((weights * sent.rgb.reshape(-1).astype(np.int64)).sum())
+        expected = (weights[: 48 * 64] * sent.depth.reshape(-1).astype(np.float64)).sum()
+        assert result.stats["depth"] == pytest.approx(expected, rel=1e-12)
+        assert result.stats["index"] == index and result.stats["timestamp"] == sent.timestamp
+        assert list(result.timings) == ["tracking", "transfer"] and result.timings["transfer"] >= 0
+
+
+def test_png_images_arrive_exactly(program, tmp_path):
+    text = f"""
+    import shutil
+    for request in requests:
+        if request["op"] == "reset":
+            assert request["images"]["mode"] == "png", request
+            factor = request["images"]["depth_factor"]
+            say({{"ok": True}})
+        elif request["op"] == "track":
+            shutil.copy(request["rgb"], {str(tmp_path)!r}); shutil.copy(request["depth"], {str(tmp_path)!r})
+            say({{"state": "ok", "T_world_cam": STILL,
+                  "stats": {{"factor": factor, "files": len(os.listdir(os.path.dirname(request["rgb"])))}}}})
+    """
+    tracker = reset(program(text, images="png"))
+    for index in range(3):
+        sent = frame(index)
+        result = tracker.track(sent)
+        rgb = cv2.imread(str(tmp_path / f"rgb-{index:06d}.png"), cv2.IMREAD_COLOR)[..., ::-1]
+        depth = cv2.imread(str(tmp_path / f"depth-{index:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(rgb, sent.rgb)
+        assert depth.dtype == np.uint16 and np.array_equal(depth, np.rint(sent.depth * result.stats["factor"]))
+        assert result.stats["files"] <= 4, "files of frames before the last one are removed"
+
+
+def test_final_trajectory(program):
+    text = """
+    for request in requests:
+        if request["op"] == "finalize":
+            say({"trajectory": [[1.5, 1, 2, 3, 0, 0, 0.6, 0.8], [1.6, 0, 0, 0, 0, 0, 0, 1]]})
+        else:
+            say({"state": "ok", "T_world_cam": STILL})
+    """
+    tracker = reset(program(text, final=True))
+    tracker.track(frame(0))
+    final = tracker.finalize()
+    assert final.timestamps.tolist() == [1.5, 1.6]
+    assert final.positions.tolist() == [[1, 2, 3], [0, 0, 0]]
+    assert np.allclose(final.T_world_cam[0, :3, :3], [[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]])
+    assert not hasattr(program(text), "finalize")
+
+
+def test_chatter_is_no_answer(program):
+    """What a program prints beside its answers, to either channel and in any amount, disturbs nothing."""
+    text = """
+    for request in requests:
+        print("Loading ...", "x" * 5000); sys.stderr.write("warning: y\\n" * 20000); sys.stderr.flush()
+        say({"state": "ok", "T_world_cam": STILL})
+        print("done")
+    """
+    tracker = reset(program(text))
+    assert [tracker.track(frame(index)).state for index in range(5)] == ["ok"] * 5
+
+
+def test_lost_and_initialising(program):
+    text = """
+    answers = iter([{"ok": True}, {"state": "initialising"}, {"state": "lost", "T_world_cam": None},
+                    {"state": "lost", "T_world_cam": STILL}])
+    for request in requests:
+        say(next(answers))
+    """
+    tracker = reset(program(text))
+    results = [tracker.track(frame(index)) for index in range(3)]
+    assert [result.state for result in results] == ["initialising", "lost", "lost"]
+    assert results[0].T_world_cam is None and results[2].T_world_cam is not None
+
+
+def test_second_reset_starts_afresh(program):
+    text = """
+    count = 0
+    for request in requests:
+        count += 1
+        say({"state": "ok", "T_world_cam": STILL, "stats": {"count": count, "pid": os.getpid()}})
+    """
+    tracker = program(text)
+    pids = []
+    for _ in range(2):
+        reset(tracker)
+        results = [tracker.track(frame(index)) for index in range(2)]
+        assert [result.stats["count"] for result in results] == [2, 3]
+        pids.append(int(results[0].stats["pid"]))
+    tracker.close()
+    tracker.close()
+    assert pids[0] != pids[1] and all(gone(pid) for pid in pids)
+    with pytest.raises(TrackerError, match="before reset"):
+        tracker.track(frame(2))
+
+
+FAULTS = {
+    "raises": ("raise ValueError('no such camera')", "exit code 1; its last line: 'ValueError: no such camera'"),
+    "exits": (
+        "sys.stderr.write('cannot open\\nconfig.yaml\\n'); sys.exit(3)",
+        "exit code 3; its last line: 'config.yaml'",
+    ),
+    "silent exit": ("os._exit(0)", "exit code 0; it wrote no message"),
+    "segfault": ("os.kill(os.getpid(), 11)", "killed by SIGSEGV"),
+    "no json": ("print('{pose: 1}', flush=True)", "answered no JSON"),
+    "error": ("say({'error': 'out of\\nmemory'})", "at frame 7: out of memory"),
+    "no pose": ("say({'state': 'ok'})", "'ok' without T_world_cam"),
+    "state": ("say({'state': 'fine', 'T_world_cam': STILL})", "known: initialising, ok, lost"),
+    "shape": ("say({'state': 'ok', 'T_world_cam': STILL[:12]})", "not 16 numbers"),
+    "text": ("say({'state': 'ok', 'T_world_cam': 'identity'})", "not 16 numbers"),
+    "not rigid": ("say({'state': 'ok', 'T_world_cam': [2 * v for v in STILL]})", "no rigid pose"),
+    "nan": ("say({'state': 'ok', 'T_world_cam': [float('nan')] * 16})", "no rigid pose"),
+    "stats": ("say({'state': 'ok', 'T_world_cam': STILL, 'stats': {'a': 'b'}})", "stats is not"),
+    "hangs": (
+        "sys.stderr.write('optimising\\n'); sys.stderr.flush(); time.sleep(60)",
+        "no answer within 0.5 s.*'optimising'",
+    ),
+    "closes": ("os.close(1); time.sleep(60)", "closed its output"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_become_one_line(program, fault):
+    code, expected = FAULTS[fault]
+    tracker = program(
+        f"""
+        for request in requests:
+            if request["op"] == "track" and request["index"] == 7:
+                {code}
+            else:
+                say({{"state": "ok", "T_world_cam": STILL, "stats": {{"pid": os.getpid()}}}})
+        """,
+        frame_timeout_s=0.5 if fault == "hangs" else 20,
+        close_timeout_s=0.2,
+    )
+    pid = int(reset(tracker).track(frame(6)).stats["pid"])
+    with pytest.raises(TrackerError, match=expected) as caught:
+        tracker.track(frame(7))
+    assert "\n" not in str(caught.value) and "at frame 7" in str(caught.value)
+    tracker.close()
+    assert gone(pid)
+    reset(tracker)
+    assert tracker.track(frame(0)).state == "ok", "a reset starts the program again"
+
+
+def test_death_at_reset(program):
+    with pytest.raises(TrackerError, match=r"at reset: .*exit code 2; its last line: 'no licence'"):
+        reset(program("sys.stderr.write('no licence\\n'); sys.exit(2)"))
+
+
+def test_refusal_at_reset(program):
+    with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
+        reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
+
+
+def test_faults_at_finalize(program):
+    for answer, expected in (
+        ("{'trajectory': [[1, 2]]}", "rows of 8"),
+        ("{}", "rows of 8"),
+        ("{'trajectory': [[1, 0, 0, 0, 0, 0, 0, 0]]}", "norm 0"),
+        ("{'trajectory': [[2, 0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 1]]}", "strictly increasing"),
+    ):
+        tracker = reset(program(f"for request in requests: say({answer})", final=True))
+        with pytest.raises(TrackerError, match=expected):
+            tracker.finalize()
+
+
+def test_commands_that_cannot_start(tmp_path):
+    with pytest.raises(TrackerError, match="subprocess:PROGRAM"):
+        build_tracker("subprocess")
+    with pytest.raises(TrackerError, match="cannot split"):
+        build_tracker("subprocess:'unclosed")
+    with pytest.raises(TrackerError, match="no folder"):
+        build_tracker("subprocess:ls", {"folder": str(tmp_path / "none")})
+    with pytest.raises(TrackerError, match="cannot start '/no/such/program'"):
+        reset(build_tracker("subprocess:/no/such/program --fast"))
+
+
+def test_close_kills_what_does_not_end(program):
+    text = """
+    import signal, subprocess
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    next(requests); say({"ok": True})
+    next(requests); say({"state": "ok", "T_world_cam": STILL, "stats": {"pid": os.getpid(), "child": child.pid}})
+    time.sleep(600)
+    """
+    tracker = reset(program(text, close_timeout_s=0.2))
+    stats = tracker.track(frame(0)).stats
+    start = time.monotonic()
+    tracker.close()
+    assert time.monotonic() - start < 5
+    assert gone(int(stats["pid"])) and gone(int(stats["child"]))
+
+
+def test_dropping_the_tracker_ends_the_program(program):
+    import gc
+
+    tracker = reset(build_tracker(program(GOOD)._command and f"subprocess:{shlex.join(program(GOOD)._command)}"))
+    pid = tracker._program._process.pid
+    folder = tracker._exchange.folder
+    assert folder.is_dir()
+    del tracker
+    gc.collect()
+    assert gone(pid) and not folder.exists()
+
+
+def test_wrong_image_size(program):
+    tracker = reset(program(GOOD))
+    small = Frame(0, 0.0, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32))
+    with pytest.raises(TrackerError, match="but the camera is 64x48"):
+        tracker.track(small)
+
+
+def test_serve_answers_for_a_python_tracker(program):
+    """The helper for Python programs: numpy views of the images, exceptions as errors, prints out of the way."""
+    root = Path(__file__).resolve().parents[2]
+    text = f"""
+    sys.path.insert(0, {str(root)!r})
+    from dynslam_bench.trackers.adapters.serve import serve
+    def track(index, timestamp, rgb, depth):
+        print("tracking", index)
+        if index == 2:
+            raise RuntimeError("no features")
+        stats = {{"sum": int(rgb.sum()), "known": int((depth > 0).sum())}}
+        return {{"state": "ok", "T_world_cam": STILL, "stats": stats}}
+    serve(lambda request: None, track, lambda: [[1.5, 0, 0, 0, 0, 0, 0, 1]])
+    """
+    tracker = reset(program(text, final=True))
+    for index in range(2):
+        sent = frame(index)
+        stats = tracker.track(sent).stats
+        assert stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
+    with pytest.raises(TrackerError, match="at frame 2: RuntimeError: no features"):
+        tracker.track(frame(2))
+    assert tracker.track(frame(3)).state == "ok", "an answered error does not end the program"
+    assert len(tracker.finalize()) == 1
