@@ -1,1 +1,7 @@
-"""Leaderboards and study reports."""
+"""Leaderboards and study reports: one offline HTML page, with Markdown, CSV and LaTeX beside it."""
+
+from .build import ReportData, ReportPaths, build_report
+from .compare import Comparison, compare
+from .rows import RunRow
+
+__all__ = ["Comparison", "ReportData", "ReportPaths", "RunRow", "build_report", "compare"]

@@ -1,0 +1,350 @@
+"""Building the report: load, order, tabulate, draw, write."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from statistics import median
+
+from pydantic import Field
+
+import dynslam_bench
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.records import Record, write_atomic
+from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.frames import common_frames
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.runs.store import RunStore
+
+from . import figures, run_tables, tables
+from .board import Board, make_board
+from .figures import Figure
+from .page import Block, Section, render
+from .reported import reported_for
+from .rows import Loaded, LoadedRun, RunRow, load_runs, open_stores
+from .statistics import power_note
+from .table import Table, to_csv, to_latex, to_markdown
+
+SCHEMA_VERSION = 1
+
+
+class ReportData(Record):
+    """What a report was made of; `compare` reads it back.
+
+    Attributes:
+        schema_version: Of this record.
+        title: Title of the report.
+        protocol: Description of the protocol.
+        reference: Tracker that errors are divided by.
+        version: Version of the package.
+        rows: One a run.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    title: str
+    protocol: str
+    reference: str
+    version: str
+    rows: list[RunRow] = Field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class ReportPaths:
+    """The files of a report.
+
+    Attributes:
+        html: The page, complete in one file.
+        markdown: The tables as Markdown.
+        latex: The main tables as LaTeX.
+        csv: The tables as CSV, by name.
+        data: All rows, for `compare`.
+    """
+
+    html: Path
+    markdown: Path
+    latex: Path
+    csv: dict[str, Path]
+    data: Path
+
+
+@dataclass
+class _Draft:
+    """What the pages are rendered from."""
+
+    sections: list[Section] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    figures: dict[str, Figure] = field(default_factory=dict)
+
+    def add(self, section: Section) -> None:
+        if section.blocks or section.notes:
+            self.sections.append(section)
+
+    def table(self, table: Table, title: str = "") -> Block:
+        self.tables.append(table)
+        return Block(kind="table", title=title, table=table)
+
+    def figure(self, name: str, figure: Figure, caption: str = "", title: str = "") -> Block:
+        self.figures[name] = figure
+        return Block(kind="figure", title=title, figure=name, caption=caption)
+
+
+def build_report(
+    runs: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    output: Path | str,
+    *,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    reference: str = "orb-slam2",
+    title: str = "Visual SLAM in dynamic scenes",
+    command: str = "",
+) -> ReportPaths:
+    """Make one offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it.
+
+    SLAM is not run; metrics that are missing under the protocol are computed from the stored trajectories.
+
+    Args:
+        runs: Results folders, or a store.
+        output: Folder of the report; files in it that the report does not make are left alone.
+        protocol: How to evaluate.
+        reference: Tracker id that errors are divided by; where it was not run on every sequence, a camera that never
+            moves takes its place.
+        title: Heading.
+        command: Command that makes this report again, shown in it; empty for a derived one.
+
+    Raises:
+        ReportError: There are no runs, or their numbers stem from different protocols.
+        DynslamError: The output folder cannot be written.
+    """
+    protocol = get_protocol(protocol)
+    output = Path(output).expanduser().absolute()
+    stores = open_stores(runs)
+    loaded = load_runs(stores, protocol)
+    board = make_board([run.row for run in loaded.runs], reference)
+    draft = _Draft()
+    _leaderboard(draft, board, protocol, loaded)
+    _sequences(draft, board, protocol, loaded)
+    _details(draft, board, protocol, loaded)
+    _behaviour(draft, board, output)
+    again = command or shlex.join(
+        ["dynslam-bench", "report", *(str(store.root) for store in stores), "-o", str(output)]
+    )
+    _provenance(draft, board, again)
+    data = ReportData(
+        title=title, protocol=protocol.describe(), reference=board.reference_name,
+        version=dynslam_bench.__version__, rows=board.rows,
+    )  # fmt: skip
+    return _write(draft, board, protocol, title, output, data)
+
+
+def _leaderboard(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+    fewest = min((len(c.scores) for key in board.ranked for c in board.cells[key].values() if c.scores), default=0)
+    notes = []
+    if len(board.ranked) > 1 or len(board.sequences) > 0:
+        notes.append(power_note(len(board.ranked), len(board.sequences), fewest))
+    if board.unscored:
+        notes.append(f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}.")
+    if loaded.superseded or loaded.stopped or loaded.unreadable:
+        left = [
+            (loaded.superseded, f"{loaded.superseded} older runs of the same tracker, settings, sequence and seed"),
+            (loaded.stopped, f"{loaded.stopped} runs that were stopped on request"),
+            (len(loaded.unreadable), f"{len(loaded.unreadable)} folders without a valid record"),
+        ]
+        notes.append("Left out: " + ", ".join(text for count, text in left if count) + ".")
+    section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=notes)
+    section.blocks.append(draft.table(tables.leaderboard(board, protocol)))
+    ratio = figures.ratio_figure(board)
+    if ratio is not None:
+        caption = "Points: geometric-mean ATE ratio; bars: 95 % bootstrap interval. Open points are not ranked."
+        section.blocks.append(draft.figure("ratio", ratio, caption))
+    draft.add(section)
+    speed = figures.speed_figure(board)
+    if speed is not None:
+        section = Section("speed", "Accuracy against speed", "Speed")
+        caption = (
+            "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
+            "include segmentation and exclude decoding; they hold for the machine named below."
+        )
+        section.blocks.append(draft.figure("speed", speed, caption))
+        draft.add(section)
+
+
+def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+    if not board.sequences:
+        return
+    section = Section("errors", "Errors by sequence", "Errors")
+    published = reported_for(board.sequences, protocol.alignment)
+    section.blocks.append(draft.table(tables.per_sequence(board, protocol, published), "Absolute trajectory error"))
+    common, frames = _common_errors(board, protocol, loaded)
+    table = tables.common_frames_table(board, common, frames)
+    if table is not None:
+        section.blocks.append(draft.table(table, table.title))
+    rule = tables.failure_rule_table(board)
+    if rule is not None:
+        section.blocks.append(draft.table(rule, rule.title))
+    for table in tables.relative_errors(board, protocol):
+        section.blocks.append(draft.table(table, table.title))
+    draft.add(section)
+
+
+def _details(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+    section = Section("trajectories", "Trajectories and error over time", "Trajectories")
+    for position, sequence in enumerate(board.sequences):
+        chosen = _representatives(board, sequence, loaded)
+        estimates: dict[str, Trajectory] = {}
+        truth = None
+        for key, run in chosen.items():
+            trajectory = run.store.trajectory(run.row.run_id, protocol.trajectory)
+            truth = truth or run.store.ground_truth(run.record.sequence.part)
+            if trajectory is not None and run.row.metrics:
+                estimates[key] = trajectory
+        if truth is None or not estimates:
+            continue
+        paths, errors = figures.sequence_figures(board, truth, estimates, protocol)
+        draft.figures |= {f"path-{position}": paths, f"error-{position}": errors}
+        caption = (
+            f"The run with the median error of each tracker, aligned ({protocol.alignment}), seen along the three "
+            f"axes. "
+            "Lines are broken where a gap exceeds twice the median interval. Click a name to show or hide it."
+        )
+        over_time = "Absolute translational error of the same runs, frame by frame."
+        section.blocks.append(
+            Block(
+                kind="details",
+                summary=sequence,
+                small=f"{board.groups[sequence]}, {len(estimates)} trackers",
+                open=position == 0,
+                figures=[(f"path-{position}", caption), (f"error-{position}", over_time)],
+            )
+        )
+    draft.add(section)
+
+
+def _behaviour(draft: _Draft, board: Board, output: Path) -> None:
+    repeat = run_tables.repeatability(board)
+    if repeat is not None:
+        section = Section("repeatability", "Repeatability", "Repeatability")
+        figure = figures.repeat_figure(board)
+        if figure is not None:
+            caption = "One point a run: its error over the median of the same tracker on the same sequence."
+            section.blocks.append(draft.figure("repeat", figure, caption))
+        section.blocks.append(draft.table(repeat))
+        draft.add(section)
+    masks = figures.mask_figure(board)
+    table = tables.metric_table(
+        board, lambda row: row.mask_iou, "mask_iou", "Mask quality",
+        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        digits=3, larger_is_better=True,
+    )  # fmt: skip
+    if masks is not None or table is not None:
+        section = Section("masks", "Mask quality and pose error", "Masks")
+        if masks is not None:
+            section.blocks.append(draft.figure("masks", masks, "One point a run."))
+        if table is not None:
+            section.blocks.append(draft.table(table))
+        draft.add(section)
+    failed = run_tables.failures(board, output)
+    section = Section("failures", "Failures", "Failures")
+    if failed is not None:
+        section.blocks.append(draft.table(failed))
+    else:
+        section.blocks.append(Block(kind="list", entries=[f"None of {len(board.rows)} runs failed."]))
+    draft.add(section)
+
+
+def _provenance(draft: _Draft, board: Board, again: str) -> None:
+    section = Section("provenance", "Machines, versions, commands", "Reproduce")
+    section.blocks.append(draft.table(run_tables.machines(board)))
+    commands = list(dict.fromkeys(row.command for row in board.rows if row.command))
+    section.blocks.append(
+        Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
+    )
+    notes = [
+        f"{board.labels[r.variant_key]} on {r.sequence_key}, seed {r.seed}: {n}" for r in board.rows for n in r.notes
+    ]
+    if notes:
+        shown = notes[:60]
+        if len(notes) > len(shown):
+            shown.append(f"... and {len(notes) - len(shown)} more in report.json")
+        section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown))
+    draft.add(section)
+
+
+def _common_errors(
+    board: Board, protocol: Protocol, loaded: Loaded
+) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
+    """Median ATE on the frames that all successful runs tracked; nothing where all runs tracked all frames."""
+    errors: dict[tuple[str, str], float] = {}
+    frames: dict[str, str] = {}
+    brief = protocol.model_copy(update={"rpe": (), "segments_m": (), "lost_frames": "exclude"})
+    for sequence in board.sequences:
+        runs = [
+            run for run in loaded.runs if run.row.sequence_key == sequence and run.row.metrics and not run.row.failed
+        ]
+        pairs = [(run, run.store.trajectory(run.row.run_id, protocol.trajectory)) for run in runs]
+        held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
+        truth = held[0][0].store.ground_truth(held[0][0].record.sequence.part) if held else None
+        if truth is None or len({run.row.variant_key for run, _ in held}) < 2:
+            continue
+        reduced = common_frames([trajectory for _, trajectory in held])
+        total = max(run.row.n_frames for run, _ in held)
+        frames[sequence] = f"{len(reduced[0])} of {total}"
+        values: dict[str, list[float]] = {}
+        for (run, _), trajectory in zip(held, reduced, strict=True):
+            try:
+                error = evaluate(trajectory, truth, brief).metrics["ate_rmse_m"]
+            except DynslamError:
+                continue
+            values.setdefault(run.row.variant_key, []).append(error)
+        errors |= {(key, sequence): median(found) for key, found in values.items()}
+    return errors, frames
+
+
+def _representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:
+    """Of each tracker the run on a sequence whose error is the (lower) median one."""
+    chosen: dict[str, LoadedRun] = {}
+    for key in board.trackers:
+        runs = [
+            run
+            for run in loaded.runs
+            if run.row.variant_key == key and run.row.sequence_key == sequence and "ate_rmse_m" in run.row.metrics
+        ]
+        if runs:
+            ordered = sorted(runs, key=lambda run: run.row.metrics["ate_rmse_m"])
+            chosen[key] = ordered[(len(ordered) - 1) // 2]
+    return chosen
+
+
+def _write(draft: _Draft, board: Board, protocol: Protocol, title: str, output: Path, data: ReportData) -> ReportPaths:
+    failed = sum(1 for row in board.rows if row.failed)
+    facts = [
+        (str(len(board.labels)), "trackers"),
+        (str(len(board.sequences) + len(board.unscored)), "sequences"),
+        (str(len(board.rows)), "runs"),
+        (str(failed), "failed"),
+    ]
+    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    footer = f"Made by dynslam-bench {data.version} on {now}. This page works without a network."
+    page = render(draft.sections, draft.figures, title=title, protocol=protocol.describe(), facts=facts, footer=footer)
+    paths = ReportPaths(
+        html=output / "index.html",
+        markdown=output / "report.md",
+        latex=output / "report.tex",
+        csv={},
+        data=output / "report.json",
+    )
+    for table in [*draft.tables, run_tables.all_runs(board)]:
+        paths.csv[table.id] = output / "csv" / f"{table.id}.csv"
+        write_atomic(paths.csv[table.id], to_csv(table))
+    head = f"# {title}\n\n{protocol.describe()}\n\n" + ", ".join(f"{value} {name}" for value, name in facts) + "\n\n"
+    notes = "".join(f"> {note}\n\n" for section in draft.sections for note in section.notes)
+    write_atomic(
+        paths.markdown, head + notes + "\n".join(to_markdown(table) for table in draft.tables) + f"\n{footer}\n"
+    )
+    latex = [to_latex(table) for table in draft.tables if table.id not in ("machines", "failures")]
+    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
+    write_atomic(paths.data, data.to_json())
+    write_atomic(paths.html, page)
+    return paths

@@ -1,0 +1,387 @@
+"""The report's tables, made of a board."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from dynslam_bench.evaluation.protocol import Protocol
+
+from .board import NEVER_MOVE, Board, Cell, rank
+from .rows import RunRow
+from .statistics import Interval, Standing
+from .table import Column, Emphasis, Table, TableCell, emphasise
+
+
+@dataclass(frozen=True)
+class ReportedCell:
+    """A published number.
+
+    Attributes:
+        system: Its name.
+        sequence: Sequence key of the board.
+        value: ATE in metres.
+        source: Where it was read.
+    """
+
+    system: str
+    sequence: str
+    value: float
+    source: str
+
+
+_PROVENANCE = {
+    "own": "this project's own method",
+    "faithful-code": "follows the published code",
+    "faithful-paper": "follows the paper",
+    "inspired": "follows an abstract or a survey; constants are ours",
+    "assumed": "identity or rule unknown, assumed",
+    "external": "not part of this project",
+    "control": "a control, not a system",
+}
+
+
+def leaderboard(board: Board, protocol: Protocol) -> Table:
+    """Ranking with intervals, coverage, speed and provenance."""
+    columns = [
+        Column("#", meaning="rank by the geometric-mean ATE ratio; 95 % bootstrap interval"),
+        Column("tracker", numeric=False),
+        Column(
+            "ATE ratio", meaning=f"geometric mean over sequences of the median ATE over that of {board.reference_name}"
+        ),
+        Column("mean rank", meaning="mean over sequences of the rank there"),
+        Column("P(better)", meaning="probability that a run has a smaller error than one of the reference"),
+        Column("p", meaning="paired Wilcoxon test against the reference over sequences, Holm-corrected"),
+        Column("coverage", meaning="tracked frames over associated input frames"),
+        Column("success", meaning="runs that ended and could be evaluated"),
+        Column(
+            "× real time",
+            meaning="frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
+            "segmentation included, decoding excluded",
+        ),
+        Column("MB", meaning="peak resident memory"),
+        Column("rows", numeric=False),
+        Column("provenance", numeric=False),
+    ]
+    standings = {standing.key: standing for standing in board.standings}
+    marks = emphasise([standings[k].ratio.value if k in board.ranked else None for k in board.trackers])
+    rows, muted = [], set()
+    for position, key in enumerate(board.trackers):
+        runs = board.runs(key)
+        standing = standings.get(key)
+        if key not in board.ranked:
+            muted.add(position)
+        rows.append([*_standing_cells(board, key, standing, marks[position]), *_run_cells(runs)])
+    imputed = sum(cell.imputed for cells in board.cells.values() for cell in cells.values())
+    total = sum(len(cell.rows) for cells in board.cells.values() for cell in cells.values())
+    caption = (
+        f"{protocol.describe()}. ATE ratio: geometric mean over {_count(len(board.sequences), 'sequence')} of the "
+        f"median "
+        f"ATE over that of {board.reference_name}; below 1 is better. Brackets: 95 % bootstrap intervals over runs and "
+        f"sequences. A run that failed or was lost counts as a camera that never moves ({imputed} of {total} runs; "
+        "their number stands in parentheses in the next table). Grey rows are shown but not ranked: controls, inspired "
+        "or assumed re-implementations, and trackers that lack sequences."
+    )
+    table = Table("leaderboard", "Leaderboard", caption, columns, rows, muted)
+    if board.ranked and len(board.ranked) < len(rows):
+        table.separators.add(len(board.ranked))
+    return table
+
+
+def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
+    """Median ATE of every tracker on every sequence, with spread, number of runs and imputed ones."""
+    columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
+    medians = {key: [_median(board.cells[key].get(sequence)) for sequence in board.sequences] for key in board.trackers}
+    marks: dict[str, list[Emphasis]] = {key: [""] * len(board.sequences) for key in board.trackers}
+    for at in range(len(board.sequences)):
+        for key, mark in zip(board.ranked, emphasise([medians[key][at] for key in board.ranked]), strict=True):
+            marks[key][at] = mark
+    rows, muted, separators = [], set(), set()
+    for position, key in enumerate(board.trackers):
+        if key not in board.ranked:
+            muted.add(position)
+        cells = [TableCell(board.labels[key], tag=_kind_tag(board, key))]
+        for at, sequence in enumerate(board.sequences):
+            cells.append(_error_cell(board, board.cells[key].get(sequence), sequence, marks[key][at]))
+        rows.append(cells)
+    separators.add(len(rows))
+    rows.append([TableCell(NEVER_MOVE), *(_never_cell(board, sequence) for sequence in board.sequences)])
+    muted.add(len(rows) - 1)
+    if reported:
+        separators.add(len(rows))
+        for name in dict.fromkeys(cell.system for cell in reported):
+            muted.add(len(rows))
+            rows.append([TableCell(name, tag="reported"), *_reported_cells(board, name, reported)])
+    caption = (
+        "Median ATE (RMSE, metres) over the runs of a cell, behind it half the interquartile range (where there are "
+        "several "
+        "runs), their number n, and in parentheses how many failed and count as a camera that never moves. Colour: "
+        "ratio "
+        f"to {board.reference_name}, from green (a quarter or less) to red (four times or more). Bold best, italic "
+        f"second "
+        f"among ranked trackers. {protocol.describe()}."
+    )
+    if reported:
+        caption += (
+            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only."
+        )
+    return Table("per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators)
+
+
+def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
+    """One table for each relative error of the protocol and each of its parts."""
+    tables = []
+    for spec in protocol.rpe:
+        for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
+            metric = f"rpe_{spec.key}_{part}_rmse_{unit}"
+            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 else ""
+            unit_text = ("m" if unit == "m" else "°") + per
+            table = metric_table(
+                board,
+                lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]
+                f"rpe_{spec.key}_{part}",
+                f"Relative pose error over {spec.describe()}: {name}",
+                f"RMSE in {unit_text}, median over the runs that could be evaluated (failures have none). "
+                f"{protocol.describe()}.",
+                digits=4 if unit == "m" else 3,
+            )
+            if table is not None:
+                tables.append(table)
+    return tables
+
+
+def metric_table(
+    board: Board,
+    value: Callable[[RunRow], float | None],
+    name: str,
+    title: str,
+    caption: str,
+    *,
+    digits: int = 4,
+    larger_is_better: bool = False,
+) -> Table | None:
+    """Median of any number of the rows by tracker and sequence; None if no row has it."""
+    sign = -1.0 if larger_is_better else 1.0
+    rows, muted = [], set()
+    found: dict[str, list[float | None]] = {}
+    for key in board.trackers:
+        found[key] = []
+        for sequence in board.sequences:
+            cell = board.cells[key].get(sequence)
+            values = [v for row in cell.rows if (v := value(row)) is not None] if cell else []
+            found[key].append(median(values) if values else None)
+    if not any(v is not None for values in found.values() for v in values):
+        return None
+    marks = [
+        emphasise([None if (v := found[key][at]) is None else sign * v for key in board.ranked])
+        for at in range(len(board.sequences))
+    ]
+    present = [key for key in board.trackers if any(number is not None for number in found[key])]
+    for position, key in enumerate(present):
+        ranked = key in board.ranked
+        if not ranked:
+            muted.add(position)
+        cells = [TableCell(board.labels[key])]
+        for at, number in enumerate(found[key]):
+            mark: Emphasis = marks[at][board.ranked.index(key)] if ranked else ""
+            cells.append(
+                TableCell() if number is None else TableCell(f"{number:.{digits}f}", value=number, emphasis=mark)
+            )
+        rows.append(cells)
+    columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
+    competing = sum(key in board.ranked for key in present)
+    separators = {competing} if 0 < competing < len(rows) else set()
+    return Table(name, title, caption, columns, rows, muted, separators)
+
+
+def common_frames_table(
+    board: Board, common: Mapping[tuple[str, str], float], frames: Mapping[str, str]
+) -> Table | None:
+    """ATE on the frames that all evaluated runs of a sequence tracked.
+
+    Args:
+        board: The board.
+        common: ``(variant, sequence)`` to the median ATE there.
+        frames: Sequence to how many frames are common, in words.
+    """
+    if not common:
+        return None
+    marks: dict[tuple[str, str], Emphasis] = {}
+    for sequence in board.sequences:
+        values = [common.get((key, sequence)) for key in board.ranked]
+        marks |= {(key, sequence): mark for key, mark in zip(board.ranked, emphasise(values), strict=True)}
+    rows, muted = [], set()
+    for position, key in enumerate(board.trackers):
+        if key not in board.ranked:
+            muted.add(position)
+        cells = [TableCell(board.labels[key])]
+        for sequence in board.sequences:
+            number = common.get((key, sequence))
+            mark = marks.get((key, sequence), "")
+            cells.append(TableCell() if number is None else TableCell(f"{number:.4f}", value=number, emphasis=mark))
+        rows.append(cells)
+    separators = {len(rows)}
+    muted.add(len(rows))
+    rows.append([TableCell("common frames"), *(TableCell(frames.get(sequence, "")) for sequence in board.sequences)])
+    caption = (
+        "Median ATE (RMSE, metres) on those frames only that every successful run of the sequence tracked: a tracker "
+        "gains "
+        "nothing here by losing the hard frames. Failed runs take no part."
+    )
+    columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
+    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators)
+
+
+def failure_rule_table(board: Board) -> Table | None:
+    """How much the ranking depends on how failures and lost frames are counted; None if nothing was lost."""
+    if not board.ranked or all(row.coverage >= 1 and not row.failed for row in board.rows):
+        return None
+    rules: list[tuple[str, Callable[[RunRow], float | None] | None]] = [
+        ("failures never move", None),
+        ("lost frames held", lambda row: row.held_ate_m if row.held_ate_m is not None else row.never_move_m),
+        ("failures left out", lambda row: None if row.failed else row.metrics.get("ate_rmse_m")),
+    ]
+    by_rule = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for _, rule in rules]
+    columns = [Column("tracker", numeric=False)]
+    for name, _ in rules:
+        columns += [Column("#", name), Column("ATE ratio", name)]
+    rows = []
+    for key in board.ranked_order():
+        cells = [TableCell(board.labels[key])]
+        for found in by_rule:
+            standing = found.get(key)
+            cells += (
+                [TableCell(), TableCell()]
+                if standing is None
+                else [_rank_cell(standing), _interval_cell(standing.ratio, ".2f")]
+            )
+        rows.append(cells)
+    caption = (
+        "The same runs under three rules. Failures never move: the report's rule. Lost frames held: every lost frame "
+        "counts "
+        "with the last tracked pose, a run without any pose as never moving. Failures left out: survivors only, which "
+        "flatters trackers that fail. A ranking that changes between the rules is decided by the rule."
+    )
+    return Table("failure_rules", "Sensitivity to the failure rule", caption, columns, rows)
+
+
+def _standing_cells(board: Board, key: str, standing: Standing | None, mark: Emphasis) -> list[TableCell]:
+    name = TableCell(board.labels[key], tip=board.first(key).tracker)
+    if standing is None:
+        return [TableCell("–"), name, *[TableCell() for _ in range(4)]]
+    ratio = _interval_cell(standing.ratio, ".2f")
+    partial = f" on {standing.sequences} of {len(board.sequences)}" if key in board.incomplete else ""
+    ratio = TableCell(ratio.text, ratio.small + partial, ratio.value, mark)
+    is_reference = key == board.reference
+    return [
+        _rank_cell(standing),
+        name,
+        ratio,
+        number_cell(standing.mean_rank, ".2f"),
+        TableCell("reference") if is_reference else _interval_cell(standing.improvement, ".2f"),
+        TableCell() if is_reference else number_cell(standing.p_value, ".3f"),
+    ]
+
+
+def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
+    coverage = float(np.mean([row.coverage for row in runs]))
+    success = float(np.mean([not row.failed for row in runs]))
+    kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
+    provenance = runs[0].provenance
+    return [
+        TableCell(f"{100 * coverage:.1f} %", value=coverage),
+        TableCell(f"{100 * success:.0f} %", value=success),
+        _speed_cell(_middle(row.real_time_factor for row in runs), _middle(row.frame_ms for row in runs)),
+        number_cell(_middle(row.peak_memory_mb for row in runs), ".0f"),
+        TableCell(tag=kinds),
+        TableCell(provenance, tip=_PROVENANCE.get(provenance, "")),
+    ]
+
+
+def _speed_cell(factor: float | None, frame_ms: float | None) -> TableCell:
+    small = "" if frame_ms is None else f"{frame_ms:.1f} ms"
+    if factor is None:
+        return TableCell(small=small)
+    return TableCell(f"{factor:.2f}" if factor < 100 else f"{factor:.0f}", small, factor)
+
+
+def _rank_cell(standing: Standing) -> TableCell:
+    if standing.rank is None:
+        return TableCell("–")
+    low, high = standing.rank.low, standing.rank.high
+    return TableCell(f"{standing.rank.value:.0f}", f"[{low:.0f}–{high:.0f}]", standing.rank.value)
+
+
+def _interval_cell(interval: Interval, digits: str) -> TableCell:
+    return TableCell(
+        f"{interval.value:{digits}}", f"[{interval.low:{digits}}, {interval.high:{digits}}]", interval.value
+    )
+
+
+def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis) -> TableCell:
+    if cell is None or cell.median is None:
+        return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
+    scores = cell.scores
+    small = f"n={len(scores)}"
+    if len(scores) > 1:
+        low, high = np.percentile(scores, [25, 75])
+        small = f"±{(high - low) / 2:.4f} {small}"
+    if cell.imputed:
+        small += f" ({cell.imputed})"
+    coverage = float(np.mean([row.coverage for row in cell.rows]))
+    ratio = cell.median / max(board.reference_median(sequence), 1e-6)
+    return TableCell(
+        f"{cell.median:.4f}", small, cell.median, mark, shade=shade(ratio),
+        tip=f"{ratio:.2f} × the reference, coverage {100 * coverage:.1f} %",
+    )  # fmt: skip
+
+
+def _never_cell(board: Board, sequence: str) -> TableCell:
+    value = board.never_move[sequence]
+    ratio = value / max(board.reference_median(sequence), 1e-6)
+    return TableCell(f"{value:.4f}", value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
+
+
+def _reported_cells(board: Board, system: str, reported: Sequence[ReportedCell]) -> list[TableCell]:
+    cells = []
+    for sequence in board.sequences:
+        found = [cell for cell in reported if cell.system == system and cell.sequence == sequence]
+        cells.append(
+            TableCell(f"{found[0].value:.4f}", value=found[0].value, tip=found[0].source) if found else TableCell()
+        )
+    return cells
+
+
+def shade(ratio: float) -> float:
+    """-1 at a quarter of the reference's error or less, 0 at the same, 1 at four times or more."""
+    return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
+
+
+def _sequence_columns(board: Board) -> list[Column]:
+    return [Column(sequence, group=board.groups[sequence]) for sequence in board.sequences]
+
+
+def _kind_tag(board: Board, key: str) -> str:
+    return "imported" if board.first(key).kind == "imported" else ""
+
+
+def _median(cell: Cell | None) -> float | None:
+    return None if cell is None else cell.median
+
+
+def _middle(values: Iterable[float | None]) -> float | None:
+    present = [value for value in values if value is not None]
+    return median(present) if present else None
+
+
+def number_cell(value: float | None, digits: str = "") -> TableCell:
+    """A number, written with a format specification or with all its digits; an empty cell for None."""
+    return TableCell() if value is None else TableCell(format(value, digits) if digits else repr(value), value=value)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"

@@ -1,0 +1,119 @@
+"""A results folder as runs would leave it, made of computed trajectories, not of runs."""
+
+import hashlib
+
+import numpy as np
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.tum_file import format_tum
+from dynslam_bench.runs.machine import Machine
+from dynslam_bench.runs.record import RunRecord, SequenceInfo, StageTime, TrackerInfo
+from dynslam_bench.runs.store import RunStore
+
+MACHINE = Machine(cpu="Test CPU", cores=2, memory_gb=8.0, system="Linux 6 x86_64")
+
+
+def truth_of(sequence, n=120):
+    """A smooth path at 100 Hz with a hole, different for every sequence."""
+    rng = np.random.default_rng(int(hashlib.sha256(sequence.encode()).hexdigest()[:8], 16))
+    t = np.arange(3 * n + 6) / 90
+    phase, speed = rng.uniform(0, 6, 6), rng.uniform(0.6, 1.8, 6)
+    twist = np.sin(t[:, None] * speed + phase) * [0.5, 0.4, 0.3, 0.15, 0.15, 0.2]
+    stamps = np.round(1000.0 + t, 6)
+    keep = (t < 2.0) | (t > 2.3)
+    return Trajectory(stamps[keep], se3.exp(twist)[keep])
+
+
+def stamps_of(n=120):
+    return np.round(1000.01 + np.arange(n) / 30, 6)
+
+
+def add_run(
+    store,
+    tracker,
+    sequence,
+    seed=0,
+    error=0.01,
+    status="ok",
+    lost=(),
+    n=120,
+    ranked=True,
+    label=None,
+    provenance="faithful-paper",
+    frame_s=0.02,
+    overrides=None,
+    tags=("high-dynamic",),
+    mask_iou=None,
+    ground_truth=True,
+    started="2026-01-01T00:00:00+00:00",
+    kind="run",
+    reason="",
+    command=("dynslam-bench", "bench", "dynamic"),
+):
+    """Store one run whose trajectory is the truth with noise of the given size."""
+    stamps, truth = stamps_of(n), truth_of(sequence, n)
+    part = hashlib.sha256(sequence.encode()).hexdigest()[:12]
+    store.prepare()
+    store.add_sequence(part, stamps, truth if ground_truth else None)
+    identity = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind}
+    run_id = hashlib.sha256(repr(identity).encode()).hexdigest()[:16]
+    rng = np.random.default_rng(int(run_id[:8], 16))
+    nearest = np.abs(truth.timestamps[:, None] - stamps).argmin(0)
+    drift = np.cumsum(rng.normal(0, 1, (n, 6)), axis=0)
+    drift = (drift - drift.mean(0)) / drift.std() * error
+    poses = se3.exp(rng.normal(size=6)) @ truth.T_world_cam[nearest] @ se3.exp(drift * [1, 1, 1, 0.3, 0.3, 0.3])
+    ok = np.ones(n, dtype=bool)
+    ok[list(lost)] = False
+    if status in ("crashed", "timeout", "invalid", "out-of-memory"):
+        ok[n // 4 :] = False
+    record = RunRecord(
+        kind=kind, run_id=run_id, status=status, reason=reason,
+        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked),
+        overrides=overrides or {}, seed=seed, device="cpu",
+        sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=n / 30, fps=30.0,
+                              ground_truth=ground_truth, tags=list(tags)),
+        n_frames=n, n_processed=n, n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
+        timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
+        started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
+        mask_iou=mask_iou, command=list(command),
+    )  # fmt: skip
+    with store.work_folder(run_id) as work:
+        if ok.any():
+            (work / "trajectory_online.txt").write_text(format_tum(Trajectory(stamps[ok], poses[ok])))
+        (work / "log.txt").write_text("a log\n")
+        store.publish(work, record)
+    return run_id
+
+
+def fill(root, trackers=None, sequences=None, seeds=(0, 1, 2)):
+    """A small benchmark: four trackers, one that fails now and then, one control, on four sequences."""
+    store = RunStore(root)
+    sequences = sequences or [
+        "synthetic/walking_xyz",
+        "synthetic/walking_rpy",
+        "synthetic/sitting_xyz",
+        "synthetic/sitting_static",
+    ]
+    quality = trackers or {"orb-slam2": 0.10, "mask-rcnn": 0.02, "dynaslam": 0.015, "ds-slam": 0.05}
+    for sequence in sequences:
+        dynamic = "walking" in sequence
+        tags = ("high-dynamic",) if dynamic else ("low-dynamic",)
+        for seed in seeds:
+            for speed, (name, error) in enumerate(quality.items(), start=1):
+                broken = name == "ds-slam" and sequence.endswith("walking_rpy") and seed == 1
+                add_run(
+                    store, name, sequence, seed,
+                    error=error * (1 + 0.2 * seed) if dynamic else 0.012 + 0.1 * error,
+                    status="crashed" if broken else "ok",
+                    reason="RuntimeError: the map is empty" if broken else "",
+                    lost=range(50, 70) if name == "orb-slam2" and dynamic else (),
+                    label={"orb-slam2": "ORB-SLAM2 (our back end)", "mask-rcnn": "Mask R-CNN (our back end)",
+                           "dynaslam": "DynaSLAM N+G (our back end)", "ds-slam": "DS-SLAM (our back end)"}.get(name, name),
+                    frame_s=0.012 * speed, tags=tags, mask_iou=None if name == "orb-slam2" else 0.9 - 3 * error,
+                )  # fmt: skip
+            add_run(
+                store, "constant-velocity", sequence, seed, error=0.3, ranked=False, label="constant velocity",
+                provenance="control", frame_s=0.0001, tags=tags,
+            )  # fmt: skip
+    return store
