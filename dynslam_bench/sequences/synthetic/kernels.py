@@ -1,10 +1,10 @@
 """The numba kernels of the renderer: ray casting over tile bins, edge antialiasing, flow and motion blur.
 
 Geometry is a list of primitives, each a unit shape in a local frame that is rigid up to a scale per axis (so that a
-round cone may have an elliptic section). A ray leaves the camera centre with direction ``((u - cx) / fx, (v - cy) / fy, 1)``;
-its parameter t is therefore the z-depth in metres, in the local frame as well. All arithmetic is IEEE float64 without
-fastmath, every pixel depends on its own inputs only, and every kernel works on a band of rows: the result is the same for
-any number of threads. The kernels release the GIL and start no threads of their own.
+round cone may have an elliptic section). A ray leaves the camera centre with direction
+``((u - cx) / fx, (v - cy) / fy, 1)``; its parameter t is therefore the z-depth in metres, in the local frame as well.
+All arithmetic is IEEE float64 without fastmath, every pixel depends on its own inputs only, and every kernel works on a
+band of rows: the result is the same for any number of threads. The kernels release the GIL and start no threads.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
     return start, members
 
 
-# The two kernels below repeat the loop over a tile's primitives: numba counts references of every array that is passed to a
-# function that it does not inline, which costs more than the tracing.
+# The two kernels below repeat the loop over a tile's primitives: numba counts references of every array that is passed
+# to a function that it does not inline, which costs more than the tracing.
 
 
 @_jit
@@ -199,10 +199,10 @@ def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, l
 
 
 @_jit
-def shade_pixels(
+def shade_pixels(  # type: ignore[no-untyped-def]
     row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, texture, uv, tint, facets, atlas,
     level_offset, log2_size, lights, hit, depth, jitter, color, cosine
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Colour (float32, 0-255 scale) and cosine of incidence of rows.
 
     ``facets`` [P, 6, 5] holds for each face its unit normal in the camera frame (boxes and quads), its light, and for

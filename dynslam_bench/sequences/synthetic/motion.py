@@ -1,7 +1,7 @@
 """The camera's motions, after the descriptions of TUM's fr3 sequences, at their tempo.
 
-World frame: z up, the camera starts near the origin's plumb line at 1.35 m and looks along +y at the desk. Positions are
-sums of smooth functions of time, so that every pose is exact at any time.
+World frame: z up, the camera starts near the origin's plumb line at 1.35 m and looks along +y at the desk. Positions
+are sums of smooth functions of time, so that every pose is exact at any time.
 
 * xyz: along the camera's three axes, one after the other, 0.25 m to each side;
 * static: held in place by hand;
@@ -27,7 +27,7 @@ TILT_RAD = math.radians(10.0)
 def camera_poses(motion: str, people: str, instance: int, times: Array) -> Array:
     """Camera-to-world poses ``[N, 4, 4]`` at `times` (seconds from the start)."""
     rng = stream(instance, "synthetic", "camera", people, motion)
-    tempo = 1.0 if people == "walking" else 0.72
+    tempo = 0.72 if people == "sitting" and motion == "xyz" else 1.0
     t = np.asarray(times, dtype=np.float64)
     offset = np.zeros((len(t), 3))  # along the camera's rest axes: right, down, forward
     angles = np.zeros((len(t), 3))  # about right (pitch), down (yaw), forward (roll)
@@ -44,15 +44,15 @@ def camera_poses(motion: str, people: str, instance: int, times: Array) -> Array
         for slot, axis in enumerate(phase):
             angles[:, axis] = signs[axis] * amplitudes[axis] * _turns(t, period, 3, slot)
     elif motion == "halfsphere":
-        around = 2 * math.pi * t / (7.3 / tempo)
+        around = 2 * math.pi * t / (6.1 / tempo)
         lift = 0.5 - 0.5 * np.cos(2 * math.pi * t / (16.9 / tempo) + 0.4)
-        radius, distance = 0.42, 2.1
+        radius, distance = 0.36, 0.9
         offset[:, 0] = signs[0] * radius * np.sin(around)
-        offset[:, 1] = -radius * (0.9 * lift - 0.15) * np.cos(around * 0.5 + 0.3)
+        offset[:, 1] = -radius * (0.85 * lift - 0.12) * np.cos(around * 0.5 + 0.3)
         offset[:, 2] = -0.1 + 0.2 * np.cos(around) * (0.4 + 0.6 * lift)
         angles[:, 1] = -0.9 * np.arctan2(offset[:, 0], distance - offset[:, 2])
         angles[:, 0] = 0.9 * np.arctan2(offset[:, 1], distance - offset[:, 2])
-        angles[:, 2] = 0.12 * np.sin(around * 0.77 + 1.0)
+        angles[:, 2] = 0.2 * np.sin(around * 0.77 + 1.0)
     offset += _hand(rng, t, 0.004, 3)
     angles += _hand(rng, t, math.radians(0.5), 3)
     rest = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -93,4 +93,4 @@ def _rotation(vectors: Array) -> Array:
     zero = np.zeros(len(k))
     hat = np.stack([zero, -k[:, 2], k[:, 1], k[:, 2], zero, -k[:, 0], -k[:, 1], k[:, 0], zero], 1).reshape(-1, 3, 3)
     s, c = np.sin(theta)[:, None, None], (1 - np.cos(theta))[:, None, None]
-    return np.eye(3) + s * hat + c * (hat @ hat)
+    return np.asarray(np.eye(3) + s * hat + c * (hat @ hat))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ class Posture:
 
 
 def draw_person(instance: int, index: int) -> Person:
-    """The `index`-th person (0 or 1) of an instance. One of the two always wears plaid, the other a print or stripes."""
+    """The `index`-th person (0 or 1) of an instance; the first always wears plaid, the other any pattern."""
     rng = stream(instance, "synthetic", "person", index)
     skins = np.array(
         [
@@ -84,8 +85,11 @@ def draw_person(instance: int, index: int) -> Person:
             [0.45, 0.43, 0.42],
         ]
     )
-    shirt = ("plaid:0", "plaid:1")[index] if index == 0 else ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")[
-        pick_one(rng, instance, list(range(6)))]  # fmt: skip
+    shirt = (
+        ("plaid:0", "plaid:1")[index]
+        if index == 0
+        else ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")[pick_one(rng, instance, list(range(6)))]
+    )
     return Person(
         instance=index + 1,
         height=pick(rng, instance, 1.62, 1.88),
@@ -93,14 +97,16 @@ def draw_person(instance: int, index: int) -> Person:
         skin=skins[pick_one(rng, instance, list(range(6)))],
         hair=hairs[pick_one(rng, instance, list(range(6)))] * (0.8 + 0.4 * rng.random()),
         trousers=np.array([[0.25, 0.32, 0.5], [0.2, 0.21, 0.25], [0.55, 0.48, 0.37], [0.32, 0.34, 0.3]])[
-            pick_one(rng, instance, list(range(4)))] * (0.85 + 0.3 * rng.random()),
+            pick_one(rng, instance, list(range(4)))
+        ]
+        * (0.85 + 0.3 * rng.random()),
         shoes=0.12 + 0.3 * rng.random() * np.ones(3),
         shirt=shirt,
         shirt_tint=np.clip(1.0 - 0.1 * rng.random(3), 0, 1),
         long_hair=bool(rng.random() < 0.4),
         long_sleeves=bool(rng.random() < 0.6),
         cap=bool(rng.random() < 0.15),
-    )  # fmt: skip
+    )
 
 
 def _pitch(angle: float) -> Array:
@@ -151,28 +157,43 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
     lean = 0.05 * gait + sit * 0.06 + 0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2)
     trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * wave(0.17, 0.7))
     hipline = body @ _yaw(-twist)
-    jeans = {"instance": who.instance, "texture": "denim", "repeat": (2.0, 3.0), "tint": who.trousers}
-    shirt = {"instance": who.instance, "texture": who.shirt, "tint": who.shirt_tint}
-    bare = {"instance": who.instance, "texture": "plain", "tint": who.skin}
+    jeans: dict[str, Any] = {"instance": who.instance, "texture": "denim", "repeat": (2.0, 3.0), "tint": who.trousers}
+    shirt: dict[str, Any] = {"instance": who.instance, "texture": who.shirt, "tint": who.shirt_tint}
+    bare: dict[str, Any] = {"instance": who.instance, "texture": "plain", "tint": who.skin}
 
-    def limb(a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: object) -> None:
+    def limb(a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> None:
         """A round cone from a to c; its section is `flat` times as wide across `side`'s normal."""
         rotation, length = along(a, c, side)
-        parts.add(ROUND_CONE, rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)  # type: ignore[arg-type]
+        parts.add(ROUND_CONE, rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
 
-    def ball(centre: Array, rotation: Array, radii: tuple[float, float, float], **style: object) -> None:
-        parts.add(ROUND_CONE, rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)  # type: ignore[arg-type]
+    def ball(centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any) -> None:
+        parts.add(ROUND_CONE, rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
 
     # Trunk: pelvis, belly, chest, shoulders; wider than deep.
     right = trunk @ _X
-    limb(root + hipline @ np.array([-0.055 * k, 0, 0.01]), root + hipline @ np.array([0.055 * k, 0, 0.01]), 0.115 * k * b, 0.115 * k * b,
-         hipline @ np.array([0.0, 0.0, 1.0]), 0.95, **jeans)  # fmt: skip
+    limb(
+        root + hipline @ np.array([-0.055 * k, 0, 0.01]),
+        root + hipline @ np.array([0.055 * k, 0, 0.01]),
+        0.115 * k * b,
+        0.115 * k * b,
+        hipline @ np.array([0.0, 0.0, 1.0]),
+        0.95,
+        **jeans,
+    )
     waist = root + trunk @ np.array([0.0, 0.0, 0.08 * k])
     chest = root + trunk @ np.array([0.0, 0.005, 0.36 * k])
     neck = root + trunk @ np.array([0.0, -0.005, spine + 0.05 * k])
     limb(waist, chest, 0.148 * k * b, 0.168 * k * b, right, 0.68, repeat=(5.0, 6.0), **shirt)
-    limb(chest - right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]), chest + right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
-         0.088 * k * b, 0.088 * k * b, trunk @ _Y, 1.0, repeat=(3.0, 6.0), **shirt)  # fmt: skip
+    limb(
+        chest - right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
+        chest + right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
+        0.088 * k * b,
+        0.088 * k * b,
+        trunk @ _Y,
+        1.0,
+        repeat=(3.0, 6.0),
+        **shirt,
+    )
     # Neck and head, which looks about.
     skull = neck + trunk @ np.array([0.0, 0.015 * k, 0.15 * k])
     head = (
@@ -188,14 +209,22 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
         right,
         **bare,
     )
-    ball(skull, head, (0.077 * k, 0.098 * k, 0.122 * k), instance=who.instance, texture="face", tint=who.skin, repeat=(1.0, 0.5),
-         shift=(0.5, 0.5))  # fmt: skip
+    ball(
+        skull,
+        head,
+        (0.077 * k, 0.098 * k, 0.122 * k),
+        instance=who.instance,
+        texture="face",
+        tint=who.skin,
+        repeat=(1.0, 0.5),
+        shift=(0.5, 0.5),
+    )
     ball(skull + head @ np.array([0, 0.092 * k, -0.012 * k]), head, (0.015 * k, 0.022 * k, 0.026 * k), **bare)
     for side in (-1, 1):
         ball(
             skull + head @ np.array([side * 0.077 * k, -0.005, -0.01]), head, (0.012 * k, 0.024 * k, 0.033 * k), **bare
         )
-    mane = {"instance": who.instance, "texture": "hair", "repeat": (3.0, 0.5), "tint": who.hair}
+    mane: dict[str, Any] = {"instance": who.instance, "texture": "hair", "repeat": (3.0, 0.5), "tint": who.hair}
     ball(
         skull + head @ np.array([0, -0.018 * k, 0.03 * k]),
         head @ _pitch(0.35),
@@ -203,8 +232,15 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
         **mane,
     )
     if who.long_hair:
-        limb(skull + head @ np.array([0, -0.06, 0.0]), skull + head @ np.array([0, -0.075, -0.15 * k]), 0.075 * k, 0.055 * k, head @ _X, 0.6,
-             **{**mane, "repeat": (4.0, 2.0)})  # fmt: skip
+        limb(
+            skull + head @ np.array([0, -0.06, 0.0]),
+            skull + head @ np.array([0, -0.075, -0.15 * k]),
+            0.075 * k,
+            0.055 * k,
+            head @ _X,
+            0.6,
+            **{**mane, "repeat": (4.0, 2.0)},
+        )
     if who.cap:
         ball(
             skull + head @ np.array([0, 0.01, 0.075 * k]),

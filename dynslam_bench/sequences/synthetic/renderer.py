@@ -19,6 +19,9 @@ from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 
+_LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
+"""Direction to each lamp in the world (not normalised) and its strength; row 0 is the ambient light."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
@@ -67,11 +70,38 @@ class Renderer:
         color, cosine = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
         lights = self._lights(now, index / FPS)
         jitter = _JITTER if settings.antialias else np.zeros((1, 2))
-        self._rows(lambda a, b: kernels.shade_pixels(
-            a, b, self._intrinsics, tiles[0], tiles[1], tiles[2], tiles[3], scene.kind, now.local, scene.shape,
-            scene.texture, scene.uv, scene.tint, self._facets(now, lights), self.atlas.texels, self.atlas.level_offset, self.atlas.log2_size, lights,
-            hit, depth, jitter, color, cosine))  # fmt: skip
+        self._rows(
+            lambda a, b: kernels.shade_pixels(
+                a,
+                b,
+                self._intrinsics,
+                tiles[0],
+                tiles[1],
+                tiles[2],
+                tiles[3],
+                scene.kind,
+                now.local,
+                scene.shape,
+                scene.texture,
+                scene.uv,
+                scene.tint,
+                self._facets(now, lights),
+                self.atlas.texels,
+                self.atlas.level_offset,
+                self.atlas.log2_size,
+                lights,
+                hit,
+                depth,
+                jitter,
+                color,
+                cosine,
+            )
+        )
         raw = self._measure(index, depth, cosine, color)
+        if settings.shadow:
+            self._shadow(now, index / FPS, depth, color)
+        if settings.glare:
+            color += self._glare(now, index / FPS)
         if settings.color.shutter > 0:
             flow = np.empty((height, width, 2), np.float32)
             motion = self._motion(now, after)
@@ -125,23 +155,42 @@ class Renderer:
         low_u, high_u = np.where(crossing, 0, u.min(1) - 2), np.where(crossing, CAMERA.width, u.max(1) + 2)
         low_v, high_v = np.where(crossing, 0, v.min(1) - 2), np.where(crossing, CAMERA.height, v.max(1) + 2)
         seen &= (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
-        boxes = np.stack([
-            np.clip(low_u, 0, CAMERA.width - 1), np.clip(low_v, 0, CAMERA.height - 1),
-            np.clip(high_u, 0, CAMERA.width - 1), np.clip(high_v, 0, CAMERA.height - 1),
-        ], axis=1)  # fmt: skip
+        boxes = np.stack(
+            [
+                np.clip(low_u, 0, CAMERA.width - 1),
+                np.clip(low_v, 0, CAMERA.height - 1),
+                np.clip(high_u, 0, CAMERA.width - 1),
+                np.clip(high_v, 0, CAMERA.height - 1),
+            ],
+            axis=1,
+        )
         boxes = (boxes // kernels.TILE).astype(np.int32)
         order = np.argsort(nearest, kind="stable")
         order = order[seen[order]].astype(np.int32)
         start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
         return tiles_x, start, members, nearest
 
-    def _geometry(self, snap: Snapshot, tiles: tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
-                  ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:  # fmt: skip
+    def _geometry(
+        self, snap: Snapshot, tiles: tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         hit = np.empty((CAMERA.height, CAMERA.width), np.int32)
         depth = np.empty((CAMERA.height, CAMERA.width))
-        self._rows(lambda a, b: kernels.cast_geometry(
-            a, b, self._intrinsics, tiles[0], tiles[1], tiles[2], tiles[3], self.scene.kind, snap.local, self.scene.shape, hit, depth
-        ))  # fmt: skip
+        self._rows(
+            lambda a, b: kernels.cast_geometry(
+                a,
+                b,
+                self._intrinsics,
+                tiles[0],
+                tiles[1],
+                tiles[2],
+                tiles[3],
+                self.scene.kind,
+                snap.local,
+                self.scene.shape,
+                hit,
+                depth,
+            )
+        )
         return hit, depth
 
     def _motion(self, now: Snapshot, other: Snapshot) -> NDArray[np.float64]:
@@ -157,7 +206,7 @@ class Renderer:
 
     def _lights(self, snap: Snapshot, time: float) -> NDArray[np.float64]:
         """Directions to the lights in the camera frame, and strengths; row 0 is the ambient light."""
-        rows = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
+        rows = _LAMPS.copy()
         rows[:, :3] /= np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
         if self.settings.lighting_change:
             rows[:, 3] *= 0.78 + 0.22 * math.cos(2 * math.pi * time / 7.0)
@@ -188,18 +237,58 @@ class Renderer:
         girth = math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3)
         repeats[cones, :, 0] /= girth[:, None]
         repeats[cones] /= scene.scale[cones].mean(axis=1)[:, None, None]
-        return repeats.max(axis=2) * (1 << self.atlas.log2_size[scene.texture]) / CAMERA.fx
+        return np.asarray(repeats.max(axis=2) * (1 << self.atlas.log2_size[scene.texture]) / CAMERA.fx)
 
-    def _measure(self, index: int, depth: NDArray[np.float64], cosine: NDArray[np.float32], color: NDArray[np.float32]
-                 ) -> NDArray[np.uint16]:  # fmt: skip
+    def _shadow(self, snap: Snapshot, time: float, depth: NDArray[np.float64], color: NDArray[np.float32]) -> None:
+        """Soft shadows of things outside the picture, sweeping over the room."""
+        light = _LAMPS[1, :3] / _LAMPS[1, 2]
+        sweep = 1.6 * math.sin(2 * math.pi * time / 6.3)
+        spots = np.array([
+            [sweep + light[0] * 1.2, 0.7 + 0.3 * math.sin(1.1 * time), 1.0, 0.5],
+            [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4],
+        ])  # fmt: skip
+        pose = snap.T_world_cam
+        self._rows(lambda a, b: sensors.dim(a, b, self._intrinsics, pose, depth, light, 2.2, spots, color))
+
+    def _glare(self, snap: Snapshot, time: float) -> NDArray[np.float32]:
+        """A bright veil ``[H, W, 1]`` around a window beside the room's back wall, brightening and fading."""
+        window = np.array([self.scene.plan.left_x * 0.55, self.scene.plan.back_y, 2.15])
+        x, y, z = (window - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
+        if z <= 0.1:
+            return np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
+        u, v = x / z * CAMERA.fx + CAMERA.cx, y / z * CAMERA.fy + CAMERA.cy
+        strength = 110 * (0.6 + 0.4 * math.sin(2 * math.pi * time / 5.3))
+        across = np.exp(-(((np.arange(CAMERA.width) - u) / 210.0) ** 2))
+        down = np.exp(-(((np.arange(CAMERA.height) - v) / 180.0) ** 2))
+        return np.asarray((strength * down[:, None] * across[None, :])[..., None], np.float32)
+
+    def _measure(
+        self, index: int, depth: NDArray[np.float64], cosine: NDArray[np.float32], color: NDArray[np.float32]
+    ) -> NDArray[np.uint16]:
         sensor = self.settings.depth
         if not sensor.noise:
             return np.clip(np.floor(depth * CAMERA.depth_factor + 0.5), 0, 65535).astype(np.uint16)
         raw = np.empty(depth.shape, np.uint16)
         seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index)) & 0xFFFFFFFFFFFFFFFF)
-        self._rows(lambda a, b: sensors.measure_depth(
-            a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, sensor.disparity_noise_px, sensor.near_m, sensor.far_m,
-            sensor.edge_px, sensor.dark, CAMERA.depth_factor, raw))  # fmt: skip
+        self._rows(
+            lambda a, b: sensors.measure_depth(
+                a,
+                b,
+                seed,
+                CAMERA.fx,
+                CAMERA.baseline_m,
+                depth,
+                cosine,
+                color,
+                sensor.disparity_noise_px,
+                sensor.near_m,
+                sensor.far_m,
+                sensor.edge_px,
+                sensor.dark,
+                CAMERA.depth_factor,
+                raw,
+            )
+        )
         return raw
 
     def _expose(self, index: int, color: NDArray[np.float32]) -> NDArray[np.uint8]:

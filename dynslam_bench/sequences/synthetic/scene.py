@@ -107,8 +107,8 @@ class Scene:
             for person, keys in zip(self.cast, self.script.people, strict=True):
                 add_person(parts, person, posture(keys, self.script.period, t))
         rotations, origins = [self._fixed_rotation], [self._fixed_origin]
-        for (rotation, origin), keys in zip(self._chairs, self.script.chairs, strict=True):
-            x, y, facing = chair_place(keys, self.script.period, 0.0 if self.mode == "none" else t)
+        for (rotation, origin), path in zip(self._chairs, self.script.chairs, strict=True):
+            x, y, facing = chair_place(path, self.script.period, 0.0 if self.mode == "none" else t)
             body = turn(facing + 180.0)
             rotations.append(body @ rotation)
             origins.append(origin @ body.T + (x, y, 0.0))
@@ -128,7 +128,7 @@ class Scene:
         return Snapshot(pose, rotation, origin, np.ascontiguousarray(local.reshape(-1, 12)))
 
     def moving(self, index: int) -> frozenset[int]:
-        """Instances with a point that moved by more than `MOVED_M` between frame index - 1 and index; frame 0 has none."""
+        """Instances with a point that moved by more than `MOVED_M` since the previous frame; frame 0 has none."""
         if index == 0 or self.mode != "moving":
             return frozenset()
         before, after = self.place((index - 1) / FPS), self.place(index / FPS)

@@ -7,10 +7,9 @@ talk and gesture.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
-
-import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
@@ -57,48 +56,82 @@ def write_script(people: str, instance: int) -> Script:
     def j(low: float, high: float) -> float:
         return pick(rng, instance, low, high)
 
+    first: tuple[Key, ...]
+    second: tuple[Key, ...]
+    chairs: tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]
     if people == "sitting":
         ax, ay, bx, by = -j(0.5, 0.62), j(1.62, 1.74), j(0.46, 0.58), j(1.68, 1.8)
         fa, fb = 180 + j(18, 35), 180 - j(22, 40)
         first = (
-            Key(0, ax, ay, fa, 1, 0.7),
-            Key(4, ax, ay, fa + 8, 1, 1),
-            Key(8, ax, ay, fa - 6, 1, 0.5),
-            Key(12, ax, ay, fa, 1, 0.7),
+            Key(0, ax, ay, fa, 1, 0.39),
+            Key(4, ax, ay, fa + 8, 1, 0.55),
+            Key(8, ax, ay, fa - 6, 1, 0.28),
+            Key(12, ax, ay, fa, 1, 0.39),
         )
         second = (
-            Key(0, bx, by, fb, 1, 0.6),
-            Key(3, bx, by, fb - 6, 1, 0.4),
-            Key(7, bx, by, fb + 7, 1, 1),
-            Key(12, bx, by, fb, 1, 0.6),
+            Key(0, bx, by, fb, 1, 0.33),
+            Key(3, bx, by, fb - 6, 1, 0.22),
+            Key(7, bx, by, fb + 7, 1, 0.55),
+            Key(12, bx, by, fb, 1, 0.33),
         )
         chairs = (
             (ChairKey(0, ax, ay, fa), ChairKey(12, ax, ay, fa)),
             (ChairKey(0, bx, by, fb), ChairKey(12, bx, by, fb)),
         )
         return _mirror(Script(12.0, (first, second), chairs), flip)
-    ax, ay, bx, by = -j(0.28, 0.4), j(1.2, 1.32), j(0.3, 0.42), j(1.36, 1.5)
+    ax, ay, bx, by = -j(0.28, 0.4), j(1.26, 1.38), j(0.3, 0.42), j(1.44, 1.58)
     cx, cy = -j(0.55, 0.7), j(1.62, 1.7)
     side = 1.65
     first = (
-        Key(0.0, ax, ay, 200, 0, 1), Key(2.1, ax, ay, 220, 0, 1), Key(2.4, ax + 0.1, ay, 270, 0, 0.2), Key(4.2, side, ay + 0.1, 270),
-        Key(4.6, side, ay + 0.1, 90), Key(6.3, -ax * 0.6, ay + 0.05, 120, 0, 0.5), Key(6.8, -ax * 0.6, ay + 0.05, 170, 0, 1),
-        Key(8.9, -ax * 0.6, ay + 0.05, 150, 0, 1), Key(9.3, -ax * 0.4, ay, 90), Key(11.2, -side, ay + 0.1, 90), Key(11.7, -side, ay + 0.1, 270),
-        Key(13.2, cx, cy - 0.32, 230), Key(13.7, cx, cy - 0.3, 180), Key(14.6, cx, cy, 185, 1, 0.4), Key(16.4, cx, cy, 200, 1, 1),
-        Key(17.2, cx, cy - 0.32, 190), Key(18.6, ax, ay, 200, 0, 0.5), Key(20.0, ax, ay, 200, 0, 1),
-    )  # fmt: skip
+        Key(0.0, ax, ay, 200, 0, 1),
+        Key(2.1, ax, ay, 220, 0, 1),
+        Key(2.4, ax + 0.1, ay, 270, 0, 0.2),
+        Key(4.2, side, ay + 0.1, 270),
+        Key(4.6, side, ay + 0.1, 90),
+        Key(6.3, -ax * 0.6, ay + 0.05, 120, 0, 0.5),
+        Key(6.8, -ax * 0.6, ay + 0.05, 170, 0, 1),
+        Key(8.9, -ax * 0.6, ay + 0.05, 150, 0, 1),
+        Key(9.3, -ax * 0.4, ay, 90),
+        Key(11.2, -side, ay + 0.1, 90),
+        Key(11.7, -side, ay + 0.1, 270),
+        Key(13.2, cx, cy - 0.32, 230),
+        Key(13.7, cx, cy - 0.3, 180),
+        Key(14.6, cx, cy, 185, 1, 0.4),
+        Key(16.4, cx, cy, 200, 1, 1),
+        Key(17.2, cx, cy - 0.32, 190),
+        Key(18.6, ax, ay, 200, 0, 0.5),
+        Key(20.0, ax, ay, 200, 0, 1),
+    )
     second = (
-        Key(0.0, bx, by, 160, 0, 0.8), Key(2.0, bx, by, 170, 0, 1), Key(2.3, bx, by, 270), Key(3.6, side - 0.1, by + 0.2, 270),
-        Key(4.4, side - 0.1, by + 0.2, 90), Key(6.0, bx - 0.75, by, 110, 0, 0.5), Key(6.6, bx - 0.75, by, 190, 0, 1),
-        Key(9.0, bx - 0.75, by, 200, 0, 1), Key(9.3, bx - 0.8, by, 90), Key(10.6, -side, by + 0.2, 90), Key(11.4, -side, by + 0.25, 270),
-        Key(14.2, bx + 0.05, by + 0.05, 250, 0, 0.5), Key(14.8, bx + 0.05, by, 150, 0, 1), Key(18.0, bx, by, 150, 0, 1),
+        Key(0.0, bx, by, 160, 0, 0.8),
+        Key(2.0, bx, by, 170, 0, 1),
+        Key(2.3, bx, by, 270),
+        Key(3.6, side - 0.1, by + 0.2, 270),
+        Key(4.4, side - 0.1, by + 0.2, 90),
+        Key(6.0, bx - 0.75, by, 110, 0, 0.5),
+        Key(6.6, bx - 0.75, by, 190, 0, 1),
+        Key(9.0, bx - 0.75, by, 200, 0, 1),
+        Key(9.3, bx - 0.8, by, 90),
+        Key(10.6, -side, by + 0.2, 90),
+        Key(11.4, -side, by + 0.25, 270),
+        Key(14.2, bx + 0.05, by + 0.05, 250, 0, 0.5),
+        Key(14.8, bx + 0.05, by, 150, 0, 1),
+        Key(18.0, bx, by, 150, 0, 1),
         Key(20.0, bx, by, 160, 0, 0.8),
-    )  # fmt: skip
+    )
     chairs = (
-        (ChairKey(0, cx, cy + 0.1, 150), ChairKey(13.3, cx, cy + 0.1, 150), ChairKey(14.4, cx, cy, 185), ChairKey(14.9, cx, cy, 185),
-         ChairKey(16.2, cx, cy, 205), ChairKey(16.6, cx, cy, 195), ChairKey(17.3, cx, cy + 0.12, 150), ChairKey(20, cx, cy + 0.1, 150)),
+        (
+            ChairKey(0, cx, cy + 0.1, 150),
+            ChairKey(13.3, cx, cy + 0.1, 150),
+            ChairKey(14.4, cx, cy, 185),
+            ChairKey(14.9, cx, cy, 185),
+            ChairKey(16.2, cx, cy, 205),
+            ChairKey(16.6, cx, cy, 195),
+            ChairKey(17.3, cx, cy + 0.12, 150),
+            ChairKey(20, cx, cy + 0.1, 150),
+        ),
         (ChairKey(0, 0.85, 1.75, 20), ChairKey(20, 0.85, 1.75, 20)),
-    )  # fmt: skip
+    )
     return _mirror(Script(20.0, (first, second), chairs), flip)
 
 
@@ -124,7 +157,7 @@ def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
     """The posture of a person at time t (seconds)."""
     local = t % period
     stride = 0.0
-    for a, b in zip(keys, keys[1:], strict=False):
+    for a, b in itertools.pairwise(keys):
         dx, dy = b.x - a.x, b.y - a.y
         distance = math.sqrt(dx * dx + dy * dy)
         if local >= b.t:
@@ -136,9 +169,15 @@ def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
         speed = distance / span * 6 * s * (1 - s)
         stride += distance * e
         return Posture(
-            a.x + e * dx, a.y + e * dy, _angle(a.facing, b.facing, _ease(min(s * 1.5, 1.0))), stride * 2 * math.pi / 1.35,
-            min(speed / 0.9, 1.0), a.sit + e * (b.sit - a.sit), a.gesture + e * (b.gesture - a.gesture), t,
-        )  # fmt: skip
+            a.x + e * dx,
+            a.y + e * dy,
+            _angle(a.facing, b.facing, _ease(min(s * 1.5, 1.0))),
+            stride * 2 * math.pi / 1.35,
+            min(speed / 0.9, 1.0),
+            a.sit + e * (b.sit - a.sit),
+            a.gesture + e * (b.gesture - a.gesture),
+            t,
+        )
     k = keys[-1]
     return Posture(k.x, k.y, k.facing, stride * 2 * math.pi / 1.35, 0.0, k.sit, k.gesture, t)
 
@@ -146,7 +185,7 @@ def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
 def chair_place(keys: tuple[ChairKey, ...], period: float, t: float) -> tuple[float, float, float]:
     """x, y (metres) and facing (degrees) of a chair at time t."""
     local = t % period
-    for a, b in zip(keys, keys[1:], strict=False):
+    for a, b in itertools.pairwise(keys):
         if local < b.t:
             e = _ease((local - a.t) / (b.t - a.t))
             return a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), _angle(a.facing, b.facing, e)

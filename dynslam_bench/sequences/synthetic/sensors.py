@@ -1,12 +1,12 @@
 """The two sensors: a structured-light depth camera and a colour camera with a rolling readout, as numba kernels.
 
-Noise is a function of (seed, frame, pixel) through an integer hash, so that it depends neither on the order of rendering
-nor on the number of threads.
+Noise is a function of (seed, frame, pixel) through an integer hash, so that it depends neither on the order of
+rendering nor on the number of threads.
 
 Depth model, in the order of the physics of a Kinect-like sensor:
 
 1. The projector stands one baseline beside the camera; what it cannot see is in its shadow and has no depth.
-2. The disparity ``fx * baseline / z`` carries noise and is quantised to 1/8 pixel, so that the depth steps grow with z^2.
+2. The disparity ``fx * baseline / z`` carries noise and is quantised to 1/8 pixel: the depth steps grow with z^2.
 3. Correlation fails near depth edges, on dark surfaces far away, on slanted surfaces, and outside the range.
 """
 
@@ -44,8 +44,9 @@ def _uniform(h):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def measure_depth(row0, row1, seed, fx, baseline, depth, cosine, color, disparity_noise, near, far, edge_px, dark, factor,
-                  out):  # type: ignore[no-untyped-def]  # fmt: skip
+def measure_depth(  # type: ignore[no-untyped-def]
+    row0, row1, seed, fx, baseline, depth, cosine, color, disparity_noise, near, far, edge_px, dark, factor, out
+):
     """Raw depth (uint16, `factor` units a metre, 0 = missing) of rows from the exact z-depth."""
     height, width = depth.shape
     shadow_right = np.empty(width, np.bool_)
@@ -110,6 +111,35 @@ def measure_depth(row0, row1, seed, fx, baseline, depth, cosine, color, disparit
                 measured = fx * baseline / disparity * factor + 0.5
                 if near * factor <= measured < 65535.0:
                     out[row, u] = int(measured)
+
+
+@_jit
+def dim(row0, row1, intrinsics, pose, depth, light, height, spots, color):  # type: ignore[no-untyped-def]
+    """Darken the colour of rows where a soft spot hides the lamp.
+
+    Each pixel's surface point is followed towards the lamp (direction ``light`` in the world) up to the plane
+    z = ``height``, where ``spots`` [K, 4] lie: x, y, radius (metres) and darkness.
+    """
+    fx, fy, cx, cy = intrinsics
+    width = color.shape[1]
+    for row in range(row0, row1):
+        for column in range(width):
+            z = depth[row, column]
+            x, y = (column - cx) / fx * z, (row - cy) / fy * z
+            wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
+            wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
+            wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+            up = (height - wz) / light[2]
+            if z <= 0.0 or up <= 0.0:
+                continue
+            wx, wy = wx + light[0] * up, wy + light[1] * up
+            factor = 1.0
+            for k in range(spots.shape[0]):
+                near = 1.0 - ((wx - spots[k, 0]) ** 2 + (wy - spots[k, 1]) ** 2) / (spots[k, 2] * spots[k, 2])
+                if near > 0.0:
+                    factor *= 1.0 - spots[k, 3] * min(1.0, 2.0 * near)
+            for ch in range(3):
+                color[row, column, ch] *= factor
 
 
 @_jit

@@ -12,7 +12,7 @@ from dynslam_bench.core.errors import SequenceError, did_you_mean
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
 
-RENDERER_VERSION = 2
+RENDERER_VERSION = 3
 """Raised whenever any pixel, pose or mask of any sequence changes; part of every digest and cache folder."""
 
 CAMERA = Camera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6, depth_factor=5000.0)
@@ -97,7 +97,7 @@ class DepthSensor(Settings):
     """The structured-light depth camera."""
 
     noise: bool = Field(True, description="False gives the exact depth, only rounded to the file's units")
-    disparity_noise_px: float = Field(0.07, ge=0, le=2, description="standard deviation of the disparity in pixels")
+    disparity_noise_px: float = Field(0.045, ge=0, le=2, description="standard deviation of the disparity in pixels")
     near_m: float = Field(0.5, ge=0.05, le=2, description="nothing nearer is measured")
     far_m: float = Field(5.0, ge=1, le=12, description="nothing further is measured; it fades out from 80 % of this")
     edge_px: int = Field(2, ge=0, le=8, description="half the window in which a depth edge spoils the correlation")

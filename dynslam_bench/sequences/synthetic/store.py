@@ -58,10 +58,10 @@ def is_intact_png(data: bytes) -> bool:
         if end > len(data):
             return False
         (stored,) = struct.unpack_from(">I", data, end - 4)
-        if zlib.crc32(data[position + 4 : end - 4]) != stored:
+        if zlib.crc32(data[position + 4 : end - 4]) != int(stored):
             return False
         if data[position + 4 : position + 8] == b"IEND":
-            return end == len(data)
+            return bool(end == len(data))
         position = end
     return False
 
@@ -112,7 +112,8 @@ class FrameStore:
         Raises:
             DynslamError: The folder cannot be written.
         """
-        for kind, image in zip(_KINDS, (masks, depth, rgb), strict=True):
+        images: dict[str, NDArray[Any]] = {"masks": masks, "depth": depth, "rgb": rgb}
+        for kind, image in images.items():
             write_atomic(self.path(kind, stamp), encode_png(image))
 
     def has(self, stamp: float) -> bool:

@@ -267,7 +267,7 @@ def hair(rng: np.random.Generator, size: int = 128) -> Image:
 
 
 def face(rng: np.random.Generator, size: int = 256) -> Image:
-    """A face, unrolled: u = 0.5 is the front, v from the crown (0) to the chin (1); to be tinted with the skin colour."""
+    """A face, unrolled: u = 0.5 is the front, v from the crown (0) to the chin (1); to be tinted with the skin."""
     image = np.tile(np.array([240.0, 236.0, 232.0]), (size, size, 1)) + 4 * fractal(rng, size, 8, 3)[..., None]
     yy, xx = (np.mgrid[0:size, 0:size] + 0.5) / size
 

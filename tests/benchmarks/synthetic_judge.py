@@ -1,0 +1,149 @@
+"""Judges the rendered twins by an outside system: the real ORB-SLAM3, repeated, with controls.
+
+Usage: python tests/benchmarks/synthetic_judge.py [ID ...] [--controls moving none frozen masked] [--runs 5]
+           [--cache DIR] [--out FILE.jsonl] [--table]
+
+Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
+step. `--table` only prints the Markdown table of the file. Controls: `none` renders the room without people, `frozen`
+with people and chairs frozen at their first pose, `masked` takes the moving sequence, removes the depth of people (and
+of chairs while they move) and fills their pixels smoothly from outside, so that no feature is left on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, RenderSettings, open_synthetic
+from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
+from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
+from dynslam_bench.trackers.protocol import TrackerContext
+
+VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
+CONTROLS = ("moving", "none", "frozen", "masked")
+
+
+def rmse(estimate: Trajectory, truth: Trajectory) -> float:
+    """RMSE of the positions after the best rigid alignment (Umeyama without scale), metres; common stamps only."""
+    index = {round(t, 6): i for i, t in enumerate(truth.timestamps)}
+    pairs = [(i, index[round(t, 6)]) for i, t in enumerate(estimate.timestamps) if round(t, 6) in index]
+    a = estimate.positions[[i for i, _ in pairs]]
+    b = truth.positions[[j for _, j in pairs]]
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.sqrt(((a @ rotation.T - b) ** 2).sum(1).mean()))
+
+
+def without(frame: Frame, hidden: np.ndarray) -> Frame:
+    """The frame with the hidden pixels' depth removed and their colours filled from around them."""
+    grown = cv2.dilate(hidden.astype(np.uint8), np.ones((15, 15), np.uint8))
+    keep = (1 - grown).astype(np.float32)
+    rgb, weight = frame.rgb * keep[..., None], keep
+    small = (80, 60)
+    fill = cv2.resize(rgb, small, interpolation=cv2.INTER_AREA)
+    mass = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
+    total, amount = np.zeros_like(fill), np.full_like(mass, 1e-6)
+    for sigma, trust in ((2, 1.0), (6, 1e-2), (20, 1e-4)):
+        total += trust * cv2.GaussianBlur(fill, (0, 0), sigma)
+        amount += trust * cv2.GaussianBlur(mass, (0, 0), sigma)
+    smooth = cv2.resize(total / amount[..., None], frame.rgb.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    alpha = cv2.GaussianBlur(grown.astype(np.float32), (0, 0), 3)[..., None]
+    alpha = np.maximum(alpha, cv2.erode(grown, np.ones((9, 9), np.uint8))[..., None])
+    mixed = np.clip(frame.rgb * (1 - alpha) + smooth * alpha + 0.5, 0, 255).astype(np.uint8)
+    return Frame(frame.index, frame.timestamp, mixed, np.where(grown > 0, np.float32(0), frame.depth))
+
+
+def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
+    """Several runs of ORB-SLAM3 side by side: each frame is read once and given to one run after the other."""
+    settings = RenderSettings(people={"none": "none", "frozen": "frozen"}.get(control, "moving"))
+    sequence = open_synthetic(id, cache, settings=settings)
+    sequence.render()
+    orbslam3 = OrbSlam3Settings(vocabulary=str(VOCABULARY))
+    trackers = [OrbSlam3(orbslam3, TrackerContext(sequence_id=id, fps=sequence.fps)) for _ in runs]
+    for tracker, run in zip(trackers, runs, strict=True):
+        tracker.reset(sequence.camera, rng=np.random.default_rng(run))
+    stamps: list[list[float]] = [[] for _ in runs]
+    poses: list[list[np.ndarray]] = [[] for _ in runs]
+    for index in range(len(sequence)):
+        frame = sequence[index]
+        if control == "masked":
+            masks = sequence.masks[index]
+            names = masks.class_names
+            ids = [k for k in names if names[k] == "person" or k in masks.moving]
+            frame = without(frame, np.isin(masks.instances, ids))
+        for k, tracker in enumerate(trackers):
+            result = tracker.track(frame)
+            if result.T_world_cam is not None and result.state == "ok":
+                stamps[k].append(frame.timestamp)
+                poses[k].append(result.T_world_cam)
+    truth = sequence.ground_truth
+    never = float(np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean()))
+    rows: list[dict[str, object]] = []
+    for k, tracker in enumerate(trackers):
+        final = tracker.finalize()
+        tracker.close()
+        rows.append({
+            "id": id, "control": control, "run": runs[k], "digest": sequence.digest(), "frames": len(sequence),
+            "final": round(rmse(final, truth), 5),
+            "online": round(rmse(Trajectory(np.array(stamps[k]), np.array(poses[k])), truth), 5),
+            "coverage": round(len(stamps[k]) / len(sequence), 4), "never": round(never, 4),
+        })  # fmt: skip
+    return rows
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: one line an id and control, the final and online ATE of every run."""
+    lines = ["| sequence | control | runs | final ATE, m: min / median / max | online: median | coverage | still |",
+             "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    groups: dict[tuple[str, str], list[dict]] = {}
+    for row in rows:
+        groups.setdefault((row["id"], row["control"]), []).append(row)
+    for (id, control), members in groups.items():
+        final = [m["final"] for m in members]
+        lines.append(
+            f"| {id} | {control} | {len(members)} | {min(final):.4f} / {np.median(final):.4f} / {max(final):.4f} "
+            f"| {np.median([m['online'] for m in members]):.4f} | {min(m['coverage'] for m in members):.3f} "
+            f"| {members[0]['never']:.3f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ids", nargs="*", default=list(SYNTHETIC_IDS))
+    parser.add_argument("--controls", nargs="+", default=list(CONTROLS), choices=CONTROLS)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_judge")
+    parser.add_argument("--out", type=Path, default=Path("synthetic_judge.jsonl"))
+    parser.add_argument("--table", action="store_true")
+    arguments = parser.parse_args()
+    rows = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
+    if not arguments.table:
+        for id in arguments.ids:
+            for control in arguments.controls:
+                digest = open_synthetic(
+                    id,
+                    None,
+                    settings=RenderSettings(people={"none": "none", "frozen": "frozen"}.get(control, "moving")),
+                ).digest()
+                done = {r["run"] for r in rows if (r["id"], r["control"], r["digest"]) == (id, control, digest)}
+                todo = sorted(set(range(arguments.runs)) - done)
+                new = judge(id, control, todo, arguments.cache) if todo else []
+                rows += new
+                with arguments.out.open("a") as file:
+                    file.writelines(json.dumps(row) + "\n" for row in new)
+                print(*new, sep="\n", file=sys.stderr, flush=True)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

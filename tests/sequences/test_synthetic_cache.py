@@ -1,0 +1,179 @@
+"""Rendered frames are the same in every process and come back from the cache as they went in."""
+
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
+from dynslam_bench.sequences.synthetic.people import draw_person
+from dynslam_bench.sequences.synthetic.room import plan_room
+from dynslam_bench.sequences.synthetic.scene import Scene
+from dynslam_bench.sequences.synthetic.script import write_script
+from dynslam_bench.sequences.synthetic.settings import RenderSettings, SyntheticId
+from dynslam_bench.sequences.synthetic.store import encode_png, is_intact_png
+
+HASHER = """
+import hashlib, sys
+from dynslam_bench.sequences.synthetic import open_synthetic
+sequence = open_synthetic(sys.argv[1], None, threads=int(sys.argv[2]))
+total = hashlib.sha256()
+for index in map(int, sys.argv[3:]):
+    frame = sequence[index]
+    for part in (frame.rgb, frame.depth, sequence.masks[index].instances, sequence.flow(index, max(index - 1, 0))):
+        total.update(part.tobytes())
+print(total.hexdigest())
+"""
+
+
+def frame_hash(frame) -> str:
+    return hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()
+
+
+def in_child(code: str, *arguments: object) -> str:
+    root = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+
+
+def test_pixels_are_the_same_across_processes_and_threads() -> None:
+    hashes = {in_child(HASHER, "synthetic/walking_halfsphere@3", threads, 0, 77) for threads in (1, 3)}
+    assert len(hashes) == 1
+    assert in_child(HASHER, "synthetic/walking_halfsphere@4", 1, 0, 77) not in hashes
+
+
+def test_the_first_read_is_what_later_reads_give(tmp_path: Path) -> None:
+    sequence = open_synthetic("synthetic/walking_xyz?frames=9", tmp_path, threads=1)
+    first = sequence[4]
+    assert list(tmp_path.rglob("rgb/*.png"))
+    other = pickle.loads(pickle.dumps(sequence))
+    again = other[4]
+    assert "renderer" not in vars(other), "the second read must not render"
+    assert np.array_equal(first.rgb, again.rgb)
+    assert np.array_equal(first.depth, again.depth) and again.depth.dtype == np.float32
+    assert np.array_equal(sequence.masks[4].instances, sequence.renderer.geometry(4)[1])
+    assert sequence[-1].index == 8
+    with pytest.raises(IndexError):
+        sequence[9]
+
+
+def test_frames_do_not_depend_on_the_length(tmp_path: Path) -> None:
+    short, long = (open_synthetic(f"synthetic/walking_rpy?frames={n}", tmp_path, threads=1) for n in (5, 600))
+    frame = short[3]
+    assert frame_hash(frame) == frame_hash(long[3])
+    assert short.store.folder == long.store.folder
+    assert np.array_equal(short.ground_truth.T_world_cam, long.ground_truth.T_world_cam[:5])
+    assert np.array_equal(short.timestamps, long.timestamps[:5])
+    assert short.digest() != long.digest()
+
+
+def test_ground_truth_and_digest_need_no_rendering(tmp_path: Path) -> None:
+    sequence = open_synthetic("synthetic/sitting_static", tmp_path)
+    assert len(sequence.ground_truth) == 600
+    assert sequence.digest() == open_synthetic("synthetic/sitting_static@0", None).digest()
+    assert not list(tmp_path.iterdir())
+    assert "renderer" not in vars(sequence)
+
+
+def test_rendering_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    calls: list[tuple[int, int]] = []
+
+    def stop_after_three(done: int, total: int) -> None:
+        calls.append((done, total))
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_synthetic("synthetic/sitting_xyz?frames=6", tmp_path, threads=1, progress=stop_after_three)
+    assert calls[-1] == (3, 6)
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("rgb/*.png")}
+    assert len(kept) >= 3
+    assert not [path for path in tmp_path.rglob(".*")], "no temporary file may stay"
+    folder = render_synthetic("synthetic/sitting_xyz?frames=6", tmp_path, threads=1)
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in kept.items())
+    assert len(list((folder / "rgb").glob("*.png"))) == 6
+    assert open_synthetic("synthetic/sitting_xyz?frames=6", tmp_path).render() == 0
+    for name in ("rgb", "depth", "masks"):
+        lines = [line.split() for line in (folder / f"{name}.txt").read_text().splitlines() if line[0] != "#"]
+        assert len(lines) == 6 and all((folder / file).is_file() for _, file in lines)
+    truth = np.loadtxt(folder / "groundtruth.txt")
+    assert truth.shape == (6, 8)
+    raw = cv2.imread(str(next((folder / "depth").glob("*.png"))), cv2.IMREAD_UNCHANGED)
+    assert raw.dtype == np.uint16
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "empty", "other", "gone"])
+@pytest.mark.parametrize("kind", ["rgb", "depth", "masks"])
+def test_damaged_files_are_rendered_again(tmp_path: Path, kind: str, damage: str) -> None:
+    sequence = open_synthetic("synthetic/walking_static?frames=2", tmp_path, threads=1)
+    frame, masks = sequence[1], sequence.masks[1]
+    path = sequence.store.path(kind, float(sequence.timestamps[1]))
+    data = bytearray(path.read_bytes())
+    if damage == "gone":
+        path.unlink()
+    else:
+        data[len(data) // 2] ^= 0x10
+        changed = {"cut": data[: len(data) // 2], "empty": b"", "other": encode_png(np.zeros((4, 4), np.uint8))}
+        path.write_bytes(bytes(changed.get(damage, data)))
+    fresh = open_synthetic("synthetic/walking_static?frames=2", tmp_path, threads=1)
+    assert frame_hash(fresh[1]) == frame_hash(frame)
+    assert np.array_equal(fresh.masks[1].instances, masks.instances)
+    assert fresh.render() <= 2
+    assert is_intact_png(path.read_bytes())
+
+
+def test_two_processes_may_render_the_same_sequence(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from dynslam_bench.sequences.synthetic import render_synthetic; "
+        "render_synthetic('synthetic/walking_static?frames=5', Path(sys.argv[1]), threads=1)"
+    )
+    root = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    children = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=environment) for _ in range(2)]
+    assert [child.wait() for child in children] == [0, 0]
+    sequence = open_synthetic("synthetic/walking_static?frames=5", tmp_path)
+    assert sequence.render() == 0
+    assert not [path for path in tmp_path.rglob(".*")]
+
+
+def test_a_cache_that_cannot_be_written_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    sequence = open_synthetic("synthetic/walking_xyz?frames=2", tmp_path / "file", threads=1)
+    with pytest.raises(DynslamError, match=r"^[^\n]*cannot (write|read)[^\n]*$"):
+        sequence[0]
+
+
+def test_tuning_and_held_out_instances_share_nothing() -> None:
+    def traits(instance: int) -> set[object]:
+        plan, script = plan_room(instance), write_script("walking", instance)
+        values: set[object] = {("back", plan.back_y), ("left", plan.left_x), ("desk", plan.desk_y, plan.desk_x)}
+        values |= {("path", k, p[0].x, p[0].y) for k, p in enumerate(script.people)}
+        values |= {("height", k, draw_person(instance, k).height) for k in range(2)}
+        return values
+
+    tune = set().union(*(traits(i) for i in range(0, 100)))
+    held_out = set().union(*(traits(i) for i in range(100, 200)))
+    assert not tune & held_out
+
+
+def test_textures_differ_between_instances() -> None:
+    def hashes(instance: int) -> dict[str, str]:
+        atlas = Scene(SyntheticId("walking", "xyz", instance), RenderSettings()).atlas()
+        ends = [*atlas.level_offset[1:, 0], len(atlas.texels)]
+        return {
+            name: hashlib.sha256(atlas.texels[atlas.level_offset[i, 0] : ends[i]].tobytes()).hexdigest()
+            for name, i in atlas.names.items()
+        }
+
+    first, second = hashes(7), hashes(107)
+    shared = [name for name in first if name in second]
+    assert "plaid:0" in shared and "poster:0" in shared
+    assert all(first[name] != second[name] for name in shared if name != "plain")

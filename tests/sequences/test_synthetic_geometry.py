@@ -1,0 +1,185 @@
+"""What is exact about a rendered frame: poses, depth, masks and flow agree with each other."""
+
+import numpy as np
+import pytest
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.sequences.frame import Sequence
+from dynslam_bench.sequences.synthetic import CAMERA, SYNTHETIC_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
+
+CLEAN = RenderSettings(
+    depth=DepthSensor(noise=False), color=ColorSensor(noise=False, shutter=0, exposure_drift=0, flicker=0)
+)
+V, U = np.mgrid[0:480, 0:640].astype(float)
+
+
+@pytest.fixture(scope="module")
+def walking():
+    return open_synthetic("synthetic/walking_xyz@1", None, threads=1)
+
+
+def reprojected(sequence, index: int, other: int) -> np.ndarray:
+    depth = sequence.exact_depth(index)
+    points = CAMERA.unproject(np.stack([U, V], -1), depth)
+    poses = sequence.ground_truth.T_world_cam
+    relative = se3.inverse(poses[other]) @ poses[index]
+    return CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3]) - np.stack([U, V], -1)
+
+
+@pytest.mark.parametrize("other", [101, 112])
+def test_static_flow_is_the_reprojection_of_the_exact_depth(walking, other: int) -> None:
+    still = walking.masks[100].instances == 0
+    assert still.mean() > 0.4
+    error = np.abs(walking.flow(100, other) - reprojected(walking, 100, other)).max(-1)
+    assert error[still].max() < 1e-3
+
+
+def test_moving_instances_do_not_follow_the_camera(walking) -> None:
+    index = 90  # both people walk
+    masks = walking.masks[index]
+    assert {1, 2} <= masks.moving
+    error = np.abs(walking.flow(index) - reprojected(walking, index, index + 1)).max(-1)
+    for person in (1, 2):
+        pixels = masks.instances == person
+        if pixels.sum() > 500:
+            assert np.median(error[pixels]) > 0.5
+
+
+def test_flow_and_back_returns(walking) -> None:
+    """Follow the flow to the next frame and back; where the point stays visible it returns to where it was."""
+    index = 90
+    forth, back = walking.flow(index), walking.flow(index + 1, index)
+    ids, then = walking.masks[index].instances, walking.masks[index + 1].instances
+    u, v = np.rint(U + forth[..., 0]).astype(int), np.rint(V + forth[..., 1]).astype(int)
+    inside = (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
+    u, v = u.clip(0, 639), v.clip(0, 479)
+    off = np.stack([U + forth[..., 0] - u, V + forth[..., 1] - v], -1)
+    error = np.linalg.norm(forth + back[v, u] + 0 * off, axis=-1)
+    for instance in (0, 1, 2):
+        here = inside & (ids == instance)
+        if here.sum() < 500:
+            continue
+        assert (then[v, u] == instance)[here].mean() > 0.9
+        assert np.median(error[here & (then[v, u] == instance)]) < 0.3
+
+
+def test_colours_follow_the_flow() -> None:
+    sequence = open_synthetic("synthetic/walking_xyz@0", None, settings=CLEAN, threads=1)
+    index = 72
+    flow, now, after = sequence.flow(index), sequence[index].rgb.astype(float), sequence[index + 1].rgb.astype(float)
+    x, y = U + flow[..., 0], V + flow[..., 1]
+    inside = (x > 1) & (x < 637) & (y > 1) & (y < 477)
+    x, y = x.clip(0, 638), y.clip(0, 478)
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    ax, ay = (x - x0)[..., None], (y - y0)[..., None]
+    seen = (1 - ay) * ((1 - ax) * after[y0, x0] + ax * after[y0, x0 + 1])
+    seen += ay * ((1 - ax) * after[y0 + 1, x0] + ax * after[y0 + 1, x0 + 1])
+    ids = sequence.masks[index].instances
+    for instance in (0, 1, 2):
+        pixels = inside & (ids == instance)
+        if pixels.sum() < 500:
+            continue
+        followed = np.median(np.abs(seen - now).mean(-1)[pixels])
+        assert followed < 4, f"instance {instance}"
+
+
+def test_hits_lie_on_their_surfaces(walking) -> None:
+    """Every hit point satisfies the implicit equation of its primitive (an independent formula)."""
+    renderer, scene = walking.renderer, walking.scene
+    snap = scene.snapshot(3.0)
+    hit, depth = renderer._geometry(snap, renderer._tiles(snap))
+    points = CAMERA.unproject(np.stack([U, V], -1), depth)[::3, ::3].reshape(-1, 3)
+    keys = hit[::3, ::3].ravel()
+    assert (keys >= 0).all()
+    prims, faces = keys >> 3, keys & 7
+    maps = snap.local[prims].reshape(-1, 3, 4)
+    local = np.einsum("nij,nj->ni", maps[:, :, :3], points) + maps[:, :, 3]
+    shape, kind = scene.shape[prims], scene.kind[prims]
+    box = kind != 1
+    axis = faces[box] >> 1
+    expected = np.where(kind[box] == 2, 0.0, shape[box, axis])
+    assert np.abs(np.abs(local[box, axis]) - expected).max() < 1e-9
+    cone = ~box
+    h, r1, r2 = shape[cone].T
+    p = local[cone]
+    radial = np.hypot(p[:, 0], p[:, 1])
+    # Signed distance of a round cone: the nearest point of its axis, in the slanted metric of its side.
+    sine = np.where(h > 0, (r1 - r2) / np.where(h > 0, h, 1), 0)
+    cosine = np.sqrt(1 - sine**2)
+    k = p[:, 2] * cosine - radial * sine
+    distance = np.where(k < 0, np.hypot(radial, p[:, 2]) - r1, radial * cosine + p[:, 2] * sine - r1)
+    distance = np.where((k > h * cosine) & (h > 0), np.hypot(radial, p[:, 2] - h) - r2, distance)
+    distance = np.where(h == 0, np.linalg.norm(p, axis=1) - r1, distance)
+    assert np.abs(distance).max() < 1e-8
+
+
+def test_depth_without_noise_is_exact_up_to_the_files_units() -> None:
+    sequence = open_synthetic("synthetic/sitting_rpy@2", None, settings=CLEAN, threads=1)
+    assert np.abs(sequence[40].depth - sequence.exact_depth(40)).max() <= 0.5 / 5000 + 1e-6
+
+
+def test_measured_depth_has_the_sensors_faults(walking) -> None:
+    measured, exact = walking[60].depth, walking.exact_depth(60)
+    valid = measured > 0
+    assert 0.6 < valid.mean() < 0.95
+    assert measured[valid].min() >= 0.5
+    assert measured.max() <= 5.4
+    # Quantised disparity: the spread grows with the square of the distance.
+    error = np.abs(measured - exact)
+    near, far = valid & (exact < 1.6), valid & (exact > 3.0)
+    assert np.median(error[near]) < 0.006
+    assert 2 < np.median(error[far]) / np.median(error[near]) < 14
+    disparity = CAMERA.fx * CAMERA.baseline_m / measured[valid & (exact > 3)]
+    assert np.abs(disparity * 8 - np.rint(disparity * 8)).max() < 0.02
+
+
+@pytest.mark.parametrize("name", SYNTHETIC_IDS)
+def test_every_twin_is_a_sequence_with_plausible_motion(name: str) -> None:
+    sequence = open_synthetic(name, None)
+    assert isinstance(sequence, Sequence)
+    truth = sequence.ground_truth
+    assert len(truth) == len(sequence) == 600
+    assert np.array_equal(truth.timestamps, sequence.timestamps)
+    assert all(se3.is_pose(pose, 1e-9) for pose in truth.T_world_cam[::50])
+    step = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    speed = np.linalg.norm(step[:, :3, 3], axis=1) * 30
+    turn = np.degrees(se3.rotation_angle(step)) * 30
+    assert speed.max() < 1.0
+    assert turn.max() < 90
+    extent = np.ptp(truth.positions, axis=0)
+    motion = name.rpartition("_")[2]
+    expected = {"xyz": (0.35, 0.6), "static": (0.0, 0.05), "rpy": (0.0, 0.05), "halfsphere": (0.2, 1.0)}[motion]
+    assert (extent >= expected[0]).all() and (extent <= expected[1]).all(), extent
+    if motion in ("rpy", "halfsphere"):
+        assert turn.mean() > 10
+
+
+def test_people_move_and_chairs_only_when_touched() -> None:
+    sequence = open_synthetic("synthetic/walking_static@4", None)
+    moving = [sequence.scene.moving(i) for i in range(0, 600, 5)]
+    assert moving[0] == frozenset()
+    share = {k: np.mean([k in ids for ids in moving]) for k in (1, 2, 3, 4)}
+    assert share[1] > 0.9 and share[2] > 0.9
+    assert 0 < share[3] < 0.4
+    assert share[4] < 0.4
+
+
+@pytest.mark.parametrize(("people", "persons"), [("frozen", True), ("none", False)])
+def test_controls(people: str, persons: bool) -> None:
+    sequence = open_synthetic("synthetic/walking_xyz", None, settings=RenderSettings(people=people), threads=1)
+    masks = sequence.masks[33]
+    assert masks.moving == frozenset()
+    assert np.isin(masks.instances, (1, 2)).any() == persons
+    still = open_synthetic("synthetic/walking_xyz", None, threads=1)
+    assert np.array_equal(still.ground_truth.T_world_cam, sequence.ground_truth.T_world_cam)
+    assert sequence.digest() != still.digest()
+
+
+@pytest.mark.parametrize("option", ["lighting_change", "glare", "shadow"])
+def test_lighting_options_change_colours_only(option: str, walking) -> None:
+    sequence = open_synthetic("synthetic/walking_xyz@1", None, settings=RenderSettings(**{option: True}), threads=1)
+    changed, plain = sequence[45], walking[45]
+    assert np.abs(changed.rgb.astype(int) - plain.rgb).mean() > 3
+    assert np.array_equal(sequence.exact_depth(45), walking.exact_depth(45))
+    assert np.array_equal(sequence.masks[45].instances, walking.masks[45].instances)
