@@ -1,1 +1,15 @@
-"""The command line."""
+"""The command line: every verb is a thin call of a public function; heavy modules load when a verb needs them."""
+
+from __future__ import annotations
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Entry point of ``dynslam-bench``.
+
+    Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed, 4 verification failed.
+    """
+    from .app import start
+
+    start()

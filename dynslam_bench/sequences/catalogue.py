@@ -118,7 +118,7 @@ def builtin_datasets() -> Iterator[DatasetSpec]:
         f"{__name__}:open_rendered",
         SYNTHETIC_IDS,
         "rendered rooms with exact poses, masks and flow",
-        "MIT",
+        "CC0-1.0",
         "dynslam-bench",
     )
 

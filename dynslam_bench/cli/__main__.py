@@ -1,0 +1,5 @@
+"""``python -m dynslam_bench.cli``."""
+
+from . import main
+
+main()

@@ -1,0 +1,90 @@
+"""The program: its verbs, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, Optional
+
+import typer
+
+from dynslam_bench import __version__
+from dynslam_bench.core.errors import DynslamError
+
+from . import caches, environments, evaluating, imports, presentation, running, segmenters, sequences, stored, trackers
+
+app = typer.Typer(
+    name="dynslam-bench",
+    help="Benchmark and tune visual SLAM in dynamic scenes.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+presentation.add_demo(app)
+app.add_typer(sequences.app, name="sequences")
+app.add_typer(trackers.app, name="trackers")
+running.add(app)
+app.add_typer(stored.app, name="runs")
+evaluating.add(app)
+presentation.add_report(app)
+imports.add(app)
+app.add_typer(segmenters.app, name="segmenter")
+app.add_typer(caches.app, name="cache")
+environments.add(app)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        sys.stdout.write(f"dynslam-bench {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        Optional[bool],  # noqa: UP045
+        typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
+    ] = None,
+) -> None:
+    """Benchmark and tune visual SLAM in dynamic scenes."""
+
+
+def start(arguments: list[str] | None = None) -> None:
+    """Run the program and exit.
+
+    Args:
+        arguments: What follows the program's name; by default the command line's.
+    """
+    arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
+    try:
+        app(args=arguments, prog_name="dynslam-bench")
+    except DynslamError as error:
+        _say(f"error: {error}")
+        sys.exit(1)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader went away, e.g. `| head`
+        sys.exit(0)
+    except KeyboardInterrupt:
+        _say("interrupted; what is finished is stored, the same command goes on from there")
+        sys.exit(130)
+
+
+def expand_lists(arguments: list[str]) -> list[str]:
+    """Let ``--seed 0 1 2`` stand for ``--seed 0 --seed 1 --seed 2``."""
+    expanded: list[str] = []
+    following = False
+    for argument in arguments:
+        if following and argument.isdigit() and expanded[-1] != "--seed":
+            expanded.append("--seed")
+        elif argument != "--seed" and not argument.isdigit():
+            following = False
+        if argument == "--seed":
+            following = True
+        expanded.append(argument)
+    return expanded
+
+
+def _say(text: str) -> None:
+    line = " ".join(text.split())
+    sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")

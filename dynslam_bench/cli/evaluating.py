@@ -1,0 +1,71 @@
+"""``eval`` and ``protocols list|compare``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import AsJson, ProtocolId
+from .output import write, write_json, write_table
+
+protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
+Estimate = Annotated[Path, typer.Argument(help="Trajectory file in TUM format.")]
+GroundTruth = Annotated[Path, typer.Argument(help="Ground-truth file in TUM format.")]
+
+
+def add(app: typer.Typer) -> None:
+    """Add the verbs."""
+    app.command("eval")(evaluate)
+    app.add_typer(protocols, name="protocols")
+
+
+def evaluate(
+    estimate: Estimate,
+    ground_truth: GroundTruth,
+    protocol: ProtocolId = "tum-rgbd/v1",
+    as_json: AsJson = False,
+) -> None:
+    """Evaluate a trajectory file against a ground-truth file."""
+    from dynslam_bench.evaluation import evaluate_files
+
+    result = evaluate_files(estimate, ground_truth, protocol)
+    if as_json:
+        write_json(result)
+        return
+    write(result.summary())
+    write(result.protocol)
+    write_table(("metric", "value"), list(result.metrics.items()))
+    for line in result.diagnostics:
+        write(line)
+
+
+@protocols.command("list")
+def list_(as_json: AsJson = False) -> None:
+    """List the protocols."""
+    from dynslam_bench.evaluation import PROTOCOLS
+
+    if as_json:
+        write_json([{"digest": each.digest(), **each.model_dump(mode="json")} for each in PROTOCOLS.values()])
+        return
+    write_table(
+        ("id", "digest", "meaning"), [(each.id, each.digest(), each.describe()) for each in PROTOCOLS.values()]
+    )  # fmt: skip
+
+
+@protocols.command()
+def compare(estimate: Estimate, ground_truth: GroundTruth, as_json: AsJson = False) -> None:
+    """Show how one trajectory scores under every protocol of the field."""
+    from dynslam_bench.evaluation import compare_protocols
+    from dynslam_bench.geometry.tum_file import read_tum
+
+    rows = compare_protocols(read_tum(estimate), read_tum(ground_truth))
+    if as_json:
+        write_json([asdict(row) for row in rows])
+        return
+    write_table(
+        ("metric", "protocol", "rmse (m)", "pairs", "note"),
+        [(row.metric, row.label, row.rmse_m, row.pairs, row.note) for row in rows],
+    )

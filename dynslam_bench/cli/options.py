@@ -1,0 +1,84 @@
+"""Options that several verbs share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+DataRoot = Annotated[
+    Optional[Path],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
+    typer.Option("--data-root", help="Folder of the sequences; default DYNSLAM_BENCH_DATA, else the user's cache."),
+]
+Results = Annotated[Path, typer.Option("--results", help="Results folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Write JSON for scripts.")]
+Camera = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml."),
+]
+Frames = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--frames", metavar="A:B", help="Part of the sequence: from frame A up to, not including, B."),
+]
+Stride = Annotated[int, typer.Option("--stride", min=1, help="Take every so many frames.")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda:N.")]
+Threads = Annotated[int, typer.Option("--threads", min=1, help="Threads of a run.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs at a time.")]
+Seeds = Annotated[
+    Optional[list[int]],  # noqa: UP045
+    typer.Option("--seed", help="Seeds, several allowed: --seed 0 1 2."),
+]
+Assignments = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--set", metavar="NAME=VALUE", help="Set a setting, e.g. epipolar.threshold_px=1.5; repeatable."),
+]
+SettingsFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--settings", help="TOML file of settings, e.g. a preset that `tune best` wrote."),
+]
+ProtocolId = Annotated[str, typer.Option("--protocol", help="How to evaluate; see `protocols list`.")]
+Retry = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--retry", help="Run again what ended so: failed, or a status."),
+]
+
+
+def gather_settings(assignments: list[str] | None, file: Path | None, preset: dict[str, Any]) -> dict[str, Any]:
+    """Overrides by dotted name: the preset's, then the file's, then the assignments'.
+
+    Raises:
+        SettingsError: The file cannot be read, or an assignment is none.
+    """
+    from dynslam_bench.core.settings import parse_assignments
+
+    merged = dict(preset)
+    if file is not None:
+        merged |= read_settings(file)
+    return merged | parse_assignments(assignments or ())
+
+
+def read_settings(file: Path) -> dict[str, Any]:
+    """Overrides by dotted name from a TOML file; a table ``[settings]`` holds them if there is one.
+
+    Raises:
+        SettingsError: The file cannot be read, or is no TOML.
+    """
+    from dynslam_bench.core.errors import SequenceError, SettingsError
+    from dynslam_bench.sequences._toml import read_toml
+
+    try:
+        document = read_toml(file.expanduser())
+    except SequenceError as error:
+        raise SettingsError(str(error)) from None
+    values = document.get("settings", document)
+    if not isinstance(values, dict):
+        raise SettingsError(f"'settings' in {file} is {values!r}, not a table")
+    return dict(_flatten(values))
+
+
+def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        found += _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
+    return found

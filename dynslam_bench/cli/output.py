@@ -1,0 +1,96 @@
+"""What commands write: tables for people, JSON for scripts, progress only where somebody watches."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+SOME_RUNS_FAILED = 3
+VERIFICATION_FAILED = 4
+
+
+def write(text: str = "") -> None:
+    """Write a line to standard output."""
+    sys.stdout.write(text + "\n")
+
+
+def note(text: str) -> None:
+    """Write a line for people to standard error, only if they watch."""
+    if sys.stderr.isatty():
+        sys.stderr.write(text + "\n")
+
+
+def write_json(value: Any) -> None:
+    """Write a value as JSON; pydantic models and paths included."""
+    sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
+
+
+def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, title: str = "") -> None:
+    """Write a table: framed and fitted on a terminal, aligned plain text in a pipe."""
+    cells = [[_text(value) for value in row] for row in rows]
+    if sys.stdout.isatty():
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(*columns, title=title or None)
+        for row in cells:
+            table.add_row(*(Text(cell) for cell in row))
+        Console().print(table)
+        return
+    widths = [max(len(row[i]) for row in [list(columns), *cells]) for i in range(len(columns))]
+    for row in [list(columns), *cells]:
+        write("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def write_fields(fields: Mapping[str, object]) -> None:
+    """Write names and values below each other; empty values are left out."""
+    shown = {name: _text(value) for name, value in fields.items() if value not in (None, "", (), [])}
+    width = max(map(len, shown), default=0)
+    for name, value in shown.items():
+        write(f"{name.ljust(width)}  {value}")
+
+
+@contextmanager
+def progress(label: str, *, unit: str = "") -> Iterator[Callable[[float, float | None], None]]:
+    """A progress bar on standard error where that is a terminal; elsewhere silence.
+
+    Yields:
+        Call it with what is done and the total, None if unknown.
+    """
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    amount = DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
+    columns = [TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn()]
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(label, total=1)
+        yield lambda done, total: bar.update(task, completed=done, total=total if total is not None else done + 1)
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return ", ".join(_text(part) for part in (sorted(value) if isinstance(value, (set, frozenset)) else value))
+    return str(value)
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "model_dump"):
+        return value.model_dump(mode="json")
+    if isinstance(value, (set, frozenset)):
+        return sorted(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)

@@ -1,0 +1,84 @@
+"""``report``, ``report compare`` and ``demo``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from .groups import DefaultGroup
+from .options import AsJson, Jobs, ProtocolId, Results
+from .output import SOME_RUNS_FAILED, write, write_json
+
+report = typer.Typer(
+    cls=DefaultGroup,
+    help="Reports of stored runs: `report [RESULTS...] [-o DIR]` is short for `report make ...`.",
+)
+
+
+def add_report(app: typer.Typer) -> None:
+    """Add ``report``."""
+    app.add_typer(report, name="report")
+
+
+def add_demo(app: typer.Typer) -> None:
+    """Add ``demo``."""
+    app.command()(demo)
+
+
+@report.command()
+def make(
+    results: Annotated[Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")] = None,  # noqa: UP045
+    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")] = None,  # noqa: UP045
+    protocol: ProtocolId = "tum-rgbd/v1",
+    reference: Annotated[str, typer.Option(help="Tracker that errors are divided by.")] = "orb-slam2",
+    title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
+    as_json: AsJson = False,
+) -> None:
+    """Make an offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it."""
+    from dynslam_bench.reports import build_report
+
+    folders = results or [Path("results")]
+    paths = build_report(folders, output or folders[0] / "report", protocol=protocol, reference=reference, title=title)
+    if as_json:
+        write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})
+    else:
+        write(str(paths.html))
+
+
+@report.command()
+def compare(
+    a: Annotated[Path, typer.Argument(help="Results folder, or folder of a report.")],
+    b: Annotated[Path, typer.Argument(help="The other one.")],
+    protocol: ProtocolId = "tum-rgbd/v1",
+    as_json: AsJson = False,
+) -> None:
+    """Compare two results folders on the runs that both have."""
+    from dynslam_bench.reports import compare as compare_results
+
+    found = compare_results(a, b, protocol=protocol)
+    if as_json:
+        overall = {name: vars(interval) for name, interval in found.overall.items()}
+        write_json({"overall": overall, "only_a": found.only_a, "only_b": found.only_b})
+        return
+    write(found.to_markdown().rstrip())
+    if found.only_a or found.only_b:
+        write(f"\nonly in {a}: {found.only_a} runs; only in {b}: {found.only_b} runs")
+
+
+def demo(
+    results: Results = Path("results"),
+    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 150,
+    jobs: Jobs = 2,
+) -> None:
+    """Run trackers on rendered sequences and report them: the whole way, with no download."""
+    from .demo import run_demo
+
+    outcome = run_demo(results, frames=frames, jobs=jobs)
+    write()
+    write(outcome.leaderboard)
+    write()
+    write(f"report: {outcome.report}")
+    if outcome.failed:
+        raise typer.Exit(SOME_RUNS_FAILED)

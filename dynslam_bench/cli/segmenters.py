@@ -1,0 +1,90 @@
+"""``segmenter train|evaluate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .options import AsJson, Assignments, Device, SettingsFile, Threads, gather_settings
+from .output import progress, write, write_fields, write_json, write_table
+
+app = typer.Typer(help="Train and measure segmentation networks.", no_args_is_help=True)
+
+
+@app.command()
+def train(
+    output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
+    assignments: Assignments = None,
+    settings: SettingsFile = None,
+    data_cache: Annotated[Optional[Path], typer.Option(help="Where prepared images are kept.")] = None,  # noqa: UP045
+    device: Device = "auto",
+    threads: Threads = 1,
+    resume: Annotated[bool, typer.Option(help="Go on where an earlier call stopped.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Train a Mask R-CNN with a cross-layer feature pyramid; a call that was interrupted goes on."""
+    from dynslam_bench.core.settings import apply_overrides
+    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.segmentation.train import TrainProgress
+    from dynslam_bench.segmentation.train import train as train_network
+    from dynslam_bench.segmentation.train_settings import TrainSettings
+
+    chosen = apply_overrides(TrainSettings(), gather_settings(assignments, settings, {}))
+    with progress("training") as advance:
+
+        def told(state: TrainProgress) -> None:
+            advance(state.done, state.total)
+
+        result = train_network(
+            chosen, output, data_cache=data_cache, device=resolve_device(device), threads=threads, resume=resume,
+            progress=told,
+        )  # fmt: skip
+    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou, "ended": result.stopped}
+    if as_json:
+        write_json(facts)
+    else:
+        write_fields(facts)
+
+
+@app.command()
+def evaluate(
+    data: Annotated[str, typer.Argument(help="synthetic:..., sequence:ID, coco:FILE[:IMAGES] or yolo:DIR.")],
+    source: Annotated[str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")] = "embedded",
+    assignments: Assignments = None,
+    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="JSON file of the scores.")] = None,  # noqa: UP045
+    limit: Annotated[Optional[int], typer.Option(min=1, help="Only so many images.")] = None,  # noqa: UP045
+    min_area: Annotated[int, typer.Option(min=0, help="Leave out objects with fewer pixels.")] = 0,
+    device: Device = "auto",
+    threads: Threads = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Measure a segmenter's masks against labels."""
+    from dynslam_bench.core.settings import apply_overrides
+    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.segmentation.evaluate import evaluate_segmenter
+    from dynslam_bench.segmentation.settings import SegmentationSettings
+
+    settings = apply_overrides(
+        SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})}
+    )  # fmt: skip
+    with progress(data) as advance:
+
+        def told(done: int, total: int) -> None:
+            advance(done, total)
+
+        score = evaluate_segmenter(
+            settings, data, output=output, device=resolve_device(device), threads=threads, min_area=min_area,
+            limit=limit, progress=told,
+        )  # fmt: skip
+    if as_json:
+        write_json(score)
+        return
+    values: dict[str, Any] = score.model_dump(mode="json")
+    classes = values.pop("classes")
+    write_fields(values)
+    if classes:
+        write()
+        columns = sorted({key for quality in classes.values() for key in quality})
+        write_table(("class", *columns), [(name, *(row.get(key) for key in columns)) for name, row in classes.items()])

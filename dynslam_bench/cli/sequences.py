@@ -1,0 +1,130 @@
+"""``sequences list|info|fetch|verify|render``."""
+
+from __future__ import annotations
+
+import fnmatch
+from dataclasses import asdict
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .options import AsJson, Camera, DataRoot
+from .output import VERIFICATION_FAILED, note, progress, write, write_fields, write_json, write_table
+
+app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_(
+    pattern: Annotated[str, typer.Argument(help="Which, e.g. 'tum/fr3/*'.")] = "*",
+    tag: Annotated[Optional[str], typer.Option(help="Only static, low-dynamic or high-dynamic ones.")] = None,  # noqa: UP045
+    here: Annotated[bool, typer.Option("--here", help="Only those on this machine.")] = False,
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """List all sequences and whether they are on this machine."""
+    from dynslam_bench.sequences.listing import summaries
+
+    found = [
+        each
+        for each in summaries(data_root=data_root)
+        if fnmatch.fnmatch(each.id, pattern) and (tag is None or tag in each.tags) and (each.here or not here)
+    ]
+    if as_json:
+        write_json([asdict(each) for each in found])
+        return
+    columns = ("sequence", "here", "size", "tags", "split", "ground truth", "license")
+    write_table(
+        columns,
+        [(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.license) for each in found],
+    )
+
+
+@app.command()
+def info(
+    name: Annotated[str, typer.Argument(help="Id, published folder name or path.")],
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what is known of a sequence, and what it holds if it is on this machine."""
+    from dynslam_bench.sequences.listing import describe
+
+    found: dict[str, Any] = describe(name, data_root=data_root, camera=camera)
+    if as_json:
+        write_json(found)
+    else:
+        write_fields(found)
+
+
+@app.command()
+def fetch(
+    names: Annotated[list[str], typer.Argument(help="Ids or patterns such as 'bonn/*'.")],
+    data_root: DataRoot = None,
+    url: Annotated[Optional[str], typer.Option(help="A mirror's address of the archive.")] = None,  # noqa: UP045
+    checksum: Annotated[bool, typer.Option(help="Refuse an archive whose checksum is not the known one.")] = True,
+    keep_archive: Annotated[bool, typer.Option("--keep-archive", help="Keep the archive, too.")] = False,
+) -> None:
+    """Download public sequences; a call that was cut short goes on where it stopped."""
+    from dynslam_bench.sequences.download import Progress
+    from dynslam_bench.sequences.fetch import fetch as fetch_one
+    from dynslam_bench.sequences.listing import expand
+
+    for name in expand(names):
+        with progress(name, unit="bytes") as advance:
+
+            def report(state: Progress, advance: Any = advance) -> None:
+                advance(state.done, state.total)
+
+            place = fetch_one(
+                name, data_root=data_root, progress=report, checksum=checksum, keep_archive=keep_archive, url=url
+            )
+        write(str(place))
+
+
+@app.command()
+def verify(
+    names: Annotated[list[str], typer.Argument(help="Ids, patterns or paths.")],
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Decode every frame, and compare every file with the checksum taken when it was fetched."""
+    from dynslam_bench.sequences.fetch import verify as verify_one
+    from dynslam_bench.sequences.listing import expand
+
+    reports = []
+    for name in expand(names):
+        with progress(name) as advance:
+            reports.append(verify_one(name, data_root=data_root, progress=advance))
+    if as_json:
+        write_json([{**asdict(report), "ok": report.ok} for report in reports])
+    else:
+        for report in reports:
+            compared = (
+                "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
+            )
+            verdict = "ok" if report.ok else f"{len(report.faults)} faults"
+            write(f"{report.id}: {verdict}, {report.frames} frames, {compared}")
+            if report.dropped is not None:
+                write(f"  {report.dropped.describe()}")
+            for fault in report.faults:
+                write(f"  {fault}")
+    if not all(report.ok for report in reports):
+        raise typer.Exit(VERIFICATION_FAILED)
+
+
+@app.command()
+def render(
+    names: Annotated[list[str], typer.Argument(help="Such as 'synthetic/walking_xyz@0?frames=600'.")],
+    data_root: DataRoot = None,
+    threads: Annotated[Optional[int], typer.Option(min=1, help="Frames rendered at a time.")] = None,  # noqa: UP045
+) -> None:
+    """Render sequences now, in place of when they are first read."""
+    from dynslam_bench.sequences.roots import find_data_root
+    from dynslam_bench.sequences.synthetic import render_synthetic
+
+    for name in names:
+        with progress(name) as advance:
+            folder = render_synthetic(name, find_data_root(data_root), threads=threads, progress=advance)
+        note(f"{name} is in")
+        write(str(folder))

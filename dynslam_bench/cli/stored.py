@@ -1,0 +1,100 @@
+"""``runs list|show|rm``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .options import AsJson, ProtocolId, Results
+from .output import write, write_fields, write_json, write_table
+from .running import show_runs
+
+app = typer.Typer(help="Stored runs.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_(
+    results: Results = Path("results"),
+    status: Annotated[Optional[str], typer.Option(help="Only runs that ended so, e.g. ok or crashed.")] = None,  # noqa: UP045
+    protocol: ProtocolId = "tum-rgbd/v1",
+    as_json: AsJson = False,
+) -> None:
+    """List the runs of a results folder, oldest first."""
+    from dynslam_bench.runs import RunStore
+
+    store = RunStore(results)
+    records, unreadable = store.all()
+    show_runs(
+        [record for record in records if status in (None, record.status)], store, protocol, as_json=as_json
+    )  # fmt: skip
+    for bad in unreadable:
+        sys.stderr.write(f"unreadable: {bad.path}: {bad.reason}\n")
+
+
+@app.command()
+def show(
+    run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",
+    results: Results = Path("results"),
+    protocol: ProtocolId = "tum-rgbd/v1",
+    as_json: AsJson = False,
+) -> None:
+    """Show everything about a run."""
+    from dynslam_bench.runs import RunStore, score
+
+    store = RunStore(results)
+    record = store.read(run)
+    metrics = score(store, record, protocol)
+    if as_json:
+        write_json({"record": record, "metrics": metrics, "folder": store.folder(record.run_id)})
+        return
+    facts: dict[str, Any] = {
+        "run": record.run_id, "folder": store.folder(record.run_id), "status": record.status, "reason": record.reason,
+        "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
+        "sequence": record.sequence.id, "frames": record.n_frames, "tracked": record.n_tracked,
+        "lost": record.n_lost, "coverage": record.coverage, "seed": record.seed, "masks": record.segmentation,
+        "device": record.device, "threads": record.threads, "started": record.started, "wall_s": record.wall_s,
+        "peak_memory_mb": record.peak_memory_mb, "keyframes": record.keyframes, "map_points": record.map_points,
+        "overrides": [f"{name}={value}" for name, value in record.overrides.items()], "notes": record.notes,
+        "command": " ".join(record.command),
+    }  # fmt: skip
+    write_fields(facts)
+    if record.timings:
+        write()
+        rows = [
+            (name, 1000 * stage.median_s, 1000 * stage.p95_s, 1000 * stage.mean_s)
+            for name, stage in record.timings.items()
+        ]
+        write_table(("stage", "median ms", "p95 ms", "mean ms"), rows)
+    for which, evaluation in (("online", metrics.online), ("final", metrics.final)):
+        write()
+        if evaluation is None:
+            write(f"{which}: {metrics.reasons.get(which, 'not evaluated')}")
+            continue
+        write(f"{which}: {evaluation.summary()}")
+        write_table(("metric", "value"), sorted(evaluation.metrics.items()))
+        for line in evaluation.diagnostics:
+            write(f"  {line}")
+
+
+@app.command()
+def rm(
+    runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,  # noqa: UP045
+    results: Results = Path("results"),
+    failed: Annotated[bool, typer.Option("--failed", help="All runs that failed.")] = False,
+) -> None:
+    """Delete runs and their metrics."""
+    from dynslam_bench.core.errors import RunError
+    from dynslam_bench.runs import RunStore
+
+    store = RunStore(results)
+    chosen = [store.find(run) for run in runs or ()]
+    if failed:
+        chosen += [record.run_id for record in store.all()[0] if record.failed]
+    if not chosen and not failed:
+        raise RunError("no run was named", "name ids, or --failed")
+    for run_id in dict.fromkeys(chosen):
+        store.remove(run_id)
+        write(run_id)

@@ -1,0 +1,120 @@
+"""``trackers list|info|doctor|test|new``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from .options import AsJson, Assignments, SettingsFile, gather_settings
+from .output import VERIFICATION_FAILED, write, write_fields, write_json, write_table
+
+app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_(as_json: AsJson = False) -> None:
+    """List all trackers, those included that lack a package."""
+    from dynslam_bench.trackers import TRACKERS
+
+    rows: list[dict[str, Any]] = [
+        {
+            "id": found.spec.id,
+            "label": found.spec.label,
+            "provenance": found.spec.provenance,
+            "ranked": found.spec.ranked,
+            "available": not found.spec.missing(),
+            "install": found.spec.missing(),
+            "source": found.source,
+            "summary": found.spec.summary,
+        }
+        for found in TRACKERS.all()
+    ]
+    if as_json:
+        write_json(rows)
+        return
+    columns = ("id", "provenance", "ranked", "available", "summary")
+    write_table(columns, [[row[column] for column in columns] for row in rows])
+
+
+@app.command()
+def info(
+    tracker: Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show a tracker's description, its settings and its published numbers."""
+    from dynslam_bench.core.settings import flatten, settings_table
+    from dynslam_bench.trackers import TRACKERS
+
+    spec = TRACKERS.get(tracker)
+    facts: dict[str, Any] = {
+        "id": spec.id, "label": spec.label, "summary": spec.summary, "provenance": spec.provenance,
+        "ranked": spec.ranked, "sensors": spec.sensors, "deterministic": spec.deterministic, "version": spec.version,
+        "license": spec.license, "citation": spec.citation, "entry_point": spec.entry_point,
+        "install": spec.missing(), "presets": list(spec.presets), "assumptions": list(spec.assumptions),
+        "remarks": spec.remarks,
+    }  # fmt: skip
+    if as_json:
+        write_json({**facts, "settings": flatten(spec.settings()), "reported": dict(spec.reported)})
+        return
+    write_fields(facts)
+    write()
+    write(settings_table(spec.settings).rstrip())
+    if spec.reported:
+        write()
+        rows = [(name, metric, value) for name, row in spec.reported.items() for metric, value in row.items()]
+        write_table(("sequence", "reported metric", "value"), rows)
+
+
+@app.command()
+def doctor(as_json: AsJson = False) -> None:
+    """Say which plug-ins are not available, and why."""
+    from dynslam_bench.testing.doctor import diagnose
+
+    found = diagnose()
+    if as_json:
+        write_json([each.__dict__ for each in found])
+        return
+    if not found:
+        write("all plug-ins are available")
+    for each in found:
+        write(f"{each.kind}: {each.name}: {each.reason}")
+
+
+@app.command()
+def test(
+    tracker: Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.")],
+    assignments: Assignments = None,
+    settings: SettingsFile = None,
+    frames: Annotated[int, typer.Option(min=2, help="Frames of each check.")] = 6,
+    as_json: AsJson = False,
+) -> None:
+    """Check that a tracker keeps its contract."""
+    from dynslam_bench.testing import tracker_report
+
+    report = tracker_report(tracker, settings=gather_settings(assignments, settings, {}), frames=frames)
+    if as_json:
+        write_json({"subject": report.subject, "ok": report.ok, "checks": [check.__dict__ for check in report.checks]})
+    else:
+        for check in report.checks:
+            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""))
+        write(f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed")
+    if not report.ok:
+        raise typer.Exit(VERIFICATION_FAILED)
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="Name of the tracker, e.g. my-slam.")],
+    folder: Annotated[Path, typer.Option("--dir", help="Where to put the file.")] = Path(),
+) -> None:
+    """Write a tracker to start from: one file that already runs."""
+    from dynslam_bench.testing.template import write_tracker_template
+
+    path = write_tracker_template(name, folder)
+    shown = path if path.is_absolute() or str(path).startswith(".") else f"./{path}"
+    write(str(path))
+    write(f"check it:  dynslam-bench trackers test {shown}:SPEC")
+    write(f"run it:    dynslam-bench run {shown}:SPEC synthetic/walking_xyz --frames 0:100")
+    write(f'list it:   export DYNSLAM_BENCH_PLUGINS="trackers={path.absolute()}:SPEC"')
