@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 def patch_half_widths(radius: int) -> NDArray[np.int64]:
     """Half widths of the rows of a disc: row ``dy`` spans ``-w[|dy|] .. w[|dy|]``, int64 ``[radius + 1]``."""
     rows = np.arange(radius + 1)
-    return np.rint(np.sqrt(radius * radius - rows * rows)).astype(np.int64)
+    return np.asarray(np.rint(np.sqrt(radius * radius - rows * rows)), dtype=np.int64)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -28,7 +28,7 @@ def _orientations(
             w = half_widths[abs(dy)]
             row = 0
             for dx in range(-w, w + 1):
-                value = np.int64(image[y0 + dy, x0 + dx])
+                value = int(image[y0 + dy, x0 + dx])
                 m10 += dx * value
                 row += value
             m01 += dy * row

@@ -55,7 +55,7 @@ def distance(a: Words, b: Words) -> int:
         v = v - ((v >> _ONE) & _M1)
         v = (v & _M2) + ((v >> _TWO) & _M2)
         v = (v + (v >> _FOUR)) & _M4
-        total += np.int64((v * _H01) >> _TOP)
+        total += int((v * _H01) >> _TOP)
     return total
 
 

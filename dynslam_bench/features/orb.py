@@ -43,8 +43,7 @@ class OrbExtractor:
                 f"fast_threshold_min is {s.fast_threshold_min}, above fast_threshold {s.fast_threshold}",
                 "lower fast_threshold_min",
             )
-        self._first = cv2.FastFeatureDetector.create(s.fast_threshold, True)
-        self._second = cv2.FastFeatureDetector.create(s.fast_threshold_min, True)
+        self._detector = cv2.FastFeatureDetector.create(s.fast_threshold_min, True)
         self._describer = cv2.ORB.create(
             nfeatures=s.n_features, scaleFactor=s.scale_factor, nlevels=s.levels, edgeThreshold=EDGE,
             firstLevel=0, WTA_K=2, patchSize=2 * PATCH_RADIUS + 1, fastThreshold=s.fast_threshold_min,
@@ -81,18 +80,13 @@ class OrbExtractor:
         inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
         cell = self.settings.cell_px
         columns, rows = -(-inner.shape[1] // cell), -(-inner.shape[0] // cell)
-        xy, response = _detect(self._first, inner)
+        xy, response = _detect(self._detector, inner)
         cells = _cell_of(xy, cell, columns)
-        filled = np.bincount(cells, minlength=rows * columns) > 0
-        if (not filled.all()) and self.settings.fast_threshold_min < self.settings.fast_threshold:
-            weak_xy, weak_response = _detect(self._second, inner)
-            weak_cells = _cell_of(weak_xy, cell, columns)
-            extra = ~filled[weak_cells]
-            xy = np.concatenate([xy, weak_xy[extra]])
-            response = np.concatenate([response, weak_response[extra]])
-            cells = np.concatenate([cells, weak_cells[extra]])
-        chosen = spread(cells, response, xy, quota)
-        return xy[chosen] + np.float32(EDGE - 3), response[chosen]
+        strong = response >= self.settings.fast_threshold
+        filled = np.zeros(rows * columns, bool)
+        filled[cells[strong]] = True
+        chosen = spread(cells, response, strong | ~filled[cells], quota)
+        return xy[chosen] + np.float32(EDGE - 3), response[chosen].astype(np.float32)
 
     def _describe(
         self,
@@ -107,8 +101,8 @@ class OrbExtractor:
             )  # fmt: skip
         scales = self.settings.scale_factor ** np.arange(len(parts))
         octave = np.repeat(np.arange(len(parts), dtype=np.int32), [len(xy) for xy, _, _ in parts])
-        xy = np.concatenate([xy for xy, _, _ in parts]).astype(np.float64)
-        xy = (xy * scales[octave][:, None]).astype(np.float32)
+        level_xy = np.concatenate([xy for xy, _, _ in parts]).astype(np.float64)
+        xy = np.asarray(level_xy * scales[octave][:, None], dtype=np.float32)
         response = np.concatenate([part for _, part, _ in parts])
         angle = np.concatenate([part for _, _, part in parts])
         size = (2 * PATCH_RADIUS + 1) * scales[octave]
@@ -137,38 +131,39 @@ def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]
 
 
 def spread(
-    cells: NDArray[np.int64], response: NDArray[np.float32], xy: NDArray[np.float32], quota: int
+    cells: NDArray[np.int64], response: NDArray[np.int16], allowed: NDArray[np.bool_], quota: int
 ) -> NDArray[np.int64]:
     """Choose points so that all cells get their share: first every cell's strongest, then the second strongest, ...
 
     Args:
         cells: Cell of each point ``[N]``.
-        response: Strength of each point ``[N]``.
-        xy: Positions ``[N, 2]``, to break ties independently of the order of detection.
+        response: Strength of each point ``[N]``; equal strengths keep their order.
+        allowed: bool ``[N]``, points that may be chosen.
         quota: How many points to choose at most.
 
     Returns:
-        Indices of the chosen points, at most `quota`, in order of rank and strength.
+        Indices of the chosen points, at most `quota`, in order of rank within the cell, then of strength.
     """
-    order = np.lexsort((xy[:, 0], xy[:, 1], -response, cells))
-    sorted_cells = cells[order]
-    starts = np.flatnonzero(np.r_[True, sorted_cells[1:] != sorted_cells[:-1]]) if len(order) else np.zeros(0, int)
-    lengths = np.diff(np.r_[starts, len(order)])
-    rank = np.arange(len(order)) - np.repeat(starts, lengths)
-    best = np.lexsort((-response[order], rank))[:quota]
-    return np.asarray(order[best], dtype=np.int64)
+    index = np.flatnonzero(allowed)
+    index = index[np.argsort(-response[index], kind="stable")]
+    by_cell = np.argsort(cells[index], kind="stable")
+    sorted_cells = cells[index][by_cell]
+    first = np.searchsorted(sorted_cells, sorted_cells, side="left")
+    rank = np.empty(len(index), np.int16)
+    rank[by_cell] = np.arange(len(index)) - first
+    return np.asarray(index[np.argsort(rank, kind="stable")[: max(quota, 0)]], dtype=np.int64)
 
 
 def _detect(
     detector: cv2.FastFeatureDetector, image: NDArray[np.uint8]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.int16]]:
     if min(image.shape) < 7:
-        return np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+        return np.zeros((0, 2), np.float32), np.zeros(0, np.int16)
     found = detector.detect(image)
     xy = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32).reshape(-1, 2)
-    return xy, np.array([point.response for point in found], dtype=np.float32)
+    return xy, np.array([point.response for point in found], dtype=np.int16)
 
 
 def _cell_of(xy: NDArray[np.float32], cell: int, columns: int) -> NDArray[np.int64]:
-    column, row = (xy // cell).astype(np.int64).T if len(xy) else np.zeros((2, 0), np.int64)
-    return row * columns + column
+    index = (xy * np.float32(1.0 / cell)).astype(np.int64)
+    return np.asarray(index[:, 1] * columns + index[:, 0])

@@ -159,8 +159,8 @@ def refresh(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def project(
     pose: Array, candidates: NDArray[np.int64], position: Array, normal: Array, far: Array,
-    fx: float, fy: float, cx: float, cy: float, bf: float, width: float, height: float, scale_factor: float, levels: int,
-    min_cosine: float, wide: float,
+    fx: float, fy: float, cx: float, cy: float, bf: float, width: float, height: float, scale_factor: float,
+    levels: int, min_cosine: float, wide: float,
 ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:  # fmt: skip
     """The candidate points that the camera should see: in the image, at a fit distance, from a fit side.
 

@@ -18,8 +18,8 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from .history import History
 from .map import Map
 from .mapping import LocalMapper
-from .observation import Observations, observe
 from .motion import MotionState, pose_covariance, smooth
+from .observation import Observations, observe
 from .outputs import KeyframeRecord, MapOutputs
 from .relocalisation import locate
 from .result import TrackResult
@@ -133,9 +133,14 @@ class RgbdBackend:
             pose = self._localise(frame, seen, timings, stats)
         timings["tracking"] = perf_counter() - begin - timings["mapping"] - timings["bundle_adjustment"]
         return TrackResult(
-            None if pose is None else se3.inverse(pose), self.state, self._stats(frame, keep, dynamic_mask, stats),
-            timings, dynamic_mask, frame.keypoints.xy, np.asarray(keep, bool),
-        )  # fmt: skip
+            None if pose is None else se3.inverse(pose),
+            self.state,
+            self._stats(frame, keep, dynamic_mask, stats),
+            timings,
+            dynamic_mask,
+            frame.keypoints.xy,
+            np.asarray(keep, bool),
+        )
 
     def _initialise(
         self, frame: FrameBundle, seen: Observations, timings: dict[str, float], stats: dict[str, float]
@@ -163,9 +168,13 @@ class RgbdBackend:
         residual = 0.0
         if matches is not None:
             found, in_view = match_map(
-                self.world, seen, pose, matches,
-                local_points(self.world, matches, self.settings.tracking.local_map), self.settings.tracking,
-            )  # fmt: skip
+                self.world,
+                seen,
+                pose,
+                matches,
+                local_points(self.world, matches, self.settings.tracking.local_map),
+                self.settings.tracking,
+            )
             matches = matches.joined(found)
             mapped = matches.select(matches.point >= 0)
             if len(mapped) >= 2 * self.settings.tracking.min_inliers:
@@ -289,9 +298,12 @@ class RgbdBackend:
         for slot in world.keyframes[::-1][: max(limit, 0)].tolist():
             n = int(world.kf_count[slot])
             keypoints = Keypoints(
-                world.kf_raw[slot, :n], world.kf_octave[slot, :n].astype(np.int32), world.kf_angle[slot, :n],
-                world.kf_response[slot, :n], world.kf_words[slot, :n].view(np.uint8),
-            )  # fmt: skip
+                world.kf_raw[slot, :n],
+                world.kf_octave[slot, :n].astype(np.int32),
+                world.kf_angle[slot, :n],
+                world.kf_response[slot, :n],
+                world.kf_words[slot, :n].view(np.uint8),
+            )
             views.append(
                 KeyframeView(
                     world.T_world_cam(slot),
@@ -300,7 +312,7 @@ class RgbdBackend:
                     world.kf_z[slot, :n],
                     self._depth_images.get(slot),
                     float(world.kf_stamp[slot]),
-                )  # fmt: skip
+                )
             )
         return tuple(views)
 
@@ -334,7 +346,7 @@ class RgbdBackend:
                 world.T_world_cam(slot),
                 int(world.kf_count[slot]),
                 int(np.count_nonzero(world.kf_point[slot, : world.kf_count[slot]] >= 0)),
-            )  # fmt: skip
+            )
             for slot in slots.tolist()
         )
         points = world.points

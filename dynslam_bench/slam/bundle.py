@@ -51,7 +51,7 @@ class BundleProblem:
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """Refined poses ``[P, 4, 4]`` and points ``[Q, 3]``, which observations fit, and the robust cost before and after."""
+    """Refined poses ``[P, 4, 4]`` and points ``[Q, 3]``, which observations fit, robust cost before and after."""
 
     poses: Array
     points: Array
@@ -91,8 +91,8 @@ def _cost(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _step(
-    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array, right: Array,
-    info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
+    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
     chi2: Array, new_poses: Array, new_points: Array,
 ) -> bool:  # fmt: skip
     """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
@@ -183,11 +183,11 @@ def _step(
             base = 6 * c
             for m in range(6):
                 g[base + m] -= y[m, 0] * b[i, 0] + y[m, 1] * b[i, 1] + y[m, 2] * b[i, 2]
-            for l in range(start[i], start[i + 1]):
-                c2 = obs_pose[l]
+            for k2 in range(start[i], start[i + 1]):
+                c2 = obs_pose[k2]
                 if c2 > c:
                     continue
-                wl = w[l]
+                wl = w[k2]
                 other = 6 * c2
                 for m in range(6):
                     y0, y1, y2 = y[m, 0], y[m, 1], y[m, 2]
@@ -215,8 +215,9 @@ def _step(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _adjust(
-    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array, right: Array,
-    info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, iterations: int, chi2: Array,
+    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,
+    iterations: int, chi2: Array,
 ) -> tuple[Array, Array, float, float]:  # fmt: skip
     cost = _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, chi2)
     before = cost

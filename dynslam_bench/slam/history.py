@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.geometry import se3
-
 from .map import Map
 
 Array = NDArray[np.float64]
@@ -20,11 +18,12 @@ class History:
         self._stamp = np.zeros(64)
         self._reference = np.zeros(64, np.int32)
         self._relative = np.zeros((64, 4, 4))
+        self._information = np.zeros((64, 6, 6), np.float32)
 
-    def append(self, stamp: float, reference: int, T_cam_ref: Array) -> None:
-        """Note a tracked frame: its stamp, its reference keyframe's slot and ``T_cam_ref``."""
+    def append(self, stamp: float, reference: int, T_cam_ref: Array, information: Array) -> None:
+        """Note a tracked frame: stamp, reference keyframe's slot, ``T_cam_ref`` and the information of the pose."""
         if self.count == len(self._stamp):
-            for name in ("_stamp", "_reference", "_relative"):
+            for name in ("_stamp", "_reference", "_relative", "_information"):
                 old = getattr(self, name)
                 new = np.zeros((2 * len(old), *old.shape[1:]), old.dtype)
                 new[: len(old)] = old
@@ -32,6 +31,7 @@ class History:
         self._stamp[self.count] = stamp
         self._reference[self.count] = reference
         self._relative[self.count] = T_cam_ref
+        self._information[self.count] = information
         self.count += 1
 
     def inherit(self, dropped: int, heir: int, T_dropped_heir: Array) -> None:
@@ -40,7 +40,8 @@ class History:
         self._relative[rows] = self._relative[rows] @ T_dropped_heir
         self._reference[rows] = heir
 
-    def poses(self, world: Map) -> tuple[Array, Array]:
-        """Stamps ``[N]`` and camera-to-world poses ``[N, 4, 4]`` of all frames with the keyframes as they are now."""
+    def poses(self, world: Map) -> tuple[Array, Array, Array]:
+        """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``."""
         n = self.count
-        return self._stamp[:n].copy(), se3.inverse(self._relative[:n] @ world.kf_pose[self._reference[:n]])
+        poses = self._relative[:n] @ world.kf_pose[self._reference[:n]]
+        return self._stamp[:n].copy(), poses, self._information[:n].astype(np.float64)

@@ -1,8 +1,8 @@
 """Robust pose optimisation against known points: Gauss-Newton on SE(3) with the right coordinate of depth.
 
 The residual of a point is ``(u - u', v - v', ur - (u' - b f / z'))``; features without depth have the first two rows
-only. Rounds of a Huber-weighted Gauss-Newton alternate with a chi-square test that sets outliers aside, as in motion-only
-bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos, 2017, Section III-C).
+only. Rounds of a Huber-weighted Gauss-Newton alternate with a chi-square test that sets outliers aside, as in
+motion-only bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos, 2017, Section III-C).
 """
 
 from __future__ import annotations

@@ -133,16 +133,52 @@ class RelocalisationSettings(Settings):
     )
 
 
-class SmoothingSettings(Settings):
-    """Smoothing of the final trajectory by a constant-velocity prior; the online trajectory is never touched."""
+class MotionSettings(Settings):
+    """White-noise acceleration as motion model: prediction and filter while tracking, smoother afterwards."""
 
-    enabled: bool = tunable(True, meaning="smooth the final trajectory")
+    filter: bool = tunable(True, meaning="weigh the pose that the image gives against the motion model, causally")
+    smooth: bool = tunable(True, meaning="smooth the final trajectory; the online one is never touched afterwards")
+    acceleration: float = tunable(
+        4.0,
+        low=0.5,
+        high=40.0,
+        limits=(0.001, 10000.0),
+        scale="log",
+        unit="m/s^2",
+        meaning="standard deviation of the camera's acceleration",
+    )
+    angular_acceleration: float = tunable(
+        20.0,
+        low=2.0,
+        high=200.0,
+        limits=(0.001, 100000.0),
+        scale="log",
+        unit="rad/s^2",
+        meaning="standard deviation of the camera's angular acceleration",
+    )
+    inflation: float = tunable(
+        50.0,
+        low=1.0,
+        high=300.0,
+        limits=(0.01, 10000.0),
+        scale="log",
+        meaning="factor on the covariance of a measured pose, whose pixel errors are not independent",
+    )
+    max_gap_s: float = tunable(
+        0.25,
+        low=0.1,
+        high=1.0,
+        limits=(0.001, 1000.0),
+        unit="s",
+        meaning="after a longer gap between frames nothing is assumed of the motion",
+    )
 
 
 class BackendSettings(Settings):
     """All settings of the back end."""
 
     tracking: TrackingSettings = TrackingSettings()
+    motion: MotionSettings = MotionSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     mapping: MappingSettings = MappingSettings()
     bundle_adjustment: BundleAdjustmentSettings = BundleAdjustmentSettings()

@@ -21,6 +21,7 @@ from .settings import TrackingSettings
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
+
 ENOUGH_FIRST = 20
 """Matches with the last frame that make a second, wider search unnecessary (ORB-SLAM2's number)."""
 
