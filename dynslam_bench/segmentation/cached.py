@@ -93,7 +93,10 @@ def cache_segmenter(
         "source": configured.source,
         "weights": weights_digest(settings, sequence_id),
         "confidence": min(LOWEST_CONFIDENCE, settings.confidence),
-        "settings": {name: getattr(settings, name) for name in ("mask_threshold", "nms_iou", "onnx_normalisation")},
+        "settings": {
+            name: getattr(settings, name)
+            for name in ("mask_threshold", "nms_iou", "classes", "network_side", "onnx_normalisation")
+        },
         "device": device,
     }
     cached = CachedSegmenter(configured.inner, identity, cache, threads)

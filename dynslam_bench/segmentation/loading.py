@@ -61,11 +61,13 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     """
     path = path.expanduser()
     try:
-        size = path.stat().st_size
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with path.open("rb") as file:
+            size = len(file.read(1)) and path.stat().st_size
     except OSError as error:
         raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
-    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
         reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
         raise SegmentationError(
             f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}", "it is truncated or foreign"

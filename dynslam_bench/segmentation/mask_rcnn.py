@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,7 +85,10 @@ class MaskRCNNSegmenter:
         for index, name in enumerate(names):
             if name not in wanted:
                 continue
-            mask = paste(planes[index], boxes[index], height, width, self.settings.mask_threshold)
+            mask = paste(
+                planes[index], boxes[index], height, width, self.settings.mask_threshold,
+                exact=self.network.config.exact_paste,
+            )  # fmt: skip
             if mask.any():
                 masks.append(mask)
                 kept.append(index)
@@ -99,13 +103,27 @@ class MaskRCNNSegmenter:
 
 
 def paste(
-    plane: NDArray[np.float32], box: NDArray[np.float32], height: int, width: int, threshold: float
+    plane: NDArray[np.float32],
+    box: NDArray[np.float32],
+    height: int,
+    width: int,
+    threshold: float,
+    *,
+    exact: bool = False,
 ) -> NDArray[np.bool_]:
     """A mask predicted inside a box, as a bool ``[H, W]`` mask of the image.
 
-    As in the published models: the mask gets a border of one pixel, the box grows by the same share and is cut to
-    whole pixels, the mask is interpolated bilinearly onto it.
+    Args:
+        plane: ``[M, M]`` probabilities.
+        box: x0, y0, x1, y1 in pixels.
+        height: Of the image.
+        width: Of the image.
+        threshold: Least probability of a pixel.
+        exact: Interpolate at the pixels' centres. Otherwise as in the published models: the mask gets a border of one
+            pixel, the box grows by the same share and is cut to whole pixels, which shifts edges by up to a pixel.
     """
+    if exact:
+        return _paste_exactly(plane, box, height, width, threshold)
     side = plane.shape[0]
     padded = np.zeros((side + 2, side + 2), np.float32)
     padded[1:-1, 1:-1] = plane
@@ -119,6 +137,26 @@ def paste(
     left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1 + 1, width), min(y1 + 1, height)
     if left < right and top < bottom:
         mask[top:bottom, left:right] = patch[top - y0 : bottom - y0, left - x0 : right - x0] >= threshold
+    return mask
+
+
+def _paste_exactly(
+    plane: NDArray[np.float32], box: NDArray[np.float32], height: int, width: int, threshold: float
+) -> NDArray[np.bool_]:
+    mask = np.zeros((height, width), bool)
+    left, top = max(math.floor(box[0]), 0), max(math.floor(box[1]), 0)
+    right, bottom = min(math.ceil(box[2]), width), min(math.ceil(box[3]), height)
+    if left >= right or top >= bottom or box[2] <= box[0] or box[3] <= box[1]:
+        return mask
+    scale = plane.shape[0] / (box[2:] - box[:2])
+    to_plane = np.array(
+        [[scale[0], 0, (left + 0.5 - box[0]) * scale[0] - 0.5], [0, scale[1], (top + 0.5 - box[1]) * scale[1] - 0.5]]
+    )
+    patch = cv2.warpAffine(plane, to_plane, (right - left, bottom - top), borderMode=cv2.BORDER_REPLICATE,
+                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # fmt: skip
+    columns, rows = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
+    inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & ((columns >= box[0]) & (columns <= box[2]))[None]
+    mask[top:bottom, left:right] = (patch >= threshold) & inside
     return mask
 
 

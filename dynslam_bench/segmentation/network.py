@@ -53,7 +53,11 @@ class MaskRCNN(nn.Module):
         size = (max(1, math.floor(height * scale)), max(1, math.floor(width * scale)))
         if size != (height, width):
             x = functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
-        return functional.pad(x, (0, -size[1] % config.divisor, 0, -size[0] % config.divisor)), size
+        return self._pad(x), size
+
+    def _pad(self, x: Tensor) -> Tensor:
+        divisor = self.config.divisor
+        return functional.pad(x, (0, -int(x.shape[3]) % divisor, 0, -int(x.shape[2]) % divisor))
 
     @torch.inference_mode()
     def detect(self, image: Tensor, *, score: float = 0.05, iou: float = 0.5) -> Detections:
@@ -91,10 +95,11 @@ class MaskRCNN(nn.Module):
             generator: Draws the samples of anchors and proposals.
             per_image: Proposals an image that enter the box losses.
         """
-        batch, _, height, width = images.shape
-        x = normalise(images).contiguous(memory_format=torch.channels_last)
+        batch, _, rows, columns = images.shape
+        x = self._pad(normalise(images)).contiguous(memory_format=torch.channels_last)
+        height, width = int(x.shape[2]), int(x.shape[3])
         levels, mask_levels = self.backbone(x)
-        proposals, anchors, logits, codes = self.rpn(levels, height, width, [(height, width)] * batch)
+        proposals, anchors, logits, codes = self.rpn(levels, height, width, [(rows, columns)] * batch)
         objectness, regression = rpn_loss(anchors, logits, codes, boxes, generator)
         heads = self.roi_heads.losses(
             levels[:4], mask_levels, proposals, boxes, labels, masks, height, generator, per_image

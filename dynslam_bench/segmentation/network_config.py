@@ -39,6 +39,7 @@ class NetworkConfig(BaseModel):
         post_nms: Proposals an image after it.
         rpn_nms: IoU of the RPN's suppression.
         max_detections: Objects an image.
+        exact_paste: Masks are placed to the fraction of a pixel instead of as the published models place them.
         norm: ``frozen`` batch norm (published checkpoints) or ``batch`` (trained from scratch).
     """
 
@@ -65,6 +66,7 @@ class NetworkConfig(BaseModel):
     post_nms: int = 1000
     rpn_nms: float = 0.7
     max_detections: int = 100
+    exact_paste: bool = False
     norm: Literal["frozen", "batch"] = "frozen"
 
     @property
@@ -80,7 +82,7 @@ def embedded_config(*, cfpn: bool = True) -> NetworkConfig:
         blocks=(2, 2, 2, 2), bottleneck=False, stem=32, channels=64, cfpn=cfpn, classes=("person",),
         anchor_sizes=(16.0, 32.0, 64.0, 128.0, 224.0), anchor_ratios=(1.0, 2.0, 3.0), box_hidden=256,
         mask_channels=64, mask_layers=4, mask_pool=14, canonical=112.0, mask_canonical=224.0, min_side=240,
-        max_side=427, pre_nms=200, post_nms=100, max_detections=20, norm="batch",
+        max_side=427, pre_nms=200, post_nms=100, max_detections=20, exact_paste=True, norm="batch",
     )  # fmt: skip
 
 

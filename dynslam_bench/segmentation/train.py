@@ -128,10 +128,8 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
 
 
 def input_size(config: NetworkConfig) -> tuple[int, int]:
-    """Height and width of training images: 4:3, padded to the divisor."""
-    d = config.divisor
-    width = round(config.min_side * 4 / 3)
-    return -(-config.min_side // d) * d, -(-width // d) * d
+    """Height and width of training images: 4:3, as the frames of most sequences."""
+    return config.min_side, round(config.min_side * 4 / 3)
 
 
 def _check_settings(settings: TrainSettings, output: Path, resume: bool) -> bool:
@@ -317,7 +315,7 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
         found = network.detect(image, score=CONFIDENCE)
         boxes, planes = found.boxes.cpu().numpy(), found.masks.float().cpu().numpy()
         labels = found.labels.cpu().numpy()
-        masks = [paste(plane, box, height, width, 0.5) for plane, box in zip(planes, boxes, strict=True)]
+        masks = [paste(plane, box, height, width, 0.5, exact=True) for plane, box in zip(planes, boxes, strict=True)]
         for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
             ious = [compare_masks(mask, truth).iou or 0.0
                     for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]  # fmt: skip

@@ -1,0 +1,309 @@
+"""The Mask R-CNN: its building blocks against slow references, its checkpoints, its behaviour as a segmenter."""
+
+import copy
+import re
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation import box_ops
+from dynslam_bench.segmentation.build import build_segmenter
+from dynslam_bench.segmentation.loading import load_network, save_network
+from dynslam_bench.segmentation.mask_rcnn import MaskRCNNSegmenter, paste
+from dynslam_bench.segmentation.network import MaskRCNN
+from dynslam_bench.segmentation.network_config import NetworkConfig, embedded_config, resnet18_config
+from dynslam_bench.segmentation.roi_align import levels_of, roi_align
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.frame import Frame
+
+SMALL = NetworkConfig(
+    blocks=(1, 1, 1, 1), bottleneck=False, stem=8, channels=16, classes=("person", "chair"), box_hidden=16,
+    mask_channels=8, mask_layers=1, min_side=64, max_side=128, pre_nms=50, post_nms=20, norm="batch",
+)  # fmt: skip
+
+
+def random_boxes(count, rng, side=100.0):
+    corner = rng.uniform(0, side, (count, 2))
+    return torch.tensor(
+        np.concatenate([corner, corner + rng.uniform(1, side / 2, (count, 2))], axis=1), dtype=torch.float32
+    )
+
+
+def network(config=SMALL, seed=0):
+    torch.manual_seed(seed)
+    made = MaskRCNN(config)
+    with torch.no_grad():
+        made.roi_heads.box_predictor.cls_score.weight.mul_(20)
+        made.rpn.head.cls_logits.weight.mul_(100)
+        for module in made.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                module.running_mean.normal_(0, 0.1)
+                module.running_var.uniform_(0.5, 2)
+                module.weight.uniform_(0.5, 1.5)
+    return made.eval()
+
+
+# --- building blocks ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.3, 0.5, 0.9])
+@pytest.mark.parametrize("count", [0, 1, 2, 60, 300])
+def test_nms_equals_opencv(count, threshold):
+    rng = np.random.default_rng(count)
+    boxes, scores = (
+        random_boxes(count, rng),
+        torch.tensor((rng.permutation(count) + 1).astype(np.float32) / max(count, 1)),
+    )
+    kept = box_ops.nms(boxes, scores, threshold).tolist()
+    as_xywh = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], dim=1).double().tolist()
+    expected = cv2.dnn.NMSBoxes(as_xywh, scores.double().tolist(), 0.0, threshold) if count else []
+    assert kept == np.asarray(expected, int).reshape(-1).tolist()
+
+
+def test_nms_of_a_long_chain_is_greedy():
+    starts = torch.arange(40, dtype=torch.float32) * 4
+    boxes = torch.stack([starts, torch.zeros(40), starts + 10, torch.full((40,), 10.0)], dim=1)
+    kept = box_ops.nms(boxes, torch.linspace(1, 0, 40), 0.3)
+    assert kept.tolist() == list(range(0, 40, 2))
+
+
+def test_grouped_nms_keeps_groups_apart():
+    boxes = torch.tensor([[0.0, 0, 10, 10]] * 4)
+    kept = box_ops.grouped_nms(boxes, torch.tensor([0.1, 0.9, 0.8, 0.2]), torch.tensor([0, 0, 1, 1]), 0.5)
+    assert kept.tolist() == [1, 2]
+
+
+def test_codes_are_inverse():
+    rng = np.random.default_rng(0)
+    boxes, references = random_boxes(50, rng), random_boxes(50, rng)
+    codes = box_ops.encode(boxes, references, box_ops.BOX_WEIGHTS)
+    assert torch.allclose(box_ops.decode(codes, references, box_ops.BOX_WEIGHTS)[:, 0], boxes, atol=1e-3)
+    assert torch.isfinite(box_ops.decode(torch.full((50, 4), 1e4), references, box_ops.RPN_WEIGHTS)).all()
+
+
+def slow_roi_align(feature, box, scale, size, samples):
+    """RoIAlign by its definition, one sample at a time."""
+    channels, height, width = feature.shape
+    x0, y0, x1, y1 = (float(value) * scale for value in box)
+    step_y, step_x = max(y1 - y0, 1.0) / size, max(x1 - x0, 1.0) / size
+    out = np.zeros((channels, size, size))
+    for i in range(size):
+        for j in range(size):
+            for a in range(samples):
+                for b in range(samples):
+                    y = y0 + (i + (a + 0.5) / samples) * step_y
+                    x = x0 + (j + (b + 0.5) / samples) * step_x
+                    if y < -1 or y > height or x < -1 or x > width:
+                        continue
+                    y, x = min(max(y, 0), height - 1), min(max(x, 0), width - 1)
+                    r, c = min(int(y), height - 1), min(int(x), width - 1)
+                    r1, c1, fy, fx = min(r + 1, height - 1), min(c + 1, width - 1), y - r, x - c
+                    out[:, i, j] += (1 - fy) * ((1 - fx) * feature[:, r, c] + fx * feature[:, r, c1]) + fy * (
+                        (1 - fx) * feature[:, r1, c] + fx * feature[:, r1, c1]
+                    )
+    return out / samples**2
+
+
+def test_roi_align_equals_its_definition():
+    rng = np.random.default_rng(1)
+    features = [torch.randn(2, 5, 64 // 2**k, 96 // 2**k) for k in range(4)]
+    boxes = [random_boxes(12, rng, 250), random_boxes(9, rng, 250) - 20]
+    found = roi_align(features, boxes, 256, 7, canonical=60.0)
+    assert found.shape == (21, 5, 7, 7)
+    levels = levels_of(torch.cat(boxes), 60.0, 4)
+    assert len(set(levels.tolist())) >= 3
+    for k, box in enumerate(torch.cat(boxes)):
+        feature = features[levels[k]][0 if k < 12 else 1].numpy()
+        expected = slow_roi_align(feature, box, 1 / (4 * 2 ** int(levels[k])), 7, 2)
+        assert np.allclose(found[k].numpy(), expected, atol=1e-4)
+    assert roi_align(features, [boxes[0][:0], boxes[1][:0]], 256, 7, canonical=60.0).shape == (0, 5, 7, 7)
+
+
+def test_box_levels_follow_the_paper():
+    sides = torch.tensor([10.0, 111.9, 112.0, 223.9, 224.0, 447.9, 448.0, 5000.0])
+    boxes = torch.stack([sides * 0, sides * 0, sides, sides], dim=1)
+    assert levels_of(boxes, 224.0, 4).tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_a_fresh_cfpn_changes_nothing_and_a_trained_one_the_masks_only():
+    plain, fused = network(SMALL.model_copy(update={"cfpn": False})), network()
+    fused.load_state_dict(plain.state_dict(), strict=False)
+    image = torch.rand(3, 60, 80)
+    before, after = plain.detect(image), fused.detect(image)
+    assert len(before.boxes) > 0
+    for name in ("boxes", "labels", "scores", "masks"):
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    with torch.no_grad():
+        for smooth in fused.backbone.cfpn.smooth:
+            smooth.weight.normal_(0, 0.1)
+    trained = fused.detect(image)
+    assert torch.equal(before.boxes, trained.boxes) and not torch.allclose(before.masks, trained.masks)
+
+
+def test_fusing_batch_norm_changes_no_output():
+    for config in (SMALL, SMALL.model_copy(update={"norm": "frozen", "bottleneck": True, "blocks": (1, 2, 1, 1)})):
+        made = network(config)
+        image = torch.rand(3, 60, 80)
+        x, _ = made.prepare(image)
+        before = made.backbone(x)[0]
+        after = copy.deepcopy(made).fuse().backbone(x)[0]
+        for a, b in zip(before, after, strict=True):
+            assert torch.allclose(a, b, atol=1e-4 * float(a.detach().abs().max()))
+
+
+# --- checkpoints -------------------------------------------------------------------------------------------------
+
+
+def published(config, layout):
+    """A state dict with torchvision's names: 'frozen' (no counters), 'counted', or '2019'."""
+    state = {k: v.clone() for k, v in network(config).state_dict().items() if not k.startswith("backbone.cfpn.")}
+    if layout != "counted":
+        state = {k: v for k, v in state.items() if not k.endswith("num_batches_tracked")}
+    if layout == "2019":
+        renamed = {}
+        for key, value in state.items():
+            key = re.sub(r"(fpn\.(?:inner|layer)_blocks\.\d)\.0\.", r"\1.", key)
+            key = key.replace("rpn.head.conv.0.0.", "rpn.head.conv.")
+            key = re.sub(r"mask_head\.(\d)\.0\.", lambda m: f"mask_head.mask_fcn{int(m[1]) + 1}.", key)
+            renamed[key] = value
+        state = renamed
+    return state
+
+
+@pytest.mark.parametrize(("layout", "keys"), [("frozen", 307), ("counted", 360), ("2019", 307)])
+def test_the_three_published_layouts_load_strictly(tmp_path, layout, keys):
+    config = NetworkConfig(norm="batch")
+    state = published(config, layout)
+    assert len(state) == keys
+    if layout == "2019":
+        assert {"backbone.fpn.inner_blocks.0.weight", "rpn.head.conv.weight",
+                "roi_heads.mask_head.mask_fcn1.weight"} <= set(state)  # fmt: skip
+    torch.save(state, tmp_path / "coco.pth")
+    loaded = load_network(tmp_path / "coco.pth")
+    assert loaded.config.blocks == (3, 4, 6, 3) and loaded.config.bottleneck and len(loaded.config.classes) == 90
+    own = loaded.state_dict()
+    reference = published(config, "frozen")
+    assert all(torch.equal(own[key], value) for key, value in reference.items())
+    assert all(not key.startswith("backbone.cfpn.smooth") or not own[key].any() for key in own)
+
+
+def test_our_own_format_carries_the_shape(tmp_path):
+    made = network()
+    save_network(made, tmp_path / "own.pt")
+    save_network(made, tmp_path / "half.pt", half=True)
+    loaded = load_network(tmp_path / "own.pt")
+    assert loaded.config == SMALL
+    assert all(torch.equal(value, loaded.state_dict()[key]) for key, value in made.state_dict().items()
+               if not key.endswith("num_batches_tracked"))  # fmt: skip
+    assert (tmp_path / "half.pt").stat().st_size < 0.7 * (tmp_path / "own.pt").stat().st_size
+    assert next(load_network(tmp_path / "half.pt").parameters()).dtype == torch.float32
+
+
+def test_a_resnet18_checkpoint_is_recognised(tmp_path):
+    torch.save(published(resnet18_config(), "counted"), tmp_path / "r18.pth")
+    config = load_network(tmp_path / "r18.pth").config
+    assert (config.blocks, config.bottleneck, config.stem, config.classes) == ((2, 2, 2, 2), False, 64, ("person",))
+
+
+def test_foreign_checkpoints_say_what_is_wrong(tmp_path):
+    path = tmp_path / "bad.pth"
+    good = published(resnet18_config(), "frozen")
+
+    def refused(content, *texts):
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            torch.save(content, path)
+        with pytest.raises(SegmentationError) as error:
+            load_network(path)
+        for text in (str(path), *texts):
+            assert text in str(error.value), error.value
+        assert "\n" not in str(error.value)
+
+    missing = {k: v for k, v in good.items() if "mask_predictor" not in k}
+    refused(missing, "4 keys are missing", "roi_heads.mask_predictor.conv5_mask.weight")
+    refused({**good, "extra.weight": torch.zeros(1)}, "1 keys are unknown (extra.weight)")
+    wrong = {**good, "rpn.head.bbox_pred.bias": torch.zeros(8)}
+    refused(wrong, "1 shapes differ (rpn.head.bbox_pred.bias 8 instead of 12)")
+    refused({**good, "rpn.head.bbox_pred.bias": torch.full((12,), float("nan"))}, "rpn.head.bbox_pred.bias holds NaN")
+    refused({"fc.weight": torch.zeros(3, 3)}, "is no Mask R-CNN", "backbone.body.conv1.weight is missing")
+    refused({"epoch": 3}, "holds no weights")
+    refused([1, 2, 3], "holds a list")
+    refused(b"", "truncated or foreign")
+    refused(b"\x80\x02garbage", "truncated or foreign")
+    torch.save(good, path)
+    refused(path.read_bytes()[:5000], "(5000 bytes)", "truncated or foreign")
+    with pytest.raises(SegmentationError, match="cannot read the checkpoint"):
+        load_network(tmp_path / "none.pth")
+
+
+def test_code_in_a_checkpoint_is_never_run(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "trapped"), "w"))
+
+    torch.save({"model": Trap()}, tmp_path / "trap.pth")
+    with pytest.raises(SegmentationError, match="no torch checkpoint of plain weights"):
+        load_network(tmp_path / "trap.pth")
+    assert not (tmp_path / "trapped").exists()
+
+
+# --- as a segmenter ----------------------------------------------------------------------------------------------
+
+
+def frame(shape, seed=0):
+    rgb = np.random.default_rng(seed).integers(0, 255, shape, dtype=np.uint8)
+    return Frame(0, 0.0, rgb, np.zeros(shape[:2], np.float32))
+
+
+@pytest.mark.parametrize("shape", [(480, 640, 3), (48, 64), (50, 333, 4), (7, 9, 1), (600, 80, 3)])
+def test_images_of_any_size_and_kind(shape):
+    found = MaskRCNNSegmenter(network(), SegmentationSettings(classes="person,chair"), floor=0.01).segment(frame(shape))
+    assert found.masks.shape[1:] == shape[:2] and found.masks.dtype == bool
+    assert len(found) == len(found.boxes) == len(found.scores) == len(found.class_names)
+    assert (found.boxes[:, [0, 1]] >= 0).all() and (found.boxes[:, 2] <= shape[1]).all()
+
+
+def test_no_detection_is_an_empty_result():
+    made = network()
+    with torch.no_grad():
+        made.roi_heads.box_predictor.cls_score.bias.copy_(torch.tensor([50.0, 0, 0]))
+    found = MaskRCNNSegmenter(made, SegmentationSettings()).segment(frame((48, 64, 3)))
+    assert len(found) == 0 and found.masks.shape == (0, 48, 64) and not found.union().any()
+
+
+def test_a_weights_file_as_source(tmp_path):
+    save_network(network(), tmp_path / "own.pt")
+    settings = SegmentationSettings(source=f"weights:{tmp_path / 'own.pt'}", confidence=0.05, network_side=0)
+    first, second = (build_segmenter(settings, threads=1).segment(frame((48, 64, 3))) for _ in range(2))
+    assert len(first) > 0 and set(first.class_names) == {"person"}
+    assert np.array_equal(first.masks, second.masks) and np.array_equal(first.scores, second.scores)
+    with pytest.raises(SegmentationError, match=r"knows none of the classes dog \(it knows chair, person\)"):
+        build_segmenter(settings.model_copy(update={"classes": "dog"}))
+    with pytest.raises(SegmentationError, match="sees no GPU"):
+        build_segmenter(settings, device="cuda:99" if not torch.cuda.is_available() else "cuda")
+        pytest.skip("there is a GPU")
+
+
+def test_pasted_masks_fill_their_box():
+    plane = np.ones((28, 28), np.float32)
+    box = np.array([10, 20, 50, 80], np.float32)
+    exact = paste(plane, box, 100, 100, 0.5, exact=True)
+    assert exact[20:80, 10:50].all() and exact.sum() == 40 * 60
+    mask = paste(plane, box, 100, 100, 0.5)
+    rows, columns = np.nonzero(mask)
+    assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == pytest.approx((10, 20, 50, 80), abs=1.01)
+    half = np.zeros((28, 28), np.float32)
+    half[:, 14:] = 1.0
+    moved = paste(half, box + np.float32(0.4), 100, 100, 0.5, exact=True)
+    assert not moved[:, :30].any() and moved[21:80, 31:50].all()
+    outside = paste(plane, np.array([-30, -30, -5, -5], np.float32), 100, 100, 0.5)
+    assert not outside.any()
+
+
+def test_the_embedded_shape_is_small():
+    weights = sum(value.numel() for key, value in MaskRCNN(embedded_config()).state_dict().items())
+    assert 2 * weights < 15e6

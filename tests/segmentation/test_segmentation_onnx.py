@@ -1,0 +1,227 @@
+"""ONNX networks: layouts found from shapes, decoding checked by hand-made outputs, clear errors."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.build import build_segmenter
+from dynslam_bench.segmentation.onnx import OnnxSegmenter, fit, opencv_threads
+from dynslam_bench.segmentation.onnx_header import TensorInfo, read_header
+from dynslam_bench.segmentation.onnx_heads import Layout, Placement, decode, detect_layout
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.frame import Frame
+
+sys.path.insert(0, str(Path(__file__).parent))
+import onnx_writer
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+WEIGHTS = SHARED / "weights"
+BONN = SHARED / "data" / "bonn" / "rgbd_bonn_crowd"
+SETTINGS = SegmentationSettings()
+
+
+def frame(rgb):
+    return Frame(0, 0.0, np.asarray(rgb), np.zeros(np.shape(rgb)[:2], np.float32))
+
+
+def info(**shapes):
+    return [TensorInfo(name, shape) for name, shape in shapes.items()]
+
+
+def test_layouts_are_found_from_shapes():
+    yolo = detect_layout(info(output0=(1, 116, 6300), output1=(1, 32, 120, 160)), {}, (480, 640), "f")
+    assert (yolo.kind, yolo.channels_first, yolo.names[0]) == ("yolo", True, "person")
+    turned = detect_layout(info(output0=(1, 6300, 116), output1=(1, 32, 120, 160)), {}, (480, 640), "f")
+    assert (turned.kind, turned.channels_first) == ("yolo", False)
+    v5 = detect_layout(info(output0=(1, 25200, 117), output1=(1, 32, 160, 160)), {}, (640, 640), "f")
+    assert (v5.kind, v5.objectness) == ("yolo", 1)
+    own = detect_layout(info(a=(1, 38, 2100), b=(1, 32, 60, 80)), {"names": "{0: 'person', 1: 'cat'}"}, (240, 320), "f")
+    assert own.names == {0: "person", 1: "cat"}
+    voc = detect_layout(info(logits=(1, 21, 31, 41)), {}, (481, 641), "f")
+    assert (voc.kind, voc.names[15], voc.aligned) == ("semantic", "person", True)
+    whole = detect_layout(info(out=(1, 21, 480, 640)), {}, (480, 640), "f")
+    assert not whole.aligned
+    shapes = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": (None, 1, 480, 640)}
+    found = detect_layout(info(**shapes), {}, (480, 640), "f")
+    assert (found.kind, found.names[1]) == ("instances", "person")
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [
+        {"output0": (1, 1000)},
+        {"logits": (1, 7, 60, 80)},
+        {"output0": (1, 300, 6)},
+        {"output0": (1, 50, 6300), "output1": (1, 32, 120, 160)},
+        {},
+    ],
+)
+def test_unknown_outputs_are_named(outputs):
+    with pytest.raises(SegmentationError) as error:
+        detect_layout(info(**outputs), {}, (480, 640), "net.onnx")
+    assert "net.onnx" in str(error.value) and "known: YOLO" in str(error.value)
+    for name in outputs:
+        assert name in str(error.value)
+
+
+def yolo_values(boxes, scores, labels, cells=(12, 16), count=50, coefficients=3):
+    """Detections of 80 classes whose masks are the first prototype, positive everywhere."""
+    rows = np.zeros((count, 84 + coefficients), np.float32)
+    for k, (box, score, label) in enumerate(zip(boxes, scores, labels, strict=True)):
+        x0, y0, x1, y1 = box
+        rows[k, :4] = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0
+        rows[k, 4 + label] = score
+        rows[k, 84] = 5.0
+    prototypes = np.zeros((1, coefficients, *cells), np.float32)
+    prototypes[0, 0] = 1.0
+    return rows.T[None], prototypes
+
+
+def test_yolo_decoding_cuts_masks_to_boxes_and_suppresses_per_class():
+    outputs = yolo_values(
+        [(8, 8, 40, 56), (9, 8, 41, 56), (8, 8, 40, 56), (50, 4, 60, 20)], [0.9, 0.8, 0.7, 0.2], [0, 0, 16, 0]
+    )
+    layout = Layout("yolo", ("a", "b"), {k: str(k) for k in range(80)} | {0: "person", 16: "dog"})
+    place = Placement(1, 1, 0, 0, 128, 96)
+    found = decode(layout, outputs, place, 96, 128, SETTINGS, 0.1)
+    assert found.class_names == ("person", "person") and found.scores == pytest.approx([0.9, 0.2])
+    assert found.boxes[0] == pytest.approx([8, 8, 40, 56])
+    assert found.masks[0].sum() == 32 * 48 and found.masks[0][8:56, 8:40].all()
+    both = decode(layout, outputs, place, 96, 128, SegmentationSettings(classes="person,dog"), 0.5)
+    assert both.class_names == ("person", "dog")
+
+
+def test_yolo_letterbox_is_undone():
+    outputs = yolo_values([(16, 32, 48, 64)], [0.9], [0], cells=(32, 32))
+    layout = Layout("yolo", ("a", "b"), {k: str(k) for k in range(80)} | {0: "person"})
+    rgb = np.zeros((240, 320, 3), np.uint8)
+    image, place = fit(rgb, (128, 128), keep_aspect=True)
+    assert image.shape == (128, 128, 3) and (image[:16] == 114).all() and (image[16:112] == 0).all()
+    found = decode(layout, outputs, place, 240, 320, SETTINGS, 0.1)
+    assert found.boxes[0] == pytest.approx([40, 40, 120, 120])
+    assert found.masks[0][41:119, 41:119].all() and found.masks[0].sum() == 80 * 80
+
+
+def test_semantic_decoding_is_argmax_split_into_parts():
+    logits = np.zeros((1, 21, 480, 640), np.float32)
+    logits[0, 0] = 1.0
+    logits[0, 15, 100:200, 50:150] = 4.0
+    logits[0, 15, 300:400, 400:600] = 4.0
+    logits[0, 9, 250:280, 10:40] = 4.0
+    layout = detect_layout(info(out=logits.shape), {}, (480, 640), "f")
+    found = decode(layout, [logits], Placement(1, 1, 0, 0, 640, 480), 480, 640, SETTINGS, 0.1)
+    assert found.class_names == ("person", "person")
+    assert found.masks[0][100:200, 50:150].all() and found.masks.sum() == 100 * 100 + 100 * 200
+    assert found.scores == pytest.approx([1 / (1 + np.exp(-3.0))] * 2, abs=1e-5)
+
+
+def test_aligned_logits_are_interpolated_between_corners():
+    logits = np.zeros((1, 21, 31, 41), np.float32)
+    logits[0, 0] = 1.0
+    logits[0, 15] = np.linspace(-1, 3, 41)[None]
+    layout = detect_layout(info(out=logits.shape), {}, (481, 641), "f")
+    found = decode(layout, [logits], Placement(1, 1, 0, 0, 641, 481), 481, 641, SETTINGS, 0.1)
+    assert found.masks[0][:, 321:].all() and not found.masks[0][:, :320].any()
+
+
+def test_torchvision_instances():
+    masks = np.zeros((3, 1, 96, 128), np.float32)
+    masks[0, 0, 10:50, 20:60] = 0.9
+    masks[1, 0, 60:90, 70:100] = 0.8
+    masks[2, 0, 0:9, 0:9] = 0.9
+    boxes = np.array([[20, 10, 60, 50], [70, 60, 100, 90], [0, 0, 9, 9]], np.float32)
+    values = [boxes, np.array([1, 62, 1], np.float32), np.array([0.9, 0.8, 0.05], np.float32), masks]
+    layout = detect_layout(info(boxes=(3, 4), labels=(3,), scores=(3,), masks=(3, 1, 96, 128)), {}, (96, 128), "f")
+    place = Placement(1, 1, 0, 0, 128, 96)
+    found = decode(layout, values, place, 96, 128, SETTINGS, 0.1)
+    assert found.class_names == ("person",) and (found.masks[0] == (masks[0, 0] > 0.5)).all()
+    assert decode(layout, values, place, 96, 128, SegmentationSettings(classes="chair"), 0.1).class_names == ("chair",)
+    with pytest.raises(SegmentationError, match=r"disagree: 3 boxes, 2 labels"):
+        decode(layout, [boxes, values[1][:2], *values[2:]], place, 96, 128, SETTINGS, 0.1)
+    with pytest.raises(SegmentationError, match="28x28"):
+        decode(layout, [*values[:3], np.ones((3, 1, 28, 28), np.float32)], place, 96, 128, SETTINGS, 0.1)
+    none = [np.zeros((0, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 1, 96, 128))]
+    assert len(decode(layout, none, place, 96, 128, SETTINGS, 0.1)) == 0
+
+
+def test_nan_outputs_are_refused():
+    logits = np.full((1, 21, 8, 8), np.nan, np.float32)
+    layout = detect_layout(info(out=logits.shape), {}, (64, 64), "f")
+    with pytest.raises(SegmentationError, match=r"'out' holds NaN"):
+        decode(layout, [logits], Placement(1, 1, 0, 0, 64, 64), 64, 64, SETTINGS, 0.1)
+
+
+def write(tmp_path, *arguments, **options):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(onnx_writer.model(*arguments, **options))
+    return path
+
+
+def test_a_written_network_runs_through_opencv(tmp_path):
+    logits = np.zeros((1, 21, 60, 80), np.float32)
+    logits[0, 0] = 1.0
+    logits[0, 15, 10:30, 20:40] = 5.0
+    path = write(tmp_path, (1, 3, 240, 320), {"out": logits})
+    assert [str(i) for i in read_header(path).inputs] == ["image 1x3x240x320"]
+    segmenter = OnnxSegmenter(path, SETTINGS)
+    assert segmenter.layout.kind == "semantic"
+    for shape in ((480, 640, 3), (240, 320), (100, 333, 4), (37, 21, 1)):
+        found = segmenter.segment(frame(np.zeros(shape, np.uint8)))
+        assert found.masks.shape == (1, *shape[:2])
+        assert found.masks.mean() == pytest.approx(20 * 20 / (60 * 80), rel=0.35)
+
+
+def test_a_written_network_with_torchvision_outputs(tmp_path):
+    masks = np.zeros((2, 1, 96, 128), np.float32)
+    masks[0, 0, 10:50, 20:60] = 0.9
+    outputs = {
+        "boxes": np.array([[20, 10, 60, 50], [0, 0, 5, 5]], np.float32),
+        "labels": np.array([1, 3], np.float32),
+        "scores": np.array([0.9, 0.8], np.float32),
+        "masks": masks,
+    }
+    found = OnnxSegmenter(write(tmp_path, (1, 3, 96, 128), outputs), SETTINGS).segment(
+        frame(np.zeros((96, 128, 3), np.uint8))
+    )
+    assert found.class_names == ("person",) and found.masks[0].sum() == 40 * 40
+
+
+def test_unknown_networks_are_refused(tmp_path):
+    path = write(tmp_path, (1, 3, 32, 32), {"probabilities": np.zeros((1, 1000), np.float32)})
+    with pytest.raises(SegmentationError, match=r"probabilities 1x1000"):
+        build_segmenter(SegmentationSettings(source=f"onnx:{path}"))
+    path = write(tmp_path, (1, 8), {"out": np.zeros((1, 21, 4, 4), np.float32)})
+    with pytest.raises(SegmentationError, match=r"image 1x8 is no image"):
+        build_segmenter(SegmentationSettings(source=f"onnx:{path}"))
+
+
+def test_damaged_files_are_refused(tmp_path):
+    with pytest.raises(SegmentationError, match="cannot read the network"):
+        build_segmenter(SegmentationSettings(source=f"onnx:{tmp_path / 'no.onnx'}"))
+    good = onnx_writer.model((1, 3, 32, 32), {"out": np.zeros((1, 21, 4, 4), np.float32)})
+    for content in (b"", b"not a network at all", good[: len(good) // 2]):
+        (tmp_path / "bad.onnx").write_bytes(content)
+        with pytest.raises(SegmentationError, match="is not an ONNX model"):
+            build_segmenter(SegmentationSettings(source=f"onnx:{tmp_path / 'bad.onnx'}"))
+
+
+def test_thread_count_is_restored():
+    before = cv2.getNumThreads()
+    with opencv_threads(1):
+        assert cv2.getNumThreads() == 1
+    assert cv2.getNumThreads() == before
+
+
+@pytest.mark.skipif(not (WEIGHTS.is_dir() and BONN.is_dir()), reason="needs ../shared/weights and ../shared/data")
+def test_yolo_and_deeplab_agree_on_bonn():
+    names = ("yolov8n-seg_480x640_fp32.onnx", "deeplabv3_mnv2_voc_481x641.onnx")
+    segmenters = [build_segmenter(SegmentationSettings(source=f"onnx:{WEIGHTS / name}")) for name in names]
+    lines = [line.split() for line in (BONN / "rgb.txt").read_text().splitlines() if line and line[0] != "#"]
+    for index, least in ((60, 0.93), (110, 0.93), (150, 0.85)):
+        rgb = np.ascontiguousarray(cv2.imread(str(BONN / lines[index][1]))[:, :, ::-1])
+        yolo, deeplab = (segmenter.segment(frame(rgb)).union() for segmenter in segmenters)
+        assert (yolo & deeplab).sum() / (yolo | deeplab).sum() > least
