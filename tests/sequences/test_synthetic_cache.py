@@ -14,7 +14,7 @@ import pytest
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
 from dynslam_bench.sequences.synthetic.people import draw_person
-from dynslam_bench.sequences.synthetic.room import plan_room
+from dynslam_bench.sequences.synthetic.plan import plan_room
 from dynslam_bench.sequences.synthetic.scene import Scene
 from dynslam_bench.sequences.synthetic.script import write_script
 from dynslam_bench.sequences.synthetic.settings import RenderSettings, SyntheticId

@@ -10,20 +10,18 @@ band of rows: the result is the same for any number of threads. The kernels rele
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
+
+from .compiled import kernel
 
 BOX, ROUND_CONE, QUAD = 0, 1, 2
 TILE = 8
 _NEAR = 0.05
 _PER_TURN = 1.0 / (2.0 * math.pi)
-_jit: Any = njit(cache=True, nogil=True, error_model="numpy")
-_inline: Any = njit(cache=True, nogil=True, error_model="numpy", inline="never")
 
 
-@_inline
+@kernel
 def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, t_max):  # type: ignore[no-untyped-def]
     """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side)."""
     t_in, t_out, face = -1.0e30, 1.0e30, -1
@@ -68,7 +66,7 @@ def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, t_max):  # type: ignore[no-unty
     return t_in, face
 
 
-@_inline
+@kernel
 def _hit_round_cone(ox, oy, oz, dx, dy, dz, h, r1, r2, t_max):  # type: ignore[no-untyped-def]
     """Nearest hit with the hull of a sphere r1 at the origin and a sphere r2 at (0, 0, h); h = 0 is a sphere."""
     best = 1e30
@@ -113,7 +111,7 @@ def _hit_round_cone(ox, oy, oz, dx, dy, dz, h, r1, r2, t_max):  # type: ignore[n
     return best
 
 
-@_jit
+@kernel
 def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
     """Primitive lists of all tiles, nearest bound first.
 
@@ -150,7 +148,7 @@ def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
 # to a function that it does not inline, which costs more than the tracing.
 
 
-@_jit
+@kernel
 def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, hit, depth):  # type: ignore[no-untyped-def]
     """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows.
 
@@ -198,7 +196,7 @@ def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, l
             depth[row, column] = t if p >= 0 else 0.0
 
 
-@_jit
+@kernel
 def shade_pixels(  # type: ignore[no-untyped-def]
     row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, texture, uv, tint, facets, atlas,
     level_offset, log2_size, lights, hit, depth, jitter, color, cosine
@@ -351,7 +349,7 @@ def shade_pixels(  # type: ignore[no-untyped-def]
             cosine[row, column] = own_cos
 
 
-@_jit
+@kernel
 def flow_field(row0, row1, intrinsics, hit, depth, motion, flow):  # type: ignore[no-untyped-def]
     """Exact optical flow (float32 pixels) of rows.
 
@@ -379,7 +377,7 @@ def flow_field(row0, row1, intrinsics, hit, depth, motion, flow):  # type: ignor
             flow[row, column, 1] = v / w * fy + cy - row
 
 
-@_jit
+@kernel
 def motion_blur(row0, row1, color, flow, shutter, blurred):  # type: ignore[no-untyped-def]
     """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred."""
     height, width = color.shape[:2]

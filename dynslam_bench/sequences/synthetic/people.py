@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.seeding import stream
 
 from .parts import ROUND_CONE, Parts, along, turn
-from .room import pick, pick_one
+from .plan import pick, pick_one
 
 Array = NDArray[np.float64]
 _X = np.array([1.0, 0.0, 0.0])

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from dynslam_bench.core.seeding import stream
 
 from . import textures
+from .furniture import add_chair
 from .motion import camera_poses
 from .parts import Parts, turn
 from .people import add_person, draw_person
-from .room import add_chair, build_room, plan_room
+from .plan import plan_room
+from .room import build_room
 from .script import chair_place, posture, write_script
 from .settings import FPS, RenderSettings, SyntheticId
 
@@ -63,7 +65,7 @@ class Scene:
         self.plan = plan_room(sequence.instance)
         self.script = write_script(sequence.people, sequence.instance)
         self.cast = [draw_person(sequence.instance, k) for k in range(2)]
-        room, _ = build_room(sequence.instance, self.plan)
+        room = build_room(sequence.instance, self.plan)
         self._chairs = []
         for k in range(2):
             chair = Parts()

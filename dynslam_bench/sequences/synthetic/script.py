@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from dynslam_bench.core.seeding import stream
 
 from .people import Posture
-from .room import pick
+from .plan import pick
 
 
 @dataclass(frozen=True)

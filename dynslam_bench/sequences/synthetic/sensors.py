@@ -13,15 +13,13 @@ Depth model, in the order of the physics of a Kinect-like sensor:
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
 
-_jit: Any = njit(cache=True, nogil=True, error_model="numpy")
+from .compiled import kernel
 
 
-@_jit
+@kernel
 def _hash(a, b):  # type: ignore[no-untyped-def]
     """A 64-bit hash (splitmix64 finaliser) of two 64-bit integers."""
     z = np.uint64(a) + np.uint64(0x9E3779B97F4A7C15) * (np.uint64(b) + np.uint64(1))
@@ -30,7 +28,7 @@ def _hash(a, b):  # type: ignore[no-untyped-def]
     return z ^ (z >> np.uint64(31))
 
 
-@_jit
+@kernel
 def _normal(h):  # type: ignore[no-untyped-def]
     """About normal with variance 1: the centred sum of the four 16-bit parts of a hash."""
     m = np.uint64(0xFFFF)
@@ -38,12 +36,12 @@ def _normal(h):  # type: ignore[no-untyped-def]
     return (total - 131070.0) * (1.7320508075688772 / 65536.0)
 
 
-@_jit
+@kernel
 def _uniform(h):  # type: ignore[no-untyped-def]
     return float(h >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@_jit
+@kernel
 def measure_depth(  # type: ignore[no-untyped-def]
     row0, row1, seed, fx, baseline, depth, cosine, color, disparity_noise, near, far, edge_px, dark, factor, out
 ):
@@ -113,7 +111,7 @@ def measure_depth(  # type: ignore[no-untyped-def]
                     out[row, u] = int(measured)
 
 
-@_jit
+@kernel
 def dim(row0, row1, intrinsics, pose, depth, light, height, spots, color):  # type: ignore[no-untyped-def]
     """Darken the colour of rows where a soft spot hides the lamp.
 
@@ -142,7 +140,7 @@ def dim(row0, row1, intrinsics, pose, depth, light, height, spots, color):  # ty
                 color[row, column, ch] *= factor
 
 
-@_jit
+@kernel
 def expose(row0, row1, seed, color, gains, offset, read_noise, shot_noise, out):  # type: ignore[no-untyped-def]
     """8-bit colours of rows: gain of each row and channel, shot and read noise, rounding, clipping."""
     width = color.shape[1]
