@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.frame import Frame, Sequence
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 
 HEIGHT = 480
 STRIP = 64
+ALIGN_FROM = 30
+"""Tracked frames with ground truth from which on the estimate is drawn aligned."""
 KEPT = (60, 220, 60)
 CULLED = (235, 50, 50)
 MASK = (255, 120, 0)
@@ -33,8 +36,8 @@ class Canvas:
     """Draws the frames of one episode; all pictures of a sequence have the same even size, as video encoders want.
 
     Left: the image the tracker saw, with kept features in green, culled ones in red and the dynamic mask in orange.
-    Right: the estimated camera centres (blue) over the ground truth (grey), both in the first camera's frame, seen from
-    above: x to the right, z (forward) up, with a scale bar. Below: state, counts and errors.
+    Right: the estimated camera centres (blue), aligned, over the ground truth (grey), both in the first camera's frame,
+    seen from above: x to the right, z (forward) up, with a scale bar. Below: state, counts and errors.
 
     Args:
         sequence: The sequence of the episode.
@@ -112,7 +115,7 @@ class _Plan:
 
     def draw(self, episode: Episode, truth: dict[int, Array]) -> Image:
         plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
-        estimate, runs = _estimate_from_first(episode, truth)
+        estimate, runs = _estimate_beside_truth(episode, truth)
         to_pixel, metres_a_pixel = self._view(estimate)
         _grid(plot, to_pixel, metres_a_pixel)
         if len(self._known) > 1:
@@ -158,17 +161,27 @@ def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
     return {i: origin @ pose for i, pose in known.items()}
 
 
-def _estimate_from_first(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice]]:
-    """Estimated centres (x, z), joined to the truth at the first frame that has both, and runs without a gap."""
+def _estimate_beside_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice]]:
+    """Estimated centres (x, z) in the truth's frame, and runs without a gap.
+
+    They are joined at the first frame that has both, and aligned by least squares over all frames so far (as for the
+    ATE) from `ALIGN_FROM` frames on.
+    """
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
         return np.zeros((0, 2)), []
-    both = [(index, pose) for index, pose in tracked if index in truth]
-    join = truth[both[0][0]] @ se3.inverse(both[0][1]) if both else se3.inverse(tracked[0][1])
-    points = np.array([(join @ pose)[[0, 2], 3] for _, pose in tracked])
+    poses = np.array([pose for _, pose in tracked])
+    both = [row for row, (index, _) in enumerate(tracked) if index in truth]
+    true = np.array([truth[tracked[row][0]] for row in both])
+    if len(both) >= ALIGN_FROM:
+        placed = align(poses[both], true, "se3").apply(poses)
+    elif both:
+        placed = true[0] @ se3.inverse(poses[both[0]]) @ poses
+    else:
+        placed = se3.inverse(poses[0]) @ poses
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
-    bounds = [0, *breaks.tolist(), len(points)]
-    return points, [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    bounds = [0, *breaks.tolist(), len(placed)]
+    return placed[:, [0, 2], 3], [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:

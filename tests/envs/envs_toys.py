@@ -152,7 +152,7 @@ class ToyTracker:
         )  # fmt: skip
         if self.settings.mode != "ok" and self.settings.at <= frame.index < self.settings.until:
             result = misbehave(self.settings.mode, result)
-        if result.state == "ok" and result.T_world_cam is not None:
+        if isinstance(result, TrackResult) and result.state == "ok" and result.T_world_cam is not None:
             self._poses[frame.timestamp] = result.T_world_cam
         return result
 
@@ -195,7 +195,7 @@ def misbehave(mode: str, result: TrackResult) -> TrackResult:
 
         os._exit(3)
     if mode == "memory":
-        hoard = [np.ones(2**24) for _ in range(64)]  # 8 GiB, 128 MiB at a time
+        hoard = [np.ones(2**23) for _ in range(64)]  # 4 GiB, 64 MiB at a time
         assert hoard
     if mode == "memoryerror":
         raise MemoryError("the toy tracker ran out of memory on purpose")
@@ -225,3 +225,6 @@ def _spec(name: str, factory: str, presets: Mapping[str, Mapping[str, object]] |
 
 SPEC = _spec("toy", "ToyTracker", {"quiet": {"noise.level_m": 1e-4}})
 FIXED = _spec("toy-fixed", "FixedTracker")
+
+TARGET = f"{__file__}:SPEC"
+"""The toy tracker as users name it."""

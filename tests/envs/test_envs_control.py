@@ -1,0 +1,105 @@
+"""Actions and the settings they stand for."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from envs_toys import TARGET, ToySequence
+
+from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.envs import ActionMap, SlamEnv
+
+
+class Group(Settings):
+    linear: float = tunable(1.0, low=0.0, high=4.0, online=True, meaning="x")
+    log: float = tunable(1.0, low=0.01, high=100.0, scale="log", online=True, meaning="x")
+    count: int = tunable(3, low=1, high=5, online=True, meaning="x")
+    log_count: int = tunable(8, low=1, high=64, scale="log", online=True, meaning="x")
+    flag: bool = tunable(False, online=True, meaning="x")
+    kind: Literal["a", "b", "c"] = tunable("b", online=True, meaning="x")
+
+
+class Root(Settings):
+    group: Group = Group()
+
+
+NAMES = [f"group.{name}" for name in ("linear", "log", "count", "log_count", "flag", "kind")]
+
+
+def test_ends_and_middle_of_every_axis() -> None:
+    actions = ActionMap(Root(), NAMES)
+    assert list(actions.values(-np.ones(6)).values()) == [0.0, 0.01, 1, 1, False, "a"]
+    assert list(actions.values(np.zeros(6)).values()) == [2.0, pytest.approx(1.0), 3, 8, True, "b"]
+    assert list(actions.values(np.ones(6)).values()) == [4.0, 100.0, 5, 64, True, "c"]
+    assert list(actions.values(np.full(6, 9.0)).values()) == list(actions.values(np.ones(6)).values())
+
+
+def test_values_have_the_fields_types() -> None:
+    values = ActionMap(Root(), NAMES).values(np.full(6, 0.3, np.float32))
+    assert [type(value) for value in values.values()] == [float, float, int, int, bool, str]
+
+
+def test_encoding_is_the_inverse() -> None:
+    actions = ActionMap(Root(), NAMES)
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        settings = actions.settings(rng.uniform(-1, 1, 6))
+        again = actions.settings(actions.encode(settings))
+        assert again.group.model_dump(exclude={"linear", "log"}) == settings.group.model_dump(exclude={"linear", "log"})
+        assert again.group.linear == pytest.approx(settings.group.linear, abs=1e-6)
+        assert again.group.log == pytest.approx(settings.group.log, rel=1e-6)
+
+
+def test_every_choice_has_an_equal_share() -> None:
+    actions = ActionMap(Root(), ["group.kind"])
+    chosen = [actions.values([a])["group.kind"] for a in np.linspace(-1, 1, 3001)]
+    assert all(abs(chosen.count(kind) - 1000) <= 2 for kind in "abc")
+
+
+def test_spaces() -> None:
+    assert ActionMap(Root(), []).space() == gym.spaces.Discrete(1)
+    assert ActionMap(Root(), NAMES).space() == gym.spaces.Box(-1, 1, (6,), np.float32)
+
+
+def test_unfit_actions() -> None:
+    actions = ActionMap(Root(), NAMES)
+    with pytest.raises(SettingsError, match=r"shape \(2,\), 6 settings"):
+        actions.settings([0, 0])
+    with pytest.raises(SettingsError, match="NaN"):
+        actions.settings([0, 0, np.nan, 0, 0, 0])
+
+
+def test_an_action_is_in_force_from_its_frame_on_and_reset_undoes_it() -> None:
+    env = SlamEnv(ToySequence(12), TARGET, control=["noise.enabled", "noise.level_m"])
+    off, loud = np.array([-1.0, 0.0]), np.array([1.0, 1.0])
+    env.reset(seed=0)
+    errors = [env.step(action)[4]["frame_error_trans_m"] for action in (off, off, loud, off, off)]
+    assert errors[0] < 0.01 and errors[1] == pytest.approx(0, abs=1e-12)
+    assert errors[2] > 0.02 and errors[3] > 0.02
+    assert errors[4] == pytest.approx(0, abs=1e-12)
+    first, _ = env.reset(seed=0)
+    fresh, _ = SlamEnv(ToySequence(12), TARGET, control=["noise.enabled", "noise.level_m"]).reset(seed=0)
+    assert first.tobytes() == fresh.tobytes()
+
+
+def test_the_neutral_action_changes_nothing() -> None:
+    plain, steered = SlamEnv(ToySequence(8), TARGET), SlamEnv(ToySequence(8), TARGET, control=["noise.passes"])
+    for env in (plain, steered):
+        env.reset(seed=3)
+        for _ in range(7):
+            env.step(env.neutral_action)
+    assert plain.online_trajectory().T_world_cam.tobytes() == steered.online_trajectory().T_world_cam.tobytes()
+
+
+def test_our_own_tracker_can_be_steered(real_data: str) -> None:
+    env = SlamEnv(
+        "tum/fr1/xyz", "emfoa-oft", control=["flow.budget"], data_root=real_data,
+        settings={"segmentation.source": "none"}, frames=(0, 4),
+    )  # fmt: skip
+    env.reset(seed=0)
+    spent = [env.step(np.array([action]))[4]["stats"]["flow_evaluations_per_point"] for action in (-1.0, 1.0, -1.0)]
+    assert spent[1] > 2 * spent[0] and spent[1] > 2 * spent[2]

@@ -1,0 +1,229 @@
+"""Rewards, errors, ends and infos of an episode."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from envs_toys import STEP_M, TARGET, ToySequence, truth
+
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.envs import SlamEnv, TrackerContractError
+from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.geometry import se3
+
+QUIET = {"noise.enabled": False}
+MOTION_M = float(np.hypot(STEP_M, 0.002))
+
+
+def play(env: SlamEnv, seed: int = 0) -> tuple[list[float], list[dict], list[tuple[bool, bool]]]:
+    _, info = env.reset(seed=seed)
+    rewards, infos, ends = [], [info], []
+    while not ends or not any(ends[-1]):
+        _, reward, terminated, truncated, info = env.step(env.neutral_action)
+        rewards.append(reward)
+        infos.append(info)
+        ends.append((terminated, truncated))
+    return rewards, infos, ends
+
+
+def test_an_episode_has_one_step_less_than_frames_and_is_truncated() -> None:
+    rewards, infos, ends = play(SlamEnv(ToySequence(12), TARGET))
+    assert len(rewards) == 11
+    assert [info["frame_index"] for info in infos] == list(range(12))
+    assert ends[:-1] == [(False, False)] * 10 and ends[-1] == (False, True)
+
+
+def test_a_perfect_tracker_earns_nothing_negative() -> None:
+    for reward in ("neg_rpe", "neg_pose_error"):
+        rewards, infos, _ = play(SlamEnv(ToySequence(12), TARGET, settings=QUIET, reward=reward))
+        assert np.allclose(rewards, 0, atol=1e-9)
+        assert all(info["pose_error_trans_m"] < 1e-9 for info in infos)
+
+
+def test_rewards_are_minus_the_errors_in_info() -> None:
+    rewards, infos, _ = play(SlamEnv(ToySequence(12), TARGET))
+    assert rewards == [-info["frame_error_trans_m"] for info in infos[1:]]
+    assert max(rewards) < 0
+    rewards, infos, _ = play(SlamEnv(ToySequence(12), TARGET, reward="neg_pose_error"))
+    assert rewards == [-info["pose_error_trans_m"] for info in infos[1:]]
+
+
+def test_pose_error_against_an_independent_computation() -> None:
+    env = SlamEnv(ToySequence(12), TARGET)
+    _, infos, _ = play(env)
+    estimate, true = env.online_trajectory().T_world_cam, truth(12)
+    for i, info in enumerate(infos):
+        error = np.linalg.inv(np.linalg.inv(true[0]) @ true[i]) @ (np.linalg.inv(estimate[0]) @ estimate[i])
+        assert info["pose_error_trans_m"] == pytest.approx(np.linalg.norm(error[:3, 3]), abs=1e-12)
+        angle = np.rad2deg(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)))
+        assert info["pose_error_rot_deg"] == pytest.approx(angle, abs=1e-5)
+
+
+def test_lost_frames_earn_the_error_of_not_moving() -> None:
+    env = SlamEnv(ToySequence(12), TARGET, settings=QUIET | {"mode": "lost", "at": 4, "until": 7})
+    rewards, infos, _ = play(env)
+    assert np.allclose(rewards[:3], 0, atol=1e-9) and np.allclose(rewards[7:], 0, atol=1e-9)
+    assert np.allclose(rewards[3:7], -MOTION_M, atol=1e-9)  # frames 4, 5, 6, and the way back at 7
+    assert [info["tracking_state"] for info in infos[4:7]] == ["lost"] * 3
+    assert all("pose" not in info for info in infos[4:7])
+    assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(9 / 12)
+
+
+def test_losing_track_costs_the_distance_from_the_last_pose() -> None:
+    env = SlamEnv(ToySequence(12), TARGET, settings=QUIET | {"mode": "lost"}, reward="neg_pose_error")
+    rewards, _, _ = play(env)
+    true = truth(12)
+    away = [np.linalg.norm((np.linalg.inv(true[i]) @ true[3])[:3, 3]) for i in range(4, 12)]
+    assert np.allclose(rewards[3:], -np.array(away), atol=1e-9)
+
+
+@pytest.mark.parametrize("reward", ["neg_rpe", "neg_pose_error"])
+def test_quitting_never_pays(reward: str) -> None:
+    lost = QUIET | {"mode": "lost", "at": 4}
+    whole, _, _ = play(SlamEnv(ToySequence(20), TARGET, settings=lost, reward=reward))
+    short, infos, ends = play(SlamEnv(ToySequence(20), TARGET, settings=lost, reward=reward, lost_after=3))
+    assert len(short) == 6 and ends[-1] == (True, False)
+    assert sum(short) == pytest.approx(sum(whole), abs=1e-12)
+    assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(4 / 20)
+
+
+def test_a_tracker_that_never_begins_is_charged_too() -> None:
+    rewards, infos, _ = play(SlamEnv(ToySequence(8), TARGET, settings={"mode": "initialising", "at": 0}))
+    assert np.allclose(rewards, -MOTION_M, atol=1e-9)
+    assert "ate_rmse_m" not in infos[-1]["episode_metrics"]
+    assert infos[-1]["episode_metrics"]["coverage"] == 0
+
+
+def test_without_ground_truth_errors_are_left_out() -> None:
+    rewards, infos, _ = play(SlamEnv(ToySequence(8, has_truth=False), TARGET))
+    assert rewards == [0.0] * 7
+    assert not any(key.startswith(("pose_error", "frame_error")) for info in infos for key in info)
+    assert infos[-1]["episode_metrics"] == {"coverage": 1.0, "frames": 8.0, "tracked_frames": 8.0}
+
+
+def test_a_hole_in_the_ground_truth() -> None:
+    _, infos, _ = play(SlamEnv(ToySequence(12, hole=(4, 8)), TARGET))
+    have = ["pose_error_trans_m" in info for info in infos]
+    assert have == [True] * 4 + [False] * 4 + [True] * 4
+    assert "frame_error_trans_m" not in infos[8] and "frame_error_trans_m" in infos[9]
+    assert all(np.isfinite(value) for info in infos for value in info.values() if isinstance(value, float))
+
+
+def test_the_last_info_carries_the_metrics_of_the_protocol() -> None:
+    env = SlamEnv(ToySequence(40), TARGET, protocol="evo-default")
+    _, infos, _ = play(env)
+    assert "episode_metrics" not in infos[-2] and infos[-1]["protocol"] == "evo-default"
+    want = evaluate(
+        env.online_trajectory(), env.sequence.ground_truth, "evo-default", input_timestamps=env.sequence.timestamps
+    ).metrics
+    assert {key: infos[-1]["episode_metrics"][key] for key in want} == want
+
+
+def test_info_holds_no_times_and_timings_do() -> None:
+    env = SlamEnv(ToySequence(5), TARGET)
+    _, infos, _ = play(env)
+    assert not any("time" in key and key != "timestamp" for info in infos for key in info)
+    assert len(env.timings) == 5
+    assert list(env.timings[0]) == ["read", "total", "features", "tracking"]
+
+
+def test_pose_in_info_is_the_tracked_pose() -> None:
+    env = SlamEnv(ToySequence(5), TARGET)
+    _, infos, _ = play(env)
+    poses = np.array([info["pose"] for info in infos])
+    assert poses.dtype == np.float64
+    again = se3.from_quaternion(poses[:, :3], poses[:, 3:])
+    assert np.allclose(again, env.online_trajectory().T_world_cam, atol=1e-12)
+
+
+def test_frames_and_stride_cut_the_sequence(toy_folder: str) -> None:
+    env = SlamEnv(toy_folder, TARGET, frames="10:40", stride=3)
+    assert len(env.sequence) == 10
+    _, infos, _ = play(env)
+    assert infos[1]["timestamp"] - infos[0]["timestamp"] == pytest.approx(0.1, abs=1e-5)
+    in_memory = SlamEnv(ToySequence(60), TARGET, frames=[10, 40], stride=3)
+    assert np.allclose(in_memory.sequence.timestamps, env.sequence.timestamps, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        ("nan", r"frame 4 returned a pose with 16 values that are not finite"),
+        ("scaled", r"frame 4 returned a pose that is no rigid transformation: .* det R = 8"),
+        ("mirrored", r"frame 4 returned a pose that is no rigid transformation: .* det R = -1"),
+        ("none", r"frame 4 returned state 'ok' without a pose"),
+        ("string", r"frame 4 returned a str"),
+    ],
+)
+def test_a_tracker_that_breaks_its_contract(mode: str, message: str) -> None:
+    env = SlamEnv(ToySequence(12), TARGET, settings={"mode": mode})
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(0)
+    with pytest.raises(TrackerContractError, match=message):
+        env.step(0)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"tracker": "emfoa-otf"}, DynslamError, "unknown tracker 'emfoa-otf'.*emfoa-oft"),
+        ({"settings": {"nois.level_m": 1}}, SettingsError, "unknown setting 'nois.level_m'.*noise.level_m"),
+        ({"settings": {"noise.level_m": 7.0}}, SettingsError, "'noise.level_m' is 7.0"),
+        ({"control": ["noise.levelm"]}, SettingsError, "unknown setting 'noise.levelm'.*noise.level_m"),
+        ({"control": ["noise.seedless"]}, SettingsError, "'noise.seedless' may not change in mid-episode"),
+        ({"control": ["mode"]}, SettingsError, "'mode' may not change in mid-episode"),
+        ({"control": ["noise.clip", "noise.clip"]}, SettingsError, "twice"),
+        ({"control": "noise.clip"}, SettingsError, "list of setting names"),
+        ({"reward": "neg_ate"}, SettingsError, "unknown reward 'neg_ate'"),
+        ({"observation": "pixels"}, SettingsError, "unknown observation 'pixels'"),
+        ({"protocol": "tum-rgbd/v2"}, DynslamError, "unknown protocol 'tum-rgbd/v2'.*tum-rgbd/v1"),
+        ({"device": "gpu"}, SettingsError, "unknown device 'gpu'"),
+        ({"device": "cuda:99"}, SettingsError, "cuda:99"),
+        ({"render_mode": "human"}, SettingsError, "unknown render mode"),
+        ({"lost_after": 0}, SettingsError, "lost_after is 0"),
+        ({"threads": 0}, SettingsError, "threads is 0"),
+        ({"stride": 0}, SequenceError, "stride is 0"),
+        ({"frames": (5, 6)}, SequenceError, "1 frames here, an episode needs 2"),
+        ({"frames": (50, 60)}, SequenceError, "0 frames here"),
+        ({"frames": (5, 2)}, SequenceError, "5:2"),
+        ({"frames": (1, 2, 3)}, SequenceError, "3 entries"),
+        ({"sequence": "tum/fr3/walkingxyz"}, SequenceError, "did you mean 'tum/fr3/walking_xyz'"),
+    ],
+)
+def test_bad_input_is_one_clear_line(kwargs: dict, error: type, message: str) -> None:
+    arguments = {"sequence": ToySequence(12), "tracker": TARGET} | kwargs
+    with pytest.raises(error, match=message) as caught:
+        SlamEnv(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_sequence_names_url_path_and_command(tmp_path) -> None:
+    with pytest.raises(SequenceError, match=r"https?://.*sequences fetch tum/fr3/walking_xyz"):
+        SlamEnv("tum/fr3/walking_xyz", TARGET, data_root=tmp_path)
+
+
+def test_steps_out_of_order() -> None:
+    env = SlamEnv(ToySequence(3), TARGET)
+    with pytest.raises(DynslamError, match="before reset"):
+        env.step(0)
+    play(env)
+    with pytest.raises(DynslamError, match="episode is over after frame 2"):
+        env.step(0)
+    env.close()
+    env.reset(seed=1)
+    env.step(0)
+
+
+def test_reset_options() -> None:
+    env = SlamEnv(ToySequence(6), TARGET)
+    env.reset(seed=0, options={"settings": {"noise.level_m": 0.05}, "sequence": ToySequence(9)})
+    assert len(env.sequence) == 9 and env.settings.noise.level_m == 0.05
+    with pytest.raises(SettingsError, match="unknown reset option 'sequnce'"):
+        env.reset(options={"sequnce": "x"})
+
+
+def test_a_tracker_that_cannot_be_steered(toy_folder: str) -> None:
+    env = SlamEnv(toy_folder, TARGET.replace(":SPEC", ":FIXED"), control=["noise.clip"])
+    with pytest.raises(TrackerError, match="toy-fixed' cannot be steered in mid-episode"):
+        env.reset()

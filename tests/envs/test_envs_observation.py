@@ -1,0 +1,68 @@
+"""What an agent sees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from envs_toys import CAMERA, TARGET, ToySequence, images
+
+from dynslam_bench.envs import STATS_LAYOUT, SlamEnv
+from dynslam_bench.envs.observation import MAX_DEPTH_M, ObservationContext, stats_observation, stats_space
+from dynslam_bench.geometry import se3
+from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.slam.result import TrackResult
+
+FRAME = Frame(3, 1.0, *images(3))
+
+
+def observe(result: TrackResult, frame: Frame = FRAME, motion: np.ndarray | None = None) -> dict[str, float]:
+    vector = stats_observation(frame, result, ObservationContext(3, 6, 0, motion))
+    assert vector in stats_space() and np.isfinite(vector).all()
+    return dict(zip((name for name, _ in STATS_LAYOUT), vector.tolist(), strict=True))
+
+
+def test_every_entry_means_what_is_documented() -> None:
+    stats = {
+        "keypoints": 1000.0, "culled": 250.0, "matches": 300.0, "inliers": 150.0, "residual_px": 1.0,
+        "mask_fraction": 0.25, "map_points": 5000.0, "keyframes": 100.0, "keyframe": 1.0,
+    }  # fmt: skip
+    motion = se3.exp(np.array([0.1, 0, -0.1, 0, 0.1, 0]))
+    seen = observe(TrackResult(np.eye(4), "ok", stats), motion=motion)
+    assert (seen["initialising"], seen["ok"], seen["lost"]) == (0, 1, 0)
+    assert seen["progress"] == 0.5 and seen["keypoints"] == 0.5 and seen["culled"] == 0.25
+    assert seen["matches"] == pytest.approx(0.4) and seen["inliers"] == 0.5 and seen["residual"] == 0.5
+    assert seen["mask_fraction"] == 0.25 and seen["map_points"] == 0.5 and seen["keyframes"] == 0.5
+    assert seen["keyframe"] == 1
+    assert seen["motion_x"] == pytest.approx(np.tanh(1)) and seen["motion_z"] == pytest.approx(-np.tanh(1))
+    assert seen["motion_ry"] == pytest.approx(np.tanh(1)) and seen["motion_rx"] == pytest.approx(0, abs=1e-9)
+    assert seen["depth_valid"] == 1 and seen["depth_median"] == pytest.approx(1.3 / 4.3)
+    assert seen["brightness"] == pytest.approx(FRAME.rgb.mean() / 255, abs=0.03)
+
+
+def test_nothing_reported_and_nonsense_reported_stay_in_bounds() -> None:
+    assert observe(TrackResult(None, "lost"))["lost"] == 1
+    wild = {"keypoints": np.inf, "culled": -5.0, "matches": 1e30, "inliers": np.nan, "mask_fraction": 7.0}
+    observe(TrackResult(np.eye(4), "ok", wild), motion=se3.exp(np.array([1e6, 0, 0, 3, 0, 0])))
+    black = replace(FRAME, rgb=np.zeros_like(FRAME.rgb), depth=np.zeros_like(FRAME.depth))
+    seen = observe(TrackResult(None, "initialising"), black)
+    assert seen["brightness"] == seen["contrast"] == seen["depth_valid"] == seen["depth_median"] == 0
+
+
+def test_rgbd_holds_copies_of_the_images() -> None:
+    env = SlamEnv(ToySequence(4), TARGET, observation="rgbd")
+    seen, _ = env.reset(seed=0)
+    assert seen["rgb"].shape == (CAMERA.height, CAMERA.width, 3) and seen["depth"].shape == seen["rgb"].shape[:2]
+    assert (seen["rgb"] == images(0)[0]).all() and (seen["depth"] == images(0)[1]).all()
+    assert not np.shares_memory(seen["rgb"], env.frame.rgb) and not np.shares_memory(seen["depth"], env.frame.depth)
+    assert seen in env.observation_space
+    assert env.observation_space["depth"].high.max() == MAX_DEPTH_M
+
+
+def test_no_ground_truth_in_the_observation() -> None:
+    with_truth, without = SlamEnv(ToySequence(8), TARGET), SlamEnv(ToySequence(8, has_truth=False), TARGET)
+    for env in (with_truth, without):
+        env.reset(seed=4)
+    for _ in range(7):
+        assert with_truth.step(0)[0].tobytes() == without.step(0)[0].tobytes()

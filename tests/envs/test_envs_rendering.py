@@ -1,0 +1,77 @@
+"""The rendered picture."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from envs_toys import TARGET, ToySequence
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.envs import SlamEnv
+from dynslam_bench.envs.rendering import CULLED, ESTIMATE, HEIGHT, KEPT, MASK, STRIP, TRUTH
+
+
+def pixels(image: np.ndarray, colour: tuple[int, int, int]) -> int:
+    return int((image == np.array(colour, np.uint8)).all(axis=2).sum())
+
+
+def rendered(steps: int = 11, **kwargs) -> np.ndarray:
+    sequence = kwargs.pop("sequence", ToySequence(12))
+    env = SlamEnv(sequence, TARGET, render_mode="rgb_array", **kwargs)
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(0)
+    image = env.render()
+    assert image is not None and image.dtype == np.uint8
+    return image
+
+
+def test_size_is_even_and_the_same_for_every_frame() -> None:
+    shapes = {rendered(steps).shape for steps in (0, 1, 11)}
+    assert shapes == {(HEIGHT + STRIP, 640 + HEIGHT, 3)}
+    assert (HEIGHT + STRIP) % 2 == 0
+
+
+def test_kept_and_culled_features_and_the_mask_are_drawn_in_their_colours() -> None:
+    picture = rendered()[:HEIGHT, :640]
+    assert pixels(picture, KEPT) > pixels(picture, CULLED) > 50
+    orange = np.abs(picture[240, 160:200].astype(float).mean(axis=0) - MASK)
+    plain = np.abs(picture[240, 500:600].astype(float).mean(axis=0) - MASK)
+    assert orange.sum() < plain.sum()
+
+
+def test_estimate_and_truth_are_drawn_from_above() -> None:
+    plot = rendered()[:HEIGHT, 640:]
+    assert pixels(plot, ESTIMATE) > 200 and pixels(plot, TRUTH) > 20
+    columns = np.argwhere((plot == np.array(ESTIMATE, np.uint8)).all(axis=2))[:, 1]
+    assert columns.max() - columns.min() > 300  # the toy camera walks to the right, which fills the plot
+
+
+def test_no_ground_truth_and_lost_frames_are_no_trouble() -> None:
+    rendered(sequence=ToySequence(12, has_truth=False))
+    rendered(settings={"mode": "lost", "at": 3, "until": 6})
+    rendered(settings={"mode": "initialising", "at": 0})
+
+
+def test_two_pictures_of_one_frame_are_equal() -> None:
+    assert (rendered() == rendered()).all()
+
+
+def test_render_without_reset_or_mode() -> None:
+    with pytest.raises(DynslamError, match="before reset"):
+        SlamEnv(ToySequence(12), TARGET, render_mode="rgb_array").render()
+    env = SlamEnv(ToySequence(12), TARGET)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
+
+
+def test_video_encoders_take_it(tmp_path) -> None:
+    image = rendered(3)
+    size = (image.shape[1], image.shape[0])
+    writer = cv2.VideoWriter(str(tmp_path / "v.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, size)
+    for _ in range(3):
+        writer.write(image[:, :, ::-1].copy())
+    writer.release()
+    assert (tmp_path / "v.mp4").stat().st_size > 1000

@@ -1,0 +1,164 @@
+"""The wrappers: timings, trajectories, dropped and degraded frames, sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from envs_toys import TARGET, ToySequence, images
+
+from dynslam_bench.core.errors import DynslamError, SettingsError
+from dynslam_bench.envs import (
+    Degradation,
+    DegradeFrames,
+    DropFrames,
+    RecordTimings,
+    RecordTrajectory,
+    SequenceSampler,
+    SlamEnv,
+)
+from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.sequences.frame import Frame
+
+
+def play(env) -> list[tuple]:
+    env.reset(seed=0)
+    steps = []
+    while not steps or not (steps[-1][2] or steps[-1][3]):
+        steps.append(env.step(0))
+    return steps
+
+
+def test_record_timings() -> None:
+    env = RecordTimings(SlamEnv(ToySequence(6), TARGET))
+    _, info = env.reset(seed=0)
+    assert info["timings"]["features"] == 0.001 and info["timings"]["total"] > 0
+    for _ in range(5):
+        assert env.step(0)[4]["timings"]["tracking"] == 0.002
+    assert env.summary()["features"] == {"median": 0.001, "p95": 0.001}
+
+
+def test_record_trajectory(tmp_path) -> None:
+    base = SlamEnv(ToySequence(6), TARGET, settings={"mode": "lost", "at": 2, "until": 4})
+    env = RecordTrajectory(base, tmp_path / "run_{episode}.txt")
+    for episode in range(2):
+        play(env)
+        written = read_tum(tmp_path / f"run_{episode}.txt")
+        assert len(written) == 4
+        assert np.allclose(written.T_world_cam, base.online_trajectory().T_world_cam, atol=1e-8)
+    assert [path.name for path in env.written] == ["run_0.txt", "run_1.txt"]
+
+
+def test_a_tracker_at_half_the_frame_rate_sees_every_other_frame() -> None:
+    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=1.9 / 30)
+    steps = play(env)
+    assert [step[4]["frame_index"] for step in steps] == [1, 3, 5, 7, 9, 10]
+    assert env.dropped == 4
+    assert steps[-1][3] and steps[-1][4]["episode_metrics"]["coverage"] == pytest.approx(7 / 11)
+
+
+def test_a_tracker_that_keeps_up_drops_nothing() -> None:
+    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=0.9 / 30)
+    assert [step[4]["frame_index"] for step in play(env)] == list(range(1, 11)) and env.dropped == 0
+    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=0.9 / 30, speed=2.0)
+    assert [step[4]["frame_index"] for step in play(env)] == [1, 3, 5, 7, 9, 10]
+
+
+def test_dropped_frames_cost_the_error_of_not_moving() -> None:
+    quiet = {"noise.enabled": False}
+    whole = sum(step[1] for step in play(SlamEnv(ToySequence(11), TARGET, settings=quiet)))
+    dropping = play(DropFrames(SlamEnv(ToySequence(11), TARGET, settings=quiet), frame_time_s=1.9 / 30))
+    motion = np.hypot(0.01, 0.002)
+    assert whole == pytest.approx(0, abs=1e-9)
+    assert sum(step[1] for step in dropping) == pytest.approx(-8 * motion, abs=1e-6)  # 4 dropped, 4 ways back
+
+
+def test_a_tracker_slower_than_the_whole_sequence_still_gets_the_last_frame() -> None:
+    steps = play(DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=100.0))
+    assert [step[4]["frame_index"] for step in steps] == [10]
+
+
+def test_random_drops_are_seeded_and_near_their_share() -> None:
+    def seen(seed: int) -> list[int]:
+        env = DropFrames(SlamEnv(ToySequence(200), TARGET), share=0.3, seed=seed)
+        return [step[4]["frame_index"] for step in play(env)]
+
+    assert seen(1) == seen(1) != seen(2)
+    assert 120 < len(seen(1)) < 160 and seen(1)[-1] == 199
+
+
+def test_real_time_with_measured_times_drops_frames_of_a_slow_tracker() -> None:
+    env = DropFrames(SlamEnv(ToySequence(11), TARGET), speed=1e6)
+    assert play(env)[-1][4]["frame_index"] == 10 and env.dropped >= 8
+
+
+def test_dropping_more_than_is_left() -> None:
+    env = SlamEnv(ToySequence(5), TARGET)
+    env.reset(seed=0)
+    with pytest.raises(DynslamError, match="cannot drop 4 frames, 3 are left"):
+        env.drop_frames(4)
+
+
+@pytest.mark.parametrize("kind", ["lighting", "glare", "shadow", "blur", "noise"])
+def test_degradation_grows_with_its_strength_and_repeats(kind: str) -> None:
+    frame = Frame(7, 1.0, *images(7))
+    changes = []
+    for strength in (0.0, 0.3, 1.0):
+        degraded = Degradation(**{kind: strength}, seed=3)(frame)
+        assert degraded.rgb.dtype == np.uint8 and degraded.rgb.shape == frame.rgb.shape
+        assert (Degradation(**{kind: strength}, seed=3)(frame).rgb == degraded.rgb).all()
+        assert (degraded.depth == frame.depth).all()
+        changes.append(float(np.abs(degraded.rgb.astype(float) - frame.rgb).mean()))
+    assert changes[0] == 0 and 0 < changes[1] < changes[2]
+    assert (Degradation(**{kind: 1.0}, seed=4)(frame).rgb != Degradation(**{kind: 1.0}, seed=3)(frame).rgb).any()
+
+
+def test_what_each_degradation_does() -> None:
+    gray = Frame(20, 1.0, np.full((120, 160, 3), 120, np.uint8), np.full((120, 160), 2.0, np.float32))
+    dark = Degradation(lighting=1.0)(gray).rgb
+    assert dark.mean() < 120
+    shadow = Degradation(shadow=1.0)(gray).rgb[..., 0]
+    assert shadow.min() == pytest.approx(0.15 * 120, abs=2) and shadow.max() == pytest.approx(120, abs=2)
+    glare = Degradation(glare=1.0)(gray).rgb[..., 0]
+    assert (glare == 255).any() and glare.min() >= 120
+    noise = Degradation(noise=0.5)(gray).rgb.astype(float)
+    assert noise.std() == pytest.approx(20, rel=0.05) and noise.mean() == pytest.approx(120, abs=0.5)
+    depth = Degradation(depth_noise=1.0)(gray).depth
+    assert (depth == 0).mean() == pytest.approx(0.3, abs=0.02)
+    assert depth[depth > 0].std() == pytest.approx(0.08, rel=0.05)
+    edge = Frame(20, 1.0, np.repeat(np.uint8([[[0]] * 80 + [[200]] * 80] * 120), 3, axis=2), gray.depth)
+    blurred = Degradation(blur=1.0)(edge).rgb[60, :, 0].astype(int)
+    assert ((blurred > 5) & (blurred < 195)).sum() > 3 and blurred[0] == 0 and blurred[-1] == 200
+
+
+def test_degraded_frames_reach_the_tracker_and_the_observation() -> None:
+    env = DegradeFrames(SlamEnv(ToySequence(5), TARGET, observation="rgbd"), noise=0.5, seed=1)
+    seen, _ = env.reset(seed=0)
+    assert (seen["rgb"] != images(0)[0]).mean() > 0.9
+    assert (seen["rgb"] == env.unwrapped.frame.rgb).all()
+
+
+@pytest.mark.parametrize("kwargs", [{"blur": 1.5}, {"noise": -0.1}])
+def test_strengths_outside_the_range(kwargs: dict) -> None:
+    with pytest.raises(SettingsError, match=r"expected a strength in \[0, 1\]"):
+        DegradeFrames(SlamEnv(ToySequence(5), TARGET), **kwargs)
+
+
+@pytest.mark.parametrize("kwargs", [{"speed": 0}, {"frame_time_s": -1}, {"share": 1.0}])
+def test_drop_frames_outside_the_range(kwargs: dict) -> None:
+    with pytest.raises(SettingsError):
+        DropFrames(SlamEnv(ToySequence(5), TARGET), **kwargs)
+
+
+def test_sequence_sampler(toy_folder: str, tmp_path) -> None:
+    from envs_toys import write_folder
+
+    other = str(write_folder(tmp_path / "other", 8))
+    env = SequenceSampler(SlamEnv(toy_folder, TARGET), [toy_folder, other])
+    drawn = [env.reset(seed=0)[1]["sequence"]] + [env.reset()[1]["sequence"] for _ in range(3)]
+    assert drawn == [toy_folder, other, toy_folder, other]
+    env = SequenceSampler(SlamEnv(toy_folder, TARGET), [toy_folder, other], mode="random")
+    first = [env.reset(seed=5)[1]["sequence"]] + [env.reset()[1]["sequence"] for _ in range(9)]
+    second = [env.reset(seed=5)[1]["sequence"]] + [env.reset()[1]["sequence"] for _ in range(9)]
+    assert first == second and set(first) == {toy_folder, other}
+    with pytest.raises(SettingsError, match="no sequences"):
+        SequenceSampler(SlamEnv(toy_folder, TARGET), [])
