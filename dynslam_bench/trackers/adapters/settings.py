@@ -32,11 +32,8 @@ class ReplaySettings(Settings):
 
 
 class ProgramSettings(Settings):
-    """How long a foreign program may take, and how it gets the images."""
+    """How long a foreign program may take."""
 
-    images: Literal["raw", "png"] = Field(
-        "raw", description="raw: one memory-mapped file, overwritten at each frame; png: two PNG files a frame"
-    )
     start_timeout_s: float = Field(120.0, gt=0, description="seconds for starting and answering `reset`")
     frame_timeout_s: float = Field(30.0, gt=0, description="seconds for answering one `track`")
     final_timeout_s: float = Field(120.0, gt=0, description="seconds for answering `finalize`")
@@ -47,6 +44,9 @@ class SubprocessSettings(ProgramSettings):
     """Settings of `subprocess:COMMAND`."""
 
     command: str = Field("", description="program and arguments, split as a shell would; run without a shell")
+    images: Literal["raw", "png"] = Field(
+        "raw", description="raw: one memory-mapped file, overwritten at each frame; png: two PNG files a frame"
+    )
     folder: str = Field("", description="working folder of the program; empty for the current one")
     version: str = Field("", description="free text, part of a run's identity; change it with the program")
     final: bool = Field(False, description="whether the program answers `finalize` with a final trajectory")

@@ -6,7 +6,7 @@ import shlex
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -31,9 +31,10 @@ class ProgramTracker:
 
     Args:
         name: For messages.
-        settings: Time limits and the way of the images.
+        settings: Time limits.
         context: Where it runs.
         command: Program and arguments.
+        images: How it gets the images, see `ImageExchange`.
         folder: Its working folder; None for the current one.
         environment: Variables to set beside the inherited ones.
     """
@@ -45,9 +46,11 @@ class ProgramTracker:
         context: TrackerContext,
         command: Sequence[str],
         *,
+        images: Literal["raw", "png"] = "raw",
         folder: Path | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
+        self._images: Literal["raw", "png"] = images
         self.name, self.limits, self.context = name, settings, context
         self._command, self._folder, self._environment = list(command), folder, dict(environment or {})
         self._program: Program | None = None
@@ -63,7 +66,7 @@ class ProgramTracker:
         seed = derive_seed(rng)
         threads = str(self.context.threads)
         limits = {name: threads for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
-        self._exchange = ImageExchange(camera, self.limits.images)
+        self._exchange = ImageExchange(camera, self._images)
         self._program = Program(
             self.name, self._command, folder=self._folder, environment={**limits, **self._environment}
         )
@@ -196,4 +199,4 @@ def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTrack
     if folder is not None and not folder.is_dir():
         raise TrackerError(f"subprocess: no folder {folder}")
     kind = FinalizingProgramTracker if settings.final else ProgramTracker
-    return kind(Path(command[0]).name, settings, context, command, folder=folder)
+    return kind(Path(command[0]).name, settings, context, command, images=settings.images, folder=folder)
