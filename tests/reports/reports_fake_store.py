@@ -11,6 +11,12 @@ from dynslam_bench.runs.machine import Machine
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, StageTime, TrackerInfo
 from dynslam_bench.runs.store import RunStore
 
+LABELS = {
+    "orb-slam2": "ORB-SLAM2 (our back end)",
+    "mask-rcnn": "Mask R-CNN (our back end)",
+    "dynaslam": "DynaSLAM N+G (our back end)",
+    "ds-slam": "DS-SLAM (our back end)",
+}
 MACHINE = Machine(cpu="Test CPU", cores=2, memory_gb=8.0, system="Linux 6 x86_64")
 
 
@@ -89,12 +95,8 @@ def add_run(
 def fill(root, trackers=None, sequences=None, seeds=(0, 1, 2)):
     """A small benchmark: four trackers, one that fails now and then, one control, on four sequences."""
     store = RunStore(root)
-    sequences = sequences or [
-        "synthetic/walking_xyz",
-        "synthetic/walking_rpy",
-        "synthetic/sitting_xyz",
-        "synthetic/sitting_static",
-    ]
+    names = ("walking_xyz", "walking_rpy", "sitting_xyz", "sitting_static")
+    sequences = sequences or [f"synthetic/{name}" for name in names]
     quality = trackers or {"orb-slam2": 0.10, "mask-rcnn": 0.02, "dynaslam": 0.015, "ds-slam": 0.05}
     for sequence in sequences:
         dynamic = "walking" in sequence
@@ -108,9 +110,8 @@ def fill(root, trackers=None, sequences=None, seeds=(0, 1, 2)):
                     status="crashed" if broken else "ok",
                     reason="RuntimeError: the map is empty" if broken else "",
                     lost=range(50, 70) if name == "orb-slam2" and dynamic else (),
-                    label={"orb-slam2": "ORB-SLAM2 (our back end)", "mask-rcnn": "Mask R-CNN (our back end)",
-                           "dynaslam": "DynaSLAM N+G (our back end)", "ds-slam": "DS-SLAM (our back end)"}.get(name, name),
-                    frame_s=0.012 * speed, tags=tags, mask_iou=None if name == "orb-slam2" else 0.9 - 3 * error,
+                    label=LABELS.get(name, name),
+frame_s=0.012 * speed, tags=tags, mask_iou=None if name == "orb-slam2" else 0.9 - 3 * error,
                 )  # fmt: skip
             add_run(
                 store, "constant-velocity", sequence, seed, error=0.3, ranked=False, label="constant velocity",

@@ -1,0 +1,175 @@
+"""The audit of the paper's tables finds what is known of them, and passes tables that are right."""
+
+import numpy as np
+import pytest
+from dynslam_bench.reports import audit as audit_module
+from dynslam_bench.reports.audit import CHECKS, OURS, audit_paper
+from dynslam_bench.reports.reported import Claimed, claimed, published, reported_for
+
+from dynslam_bench.geometry.trajectory import Trajectory
+
+
+@pytest.fixture(scope="module")
+def report():
+    return audit_paper()
+
+
+def keys(findings):
+    return {(f.table, f.system, f.sequence.rpartition("_")[0].rpartition("/")[2], f.quantity) for f in findings}
+
+
+def test_every_cell_breaks_the_identity_of_rmse_mean_and_deviation(report):
+    assert len(report.of("rmse-identity")) == 28
+    assert len(report.failed("rmse-identity")) == 28
+    by_more_than_2_mm = [f for f in report.failed("rmse-identity") if abs(f.printed - f.expected) > 0.002]
+    assert len(by_more_than_2_mm) == 27
+    ours = {f.sequence: f.expected for f in report.of("rmse-identity") if f.system == OURS and f.table == 1}
+    assert ours == {
+        "tum/fr3/sitting_xyz": pytest.approx(0.2324, abs=5e-5),
+        "tum/fr3/walking_xyz": pytest.approx(0.2211, abs=5e-5),
+    }
+
+
+def test_ten_cells_have_an_rmse_below_the_mean(report):
+    assert keys(report.failed("rmse-at-least-mean")) == {
+        (1, "DGS-SLAM", "sitting", "ape_rmse"), (1, "DGS-SLAM", "walking", "ape_rmse"),
+        (1, "YOLO-SLAM", "walking", "ape_rmse"), (1, "ORB-SLAM2", "walking", "ape_rmse"),
+        (1, "OPF-SLAM", "sitting", "ape_rmse"), (1, "DI-SLAM", "sitting", "ape_rmse"), (1, OURS, "sitting", "ape_rmse"),
+        (2, "OPF-SLAM", "sitting", "rpe_rmse"), (2, "DynaTM-SLAM", "sitting", "rpe_rmse"),
+        (2, "DI-SLAM", "sitting", "rpe_rmse"),
+    }  # fmt: skip
+
+
+def test_one_column_of_improvements_repeats_another(report):
+    assert len(report.of("improvement")) == 96
+    failed = report.failed("improvement")
+    assert {(f.table, f.sequence, f.quantity) for f in failed} == {(2, "tum/fr3/walking_xyz", "rpe_rmse")}
+    assert {f.system: round(f.expected, 4) for f in failed} == {
+        "DGS-SLAM": 40.1006, "YOLO-SLAM": 34.5505, "ORB-SLAM2": 29.6030,
+        "OPF-SLAM": 22.6091, "DynaTM-SLAM": 17.1883, "DI-SLAM": 11.8456,
+    }  # fmt: skip
+    assert all("repeats the column of tum/fr3/sitting_xyz" in f.remark for f in failed)
+
+
+def test_systems_that_are_worse_than_not_moving(report):
+    failed = keys(f for f in report.failed("better-than-not-moving") if f.table == 1)
+    both = {
+        (1, name, part, "ape_rmse")
+        for name in ("DGS-SLAM", "YOLO-SLAM", "ORB-SLAM2")
+        for part in ("sitting", "walking")
+    }
+    assert failed == both | {(1, "OPF-SLAM", "walking", "ape_rmse")}
+    relative = keys(f for f in report.failed("better-than-not-moving") if f.table == 2)
+    assert {(s, p) for _, s, p, _ in relative} == {
+        ("DGS-SLAM", "sitting"), ("YOLO-SLAM", "sitting"), ("ORB-SLAM2", "sitting"), ("OPF-SLAM", "sitting"),
+        ("DGS-SLAM", "walking"), ("YOLO-SLAM", "walking"),
+    }  # fmt: skip
+
+
+def test_accuracy_is_a_deviation_in_disguise(report):
+    errors = [f for f in report.of("accuracy") if f.quantity == "error_percent"]
+    assert len(errors) == 14
+    assert not any(f.holds for f in errors)
+    assert max(abs(f.printed - f.expected) for f in errors) == pytest.approx(0.21, abs=0.005)
+    sums = [f for f in report.of("accuracy") if f.quantity == "accuracy_percent"]
+    assert all(f.holds for f in sums)
+
+
+def test_compared_with_what_was_published(report):
+    factors = {(f.system, f.sequence): f.printed / f.expected for f in report.of("published")}
+    assert factors["YOLO-SLAM", "tum/fr3/walking_xyz"] == pytest.approx(23.1, abs=0.1)
+    assert factors["ORB-SLAM2", "tum/fr3/sitting_xyz"] > 30
+    assert factors["ORB-SLAM2", "tum/fr3/walking_xyz"] < 1
+
+
+def test_summary_and_details(report):
+    summary = report.summary()
+    assert [row[0].text for row in summary.rows] == list(CHECKS)
+    assert "75 of 213 findings do not hold" in summary.caption
+    assert len(report.details().rows) == 75
+    assert len(report.details(failed_only=False).rows) == 213
+    assert "| rmse-identity |" in report.to_markdown()
+
+
+def test_a_table_that_is_right_passes(monkeypatch):
+    rng = np.random.default_rng(0)
+    rows = []
+    for system, size in (("A", 0.02), (OURS, 0.01)):
+        error = np.abs(rng.normal(0, size, 500))
+        for sequence in ("tum/fr3/sitting_xyz", "tum/fr3/walking_xyz"):
+            for table, metric in ((1, "ape"), (2, "rpe")):
+                numbers = {
+                    "mean": error.mean(),
+                    "median": np.median(error),
+                    "rmse": np.sqrt((error**2).mean()),
+                    "std": error.std(),
+                }
+                rows += [
+                    Claimed(table, system, sequence, f"{metric}_{k}", "value", round(float(v), 4), 4)
+                    for k, v in numbers.items()
+                ]
+    values = {(c.table, c.system, c.sequence, c.quantity): c.value for c in rows}
+    rows += [
+        Claimed(t, "A", s, q, "improvement_percent", round(100 * (v - values[t, OURS, s, q]) / v, 4), 4)
+        for (t, name, s, q), v in list(values.items())
+        if name == "A"
+    ]
+    monkeypatch.setattr(audit_module, "claimed", lambda: tuple(rows))
+    audited = audit_paper()
+    for check in ("rmse-identity", "rmse-at-least-mean", "improvement", "better-than-not-moving"):
+        assert len(audited.of(check)) > 0
+        assert audited.failed(check) == [], check
+
+
+def test_never_moving_can_be_recomputed_from_ground_truth():
+    n = 400
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 0, 3] = np.where(np.arange(n) % 2, 1.0, -1.0)  # one metre from its centre at all times
+    truth = Trajectory(np.arange(n) / 100, poses)
+    report = audit_paper({"tum/fr3/sitting_xyz": truth})
+    held = {f.expected for f in report.of("better-than-not-moving") if f.table == 1 and "sitting" in f.sequence}
+    assert held == {1.0}
+    assert all(f.holds for f in report.of("better-than-not-moving") if f.table == 1 and "sitting" in f.sequence)
+
+
+# -- the data
+
+
+def test_the_papers_tables_are_complete():
+    values = [c for c in claimed() if c.kind == "value"]
+    assert len(values) == 7 * 8 + 7 * 8 + 7 * 6
+    assert len(claimed()) - len(values) == 96
+    by_key = {(c.table, c.system, c.sequence, c.quantity): c.value for c in values}
+    assert by_key[1, OURS, "tum/fr3/sitting_xyz", "ape_rmse"] == 0.2159
+    assert by_key[2, OURS, "tum/fr3/walking_xyz", "rpe_rmse"] == 0.1667
+    assert by_key[2, OURS, "tum/fr3/walking_xyz", "rpe_std"] == 0.1257
+    assert by_key[3, OURS, "tum/fr3/walking_xyz", "time_ms"] == 32.69
+
+
+def test_published_numbers_are_plausible_and_sourced():
+    rows = published()
+    assert len(rows) > 400
+    assert all(p.source and p.system for p in rows)
+    assert all(0 < p.value < 3 for p in rows if p.unit == "m")
+    assert {p.alignment for p in rows} == {"SE(3) or not stated", "Sim(3)", "not applicable", "not stated"}
+    assert {p.metric for p in rows} == {"ate_rmse_m", "rpe_1s_trans_rmse_m", "rpe_1s_rot_rmse_deg"}
+    keys = [(p.system, p.sequence, p.metric, p.source) for p in rows]
+    assert len(set(keys)) == len(keys)
+    found = {(p.system, p.sequence): p.value for p in rows if p.source == "DynaSLAM paper" and p.metric == "ate_rmse_m"}
+    assert found["DynaSLAM N+G", "tum/fr3/walking_xyz"] == 0.015
+    assert found["ORB-SLAM2", "tum/fr3/walking_xyz"] == 0.459
+
+
+def test_published_sequences_are_catalogued():
+    catalogue = pytest.importorskip("dynslam_bench.sequences.catalogue")
+    assert all(catalogue.entry_of(sequence) is not None for sequence in {p.sequence for p in published()})
+
+
+def test_reported_rows_do_not_mix_alignments():
+    sequences = ["tum/fr3/walking_xyz", "synthetic/walking_xyz"]
+    se3, sim3 = reported_for(sequences), reported_for(sequences, "sim3")
+    assert se3
+    assert sim3
+    assert not {c.system for c in se3} & {c.system for c in sim3}
+    assert reported_for(sequences, "none") == []
+    assert reported_for(["tum/fr3/walking_xyz [0:100]"]) == []  # a part of a sequence is not what was published

@@ -1,0 +1,387 @@
+"""The report of a results folder: what is in it, what it refuses, and that the page needs no network."""
+
+import csv
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from dynslam_bench.reports import ReportData, build_report, compare
+from dynslam_bench.reports.board import make_board
+from dynslam_bench.reports.figures import broken
+from dynslam_bench.reports.rows import RunRow, check_one_protocol, load_runs
+from dynslam_bench.reports.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown
+from dynslam_bench.reports.tables import leaderboard, per_sequence
+from reports_fake_store import add_run, fill, truth_of
+
+from dynslam_bench.core.errors import ReportError
+from dynslam_bench.evaluation import evaluate
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.runs.store import RunStore
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """One filled store and its report, made once."""
+    root = tmp_path_factory.mktemp("results")
+    store = fill(root / "results")
+    add_run(store, "orb-slam3", "synthetic/walking_xyz", kind="imported", label="ORB-SLAM3", error=0.08, frame_s=None)
+    return store, build_report(store, root / "report")
+
+
+def rows_of(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+class Page(HTMLParser):
+    """Collects what a page would fetch, its ids and its table cells."""
+
+    def __init__(self):
+        super().__init__()
+        self.fetched, self.ids, self.stack, self.cells = [], [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        if tag in ("script", "img", "link", "iframe", "source") and (found.get("src") or found.get("href")):
+            self.fetched.append(found)
+        if "id" in found:
+            self.ids.append(found["id"])
+        self.stack.append(tag)
+
+    def handle_endtag(self, tag):
+        while self.stack and self.stack.pop() != tag:
+            pass
+
+
+def test_all_files_are_there(made):
+    _, paths = made
+    assert paths.html.name == "index.html"
+    for path in [paths.html, paths.markdown, paths.latex, paths.data, *paths.csv.values()]:
+        assert path.stat().st_size > 0
+    assert {
+        "leaderboard",
+        "per_sequence",
+        "runs",
+        "failures",
+        "repeatability",
+        "common_frames",
+        "failure_rules",
+    } <= set(paths.csv)
+    assert {"rpe_1s_trans", "rpe_1s_rot", "rpe_1f_trans", "rpe_1f_rot", "mask_iou", "machines"} <= set(paths.csv)
+
+
+def test_the_page_is_complete_in_itself(made):
+    _, paths = made
+    text = paths.html.read_text()
+    page = Page()
+    page.feed(text)
+    assert page.fetched == []
+    assert len(page.ids) == len(set(page.ids))
+    assert text.count("plotly.js v") >= 1
+    assert len(text) < 8e6
+    assert "default-src 'none'" in text
+    figures = json.loads(re.search(r"const FIGURES = (\{.*?\});\n", text, re.DOTALL)[1])
+    assert {"ratio", "speed", "repeat", "masks", "path-0", "error-0", "path-3"} <= set(figures)
+    assert set(figures) <= set(page.ids)
+    for figure in figures.values():
+        assert figure["data"]
+        assert figure["layout"]["height"] > 100
+
+
+def test_the_leaderboard_orders_and_compares(made):
+    _, paths = made
+    board = rows_of(paths.csv["leaderboard"])
+    assert [row["tracker"] for row in board[:4]] == [
+        "DynaSLAM N+G (our back end)", "Mask R-CNN (our back end)", "DS-SLAM (our back end)", "ORB-SLAM2 (our back "
+        "end)",
+    ]  # fmt: skip
+    assert [float(row["#"]) for row in board[:4]] == [1, 2, 3, 4]
+    assert {row["tracker"] for row in board[4:]} == {"ORB-SLAM3", "constant velocity"}
+    assert all(row["#"] == "–" for row in board[4:])
+    assert float(board[3]["ATE ratio"]) == 1.0
+    medians = {row["tracker"]: row for row in rows_of(paths.csv["per_sequence"])}
+    names = [name for name in medians["ORB-SLAM2 (our back end)"] if "synthetic" in name]
+    ratios = [
+        float(medians["DynaSLAM N+G (our back end)"][n]) / float(medians["ORB-SLAM2 (our back end)"][n]) for n in names
+    ]
+    assert float(board[0]["ATE ratio"]) == pytest.approx(np.exp(np.mean(np.log(ratios))))
+
+
+def test_numbers_are_those_of_the_evaluation(made):
+    store, paths = made
+    for row in rows_of(paths.csv["runs"])[::7]:
+        trajectory = store.trajectory(row["run_id"])
+        truth = truth_of(row["sequence_key"])
+        assert float(row["ate_rmse_m"]) == pytest.approx(evaluate(trajectory, truth).metrics["ate_rmse_m"], rel=1e-6)
+
+
+def test_failures_are_rows_and_count_as_not_moving(made):
+    store, paths = made
+    (failed,) = rows_of(paths.csv["failures"])
+    assert failed["status"] == "crashed"
+    assert failed["reason"] == "RuntimeError: the map is empty"
+    runs = {row["run_id"]: row for row in rows_of(paths.csv["runs"])}
+    row = runs[failed["log"]]
+    assert float(row["score_m"]) == float(row["never_move_m"]) != float(row["ate_rmse_m"])
+    text = paths.html.read_text()
+    link = re.search(rf'href="([^"]*{failed["log"]}/log\.txt)"', text)[1]
+    assert (paths.html.parent / link).resolve() == (store.folder(failed["log"]) / "log.txt").resolve()
+    markdown = paths.markdown.read_text()
+    assert "n=3 (1)" in markdown
+    assert "counts as a camera that never moves (1 of 61 runs" in markdown
+
+
+def test_captions_carry_the_protocol_and_the_power_note(made):
+    _, paths = made
+    for text in (paths.html.read_text(), paths.markdown.read_text()):
+        assert "1190f97bbd77" in text
+        assert "can never reach p &lt; 0.05" in text or "can never reach p < 0.05" in text
+        assert "dynslam-bench bench dynamic" in text or text is not paths.html
+    assert "\\begin{tabular}" in paths.latex.read_text()
+    assert "&gt; Mixed" not in paths.html.read_text()
+
+
+def test_common_frames_beside_the_error(made):
+    _, paths = made
+    table = {row["tracker"]: row for row in rows_of(paths.csv["common_frames"])}
+    frames = table["common frames"]
+    assert frames["high dynamic: synthetic/walking_xyz"] == "100 of 120"
+    assert frames["low dynamic: synthetic/sitting_xyz"] == "120 of 120"
+
+
+def test_a_report_can_be_made_again_under_another_protocol(made, tmp_path):
+    store, paths = made
+    other = build_report(store, tmp_path / "other", protocol="vslam-lab")
+    assert "Sim(3)-aligned" in other.html.read_text()
+    first, second = ReportData.read(paths.data), ReportData.read(other.data)
+    assert {row.protocol_digest for row in first.rows}.isdisjoint({row.protocol_digest for row in second.rows})
+    assert not any(name.startswith("rpe_") for name in other.csv)
+    with pytest.raises(
+        ReportError, match=r"cannot mix 2 protocols: tum-rgbd/v1 \[1190f97bbd77\] \(61 rows\) and vslam-lab"
+    ):
+        check_one_protocol(first.rows + second.rows)
+    with pytest.raises(ReportError, match="cannot mix 2 protocols"):
+        compare(paths.data.parent, other.data.parent)
+    with pytest.raises(ReportError, match="cannot mix"):
+        make_board(first.rows + second.rows)
+
+
+def test_the_same_runs_give_the_same_report(made, tmp_path):
+    store, paths = made
+    again = build_report(store, tmp_path / "again")
+    for name, path in paths.csv.items():
+        if name != "failures":  # its links are relative to the report
+            assert again.csv[name].read_text() == path.read_text(), name
+    assert again.data.read_text() == paths.data.read_text()
+
+
+def test_other_files_in_the_folder_stay(made, tmp_path):
+    store, _ = made
+    (tmp_path / "notes.txt").write_text("mine")
+    build_report(store, tmp_path)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp_path):
+    store, _ = made
+    paths = build_report(store, tmp_path, reference="orb-slam3")
+    assert "never move (from the ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
+    assert ReportData.read(paths.data).reference == "never move (from the ground truth)"
+    board = rows_of(paths.csv["leaderboard"])
+    assert float(board[0]["ATE ratio"]) < 0.2
+
+
+def test_variants_of_a_tracker_are_rows_of_their_own(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for seed in (0, 1):
+        add_run(store, "orb-slam2", "s/a", seed)
+        add_run(store, "orb-slam2", "s/a", seed, overrides={"features": 500})
+    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
+    board = make_board([run.row for run in loaded.runs])
+    assert sorted(board.labels.values()) == ["orb-slam2", "orb-slam2 · features=500"]
+    assert board.reference_name == "orb-slam2"
+
+
+def test_only_the_newest_of_equal_runs_counts(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "a", "s/a", error=0.3, started="2026-01-01T00:00:00+00:00")
+    new = add_run(store, "a", "s/a", error=0.01, started="2026-02-01T00:00:00+00:00")
+    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
+    assert [run.row.run_id for run in loaded.runs] == [new]
+    assert loaded.superseded == 1
+    paths = build_report(store, tmp_path / "report")
+    assert "Left out: 1 older runs" in paths.markdown.read_text()
+
+
+def test_small_and_odd_results(tmp_path):
+    """One run; a sequence without ground truth; nothing but failures; hostile names."""
+    one = RunStore(tmp_path / "one")
+    add_run(one, "a", "s/a", mask_iou=0.5)
+    paths = build_report(one, tmp_path / "r1")
+    assert "smallest possible p is 1" in paths.markdown.read_text()
+    blind = RunStore(tmp_path / "blind")
+    add_run(blind, "a", "s/a", ground_truth=False)
+    paths = build_report(blind, tmp_path / "r2")
+    assert "in no table of errors: s/a" in paths.markdown.read_text()
+    dead = RunStore(tmp_path / "dead")
+    for seed in (0, 1):
+        add_run(dead, "a", "s/a", seed, status="crashed", reason="boom", lost=range(120))
+        add_run(dead, "orb-slam2", "s/a", seed, status="crashed", reason="boom", lost=range(120))
+    paths = build_report(dead, tmp_path / "r3")
+    assert [float(row["ATE ratio"]) for row in rows_of(paths.csv["leaderboard"])] == [1.0, 1.0]
+    assert len(rows_of(paths.csv["failures"])) == 4
+    hostile = RunStore(tmp_path / "hostile")
+    name = "</script><script>alert(1)</script> & | % _ $"
+    add_run(hostile, "evil", "s/a", label=name, reason=name, status="crashed")
+    add_run(hostile, "orb-slam2", "s/a")
+    text = build_report(hostile, tmp_path / "r4").html.read_text()
+    assert "<script>alert(1)" not in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert r"\textless{}script\textgreater{}" in (tmp_path / "r4" / "report.tex").read_text()
+
+
+@pytest.mark.parametrize("case", ["missing", "empty", "no runs", "damaged"])
+def test_what_cannot_be_reported_is_one_clear_line(tmp_path, case):
+    folder = tmp_path / "results"
+    if case != "missing":
+        folder.mkdir()
+    if case in ("no runs", "damaged"):
+        (folder / "runs").mkdir()
+    if case == "damaged":
+        (folder / "runs" / ("a" * 16)).mkdir()
+        (folder / "runs" / ("a" * 16) / "run.json").write_text("{")
+    expected = {"missing": "there is no results folder", "empty": "holds no runs", "no runs": "there are no runs in",
+                "damaged": "Invalid JSON"}[case]  # fmt: skip
+    with pytest.raises(ReportError, match=expected) as caught:
+        build_report([folder], tmp_path / "report")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "report").exists()
+
+
+# -- compare
+
+
+def test_compare_finds_what_changed(made, tmp_path):
+    store, paths = made
+    walking = ["synthetic/walking_xyz", "synthetic/walking_rpy"]
+    better = fill(tmp_path / "b", trackers={"orb-slam2": 0.10, "mask-rcnn": 0.002}, sequences=walking)
+    comparison = compare(store, better)
+    changed = comparison.overall["Mask R-CNN (our back end)"]
+    assert changed.high < 1
+    same = comparison.overall["ORB-SLAM2 (our back end)"]
+    assert same.value == pytest.approx(1.0)
+    verdicts = {row[0].text: row[5].text for row in comparison.table.rows if row[1].text.startswith("all ")}
+    assert verdicts["Mask R-CNN (our back end)"] == "better"
+    assert verdicts["ORB-SLAM2 (our back end)"] == "no difference shown"
+    assert comparison.only_a == 12 + 12 + 1 + 3 * 6
+    assert comparison.only_b == 0
+    assert compare(paths.data.parent, paths.data).overall.keys() == compare(store, store).overall.keys()
+    assert all(i.value == i.low == i.high == 1 for i in compare(store, store).overall.values())
+    assert "| Mask R-CNN (our back end) | all 2 sequences |" in comparison.to_markdown()
+
+
+def test_compare_refuses_what_has_nothing_in_common(made, tmp_path):
+    store, _ = made
+    other = RunStore(tmp_path / "b")
+    add_run(other, "new-tracker", "s/a")
+    with pytest.raises(
+        ReportError, match=r"\(61 runs\) and .* \(1 runs\) have no tracker, settings and sequence in common"
+    ):
+        compare(store, other)
+
+
+# -- reported rows
+
+
+def test_published_numbers_stand_apart_and_never_compete(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for seed in (0, 1):
+        add_run(store, "orb-slam2", "tum/fr3/walking_xyz", seed)
+        add_run(store, "dynaslam", "tum/fr3/walking_xyz", seed, error=0.05)
+    paths = build_report(store, tmp_path / "report")
+    table = rows_of(paths.csv["per_sequence"])
+    reported = {row["tracker"] for row in table if "reported" in row["tracker"]}
+    assert "DynaSLAM N+G (DynaSLAM paper) reported" in reported
+    assert not any("DROID-W" in name for name in reported)  # aligned by Sim(3)
+    assert {row["tracker"] for row in rows_of(paths.csv["leaderboard"])} == {"orb-slam2", "dynaslam"}
+    assert "Rows marked &#39;reported&#39; are published numbers" in paths.html.read_text()
+
+
+# -- pieces
+
+
+def row(**changes):
+    base = dict(run_id="r", kind="run here", tracker="a", label="A", sequence="s", protocol_id="p", protocol_digest="d",
+                metrics={"ate_rmse_m": 0.1}, never_move_m=0.5)  # fmt: skip
+    return RunRow(**(base | changes))
+
+
+def test_scores_impute_failures_only():
+    assert row().score_m == 0.1
+    assert row(failed=True).score_m == 0.5
+    assert row(failed=True, metrics={}).score_m == 0.5
+    assert row(metrics={}, never_move_m=None).score_m is None
+
+
+def test_trackers_that_lack_sequences_are_shown_but_not_ranked():
+    rows = [row(tracker="orb-slam2", label="O", sequence=s) for s in ("s", "t")] + [row(tracker="half", label="H")]
+    rows += [row(tracker="control", label="C", sequence=s, ranked=False) for s in ("s", "t")]
+    board = make_board(rows)
+    assert [board.labels[key] for key in board.ranked] == ["O"]
+    assert [board.labels[key] for key in board.incomplete] == ["H"]
+    protocol = get_protocol("tum-rgbd/v1")
+    table = leaderboard(board, protocol)
+    assert table.muted_rows == {1, 2}
+    texts = {cells[1].text: cells[2].small for cells in table.rows}
+    assert texts["H"].endswith("on 1 of 2")
+    matrix = per_sequence(board, protocol)
+    assert matrix.rows[[r[0].text for r in matrix.rows].index("H")][2].text == "–"
+
+
+def test_sequences_are_grouped_from_static_to_dynamic():
+    tags = {"z": ["static"], "b": ["high-dynamic"], "a": ["low-dynamic"], "c": ["high-dynamic"], "d": []}
+    board = make_board([row(sequence=name, tags=found) for name, found in tags.items()])
+    assert board.sequences == ["z", "a", "b", "c", "d"]
+    assert [board.groups[s] for s in board.sequences] == [
+        "static",
+        "low dynamic",
+        "high dynamic",
+        "high dynamic",
+        "other",
+    ]
+
+
+def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
+    stamps = np.r_[0:0.95:0.1, 1.05:2:0.1, 2.6:3:0.1]
+    values = stamps[:, None] * [1.0, 2.0]
+    t, v = broken(stamps, values)
+    gaps = np.flatnonzero(np.isnan(v[:, 0]))
+    assert len(gaps) == 1  # 0.65 s is a gap of more than twice 0.1 s, 0.15 s is none
+    assert 1.95 < t[gaps[0]] < 2.6
+    assert np.array_equal(t[~np.isnan(v[:, 0])], stamps)
+    long = np.arange(10000) / 30.0
+    long[5000:] += 10
+    t, v = broken(long, long[:, None], most=400)
+    assert len(t) < 420
+    assert {long[0], long[4999], long[5000], long[-1]} <= set(t.tolist())
+    assert np.isnan(v[:, 0]).sum() == 1
+
+
+def test_best_and_second_share_their_marks():
+    assert emphasise([3.0, 1.0, 2.0, 1.0, None]) == ["", "best", "second", "best", ""]
+    assert emphasise([1.0, None]) == ["", ""]
+
+
+def test_tables_in_every_format():
+    table = Table(
+        "t", "A & B", "50 % of_it.", [Column("name", numeric=False), Column("x", "G"), Column("y", "G")],
+        [[TableCell("a|b_*", tag="imported"), TableCell("0.5", "±0.1", 0.51234, "best"), TableCell()]],
+    )  # fmt: skip
+    assert "| a\\|b\\_\\* (imported) | **0.5** ±0.1 |  |" in to_markdown(table)
+    assert to_csv(table) == "name,G: x,G: y\na|b_* imported,0.51234,\n"
+    latex = to_latex(table)
+    assert r"\caption{A \& B. 50 \% of\_it.}" in latex
+    assert r"\multicolumn{2}{c}{G} \\ \cmidrule(lr){2-3}" in latex
+    assert r"a\textbar{}b\_*~{\scriptsize imported} & \textbf{0.5}~{\scriptsize $\pm$0.1} &  \\" in latex
