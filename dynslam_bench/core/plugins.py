@@ -1,7 +1,7 @@
 """Guarded discovery of plug-ins: one scheme for trackers, segmenters, features, flows, filters and sequences.
 
 A plug-in is a light *spec* (importable without torch or OpenCV) with an `id` and an `entry_point` ``"module:Attr"``
-that loads the heavy part. Specs are looked up, in this order: ``module:Attr`` or ``file.py:Attr`` given by the user, the
+that loads the heavy part. Specs are looked up, in this order: ``module:Attr`` or ``file.py:Attr`` of the user, the
 environment variable ``DYNSLAM_BENCH_PLUGINS``, the entry-point groups ``dynslam_bench.<kind>``, the built-in ones. A
 plug-in that fails to load never breaks the rest; the reason is kept and shown by ``trackers doctor``.
 """
