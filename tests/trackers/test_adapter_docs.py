@@ -1,0 +1,121 @@
+"""The examples of docs/plugins.md are run as they stand."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, load_object
+from dynslam_bench.flow.build import build_flow
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.spec import FLOWS
+from dynslam_bench.segmentation.registry import SEGMENTERS
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.datasets import DATASETS
+from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
+from dynslam_bench.trackers import TRACKERS, build_tracker
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
+
+
+@pytest.fixture
+def example(tmp_path):
+    """Writes a named example of the page and gives its path."""
+    blocks = re.findall(r"```python\n(# (\w+\.py)\n.*?)```", PAGE.read_text(), re.DOTALL)
+    texts = {name: text for text, name in blocks}
+    assert len(texts) == len(blocks) >= 6
+
+    def write(name):
+        path = tmp_path / name
+        path.write_text(texts[name])
+        return path
+
+    return write
+
+
+@pytest.fixture
+def plugged(monkeypatch):
+    """Names a plug-in in the environment, as the page's shell lines do."""
+
+    def plug(kind, path, registry):
+        monkeypatch.setenv(ENVIRONMENT_VARIABLE, f"{kind}={path}:SPEC")
+        registry.refresh()
+        assert not [failure for failure in registry.failures() if str(path) in failure.source]
+        used.append(registry)
+
+    used = []
+    yield plug
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+    for registry in used:
+        registry.refresh()
+
+
+def test_tracker(example):
+    path = example("my_slam.py")
+    check_tracker(f"{path}:SPEC", frames=3)
+    tracker = build_tracker(f"{path}:SPEC", {"step_m": "0.02"})
+    sequence = CornerSequence(4)
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    assert [tracker.track(sequence[i]).T_world_cam[2, 3] for i in range(4)] == pytest.approx([0, 0.02, 0.04, 0.06])
+
+
+def test_program(example):
+    path = example("still.py")
+    check_tracker(f"subprocess:{sys.executable} {path}", frames=3)
+
+
+def test_data_set(example, plugged, tmp_path):
+    path = example("my_data.py")
+    plugged("sequences", path, DATASETS)
+    sequence = open_sequence("grey/wall", data_root=tmp_path)
+    check_sequence(sequence)
+    assert len(sequence) == 20 and open_sequence("grey/wall", data_root=tmp_path, frames="5:8")[0].timestamp == 5 / 30
+    with pytest.raises(SequenceError, match="known: grey/wall"):
+        open_sequence("grey/door", data_root=tmp_path)
+
+
+def test_segmenter(example, plugged):
+    path = example("my_segmenter.py")
+    plugged("segmenters", path, SEGMENTERS)
+    spec = SEGMENTERS.get("near")
+    build = load_object(spec.entry_point)
+    check_segmenter(lambda: build(None, None))
+    tracker = build_tracker("mask-rcnn", {"segmentation.source": "plugin:near"})
+    sequence = CornerSequence(3)
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    assert tracker.track(sequence[0]).state == "ok"
+
+
+def test_flow(example, plugged):
+    path = example("my_flow.py")
+    plugged("flow", path, FLOWS)
+    flow = build_flow(FlowSettings(plugin="no-motion"))
+    points = np.array([[3.5, 4.5], [10, 20]], np.float32)
+    guess = np.array([[np.nan, np.nan], [11, 21]], np.float32)
+    image = np.zeros((48, 64), np.uint8)
+    result = flow.track(flow.prepare(image), flow.prepare(image), points, guess=guess)
+    assert result.xy.tolist() == [[3.5, 4.5], [11, 21]] and result.valid.all()
+
+
+def test_filter_and_system(example):
+    path = example("far_slam.py")
+    check_filter(load_object(f"{path}:FarFilter"))
+    assert TRACKERS.get(f"{path}:SPEC").id == "far-slam"
+    check_tracker(f"{path}:SPEC", frames=3)
+
+
+def test_the_shell_lines_name_verbs_that_exist():
+    from typer.main import get_command
+
+    from dynslam_bench.cli.app import app
+
+    root = get_command(app)
+    lines = re.findall(r"^dynslam-bench (\S+)(?: (\S+))?", PAGE.read_text(), re.MULTILINE)
+    assert len(lines) >= 6
+    for verb, second in lines:
+        command = root.commands[verb]
+        if hasattr(command, "commands"):
+            assert second in command.commands, (verb, second)
