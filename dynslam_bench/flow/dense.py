@@ -5,7 +5,8 @@
 3. For each superpixel, its own label and its neighbours' are tried on every pixel of its bounding box extended by twice
    the filter's radius; the raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel keeps the winner
    (Eq. 3). This works at half resolution: the orientation maps are no finer.
-4. A pixel is valid if the flow of the other direction leads back.
+4. A pixel is valid if the flow of the other direction leads back; the others get an affine motion fitted to consistent
+   regions around them, but stay marked as not valid.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from ._jit import kernel
 from .checks import same_image
+from .fill import fill_and_smooth, fit_regional_motion
 from .guided_filter import filter_patch
 from .maps import OrientationMaps
 from .matching import (
@@ -62,9 +64,16 @@ class DenseDaisyFlow:
 
     def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
         self.settings = settings or FlowSettings()
-        searching = self.settings.model_copy(update={"support": 9})
+        searching = self.settings.model_copy(
+            update={
+                "support": 9,
+                "support_spacing_px": max(1, self.settings.dense_superpixel_px // 2),
+                "range_px": self.settings.dense_range_px,
+                "budget": self.settings.dense_budget,
+                "sweeps": self.settings.dense_sweeps,
+            }
+        )
         self._sparse = SparseDaisyFlow(searching, threads=threads)
-        self.threads, self._pool = self._sparse.threads, self._sparse.pool
 
     def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
         """The orientation maps of a uint8 ``[H, W]`` image."""
@@ -82,59 +91,106 @@ class DenseDaisyFlow:
                 np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_), np.zeros(shape, np.float32),
                 {"identical": 1.0, "evaluations": 0.0, "valid": 0.0},
             )  # fmt: skip
-        flow, cost, evaluations = self._one_way(reference, target, seed)
+        forward = self._one_way(reference, target, seed)
         valid = np.ones((height, width), dtype=np.bool_)
-        if self.settings.forward_backward_px > 0:
-            back, _, more = self._one_way(target, reference, seed + 1)
-            evaluations += more
-            valid = consistent(flow, back, self.settings.dense_forward_backward_px)
-        stats = {"evaluations": float(evaluations), "valid": float(valid.sum())}
-        return DenseFlow(flow, valid, cost, stats)
+        rounds = [forward]
+        if self.settings.dense_forward_backward_px > 0:
+            backward = self._one_way(target, reference, seed + 1)
+            rounds = [forward, backward]
+            tolerance = self.settings.dense_forward_backward_px
+            flows = forward.flow(), backward.flow()
+            if self.settings.dense_second_round:
+                forward.again(consistent(*flows, tolerance))
+                backward.again(consistent(*flows[::-1], tolerance))
+                flows = forward.flow(), backward.flow()
+            valid = consistent(*flows, tolerance)
+            fitted = fit_regional_motion(flows[0], valid, forward.regions, forward.half)
+            flow = flows[0] if fitted is None else fill_and_smooth(flows[0], valid, fitted)
+        else:
+            flow = forward.flow()
+        stats = {"evaluations": float(sum(r.evaluations for r in rounds)), "valid": float(valid.sum())}
+        return DenseFlow(flow, valid, forward.cost(), stats)
 
-    def _one_way(
-        self, reference: OrientationMaps, target: OrientationMaps, seed: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
-        settings, sparse = self.settings, self._sparse
-        height, width = reference.gray.shape
-        inner = slice(BORDER, -BORDER)
-        half = np.ascontiguousarray(reference.framed_half[inner, inner])
-        regions = superpixels(half, max(2, settings.dense_superpixel_px // 2))
-        centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
-        tables = tables_for(height, width, sparse.settings)
-        neighbours = sparse.neighbours(centres)
-        state = sparse.search(sparse.describe(reference, centres, tables), target, tables, neighbours, None, seed)
+    def _one_way(self, reference: OrientationMaps, target: OrientationMaps, seed: int) -> _OneWay:
+        one_way = _OneWay(self.settings, self._sparse, reference, target)
+        one_way.found(seed)
+        return one_way
+
+
+class _OneWay:
+    """The labels of one direction while they are improved; the sizes are those of the half-resolution image."""
+
+    def __init__(
+        self, settings: FlowSettings, sparse: SparseDaisyFlow, reference: OrientationMaps, target: OrientationMaps
+    ) -> None:
+        self.settings, self._sparse = settings, sparse
+        self._reference, self._target = reference, target
+        self.half = np.ascontiguousarray(reference.framed_half[BORDER:-BORDER, BORDER:-BORDER])
+        self.regions = superpixels(self.half, max(2, settings.dense_superpixel_px // 2))
+        self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+        self.evaluations = 0
+        self._tables = tables_for(*reference.gray.shape, settings.model_copy(update={"support": 1}))
+        self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
+        self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
+
+    def found(self, seed: int) -> None:
+        """Search a label for each region and let its pixels choose among it and the neighbours'."""
+        sparse, reference, target = self._sparse, self._reference, self._target
+        tables = tables_for(*reference.gray.shape, sparse.settings)
+        neighbours = sparse.neighbours(self.centres)
+        described = sparse.describe(reference, self.centres, tables)
+        state = sparse.search(described, target, tables, neighbours, None, seed)
+        self.evaluations += int(state.used.sum())
         labels = np.ascontiguousarray(state.flames[:, 0])
-        correlation = sparse.refine(centres, labels, reference, target)
+        correlation = sparse.refine(self.centres, labels, reference, target)
         if neighbours.shape[1] > 1:
-            sparse.second_opinion(centres, labels, correlation, neighbours, reference, target)
-        candidates = self._candidates(centres, labels, neighbours)
-        pixel_tables = tables_for(height, width, settings.model_copy(update={"support": 1}))
-        best = np.full(half.shape, np.inf, dtype=np.float32)
-        winner = np.zeros((*half.shape, 4), dtype=np.float32)
-        guide = half.astype(np.float32) / np.float32(255)
-        evaluations = np.zeros(len(centres), dtype=np.int64)
-        run_stripes(
-            aggregate_and_choose, len(centres), self.threads, self._pool, regions.members, regions.starts, centres,
-            candidates, side(reference), side(target), pixel_tables, guide,
-            max(1, settings.dense_filter_radius_px // 2), np.float32(settings.dense_filter_epsilon), best, winner,
-            evaluations,
-        )  # fmt: skip
-        flow = np.empty((height, width, 2), dtype=np.float32)
-        run_stripes(spread_labels, height, self.threads, self._pool, winner, regions.labels, centres, flow)
-        share = np.repeat(np.repeat(best, 2, axis=0), 2, axis=1) / pixel_tables.ceiling
-        cost = np.ones((height, width), dtype=np.float32)
-        cost[: share.shape[0], : share.shape[1]] = share[:height, :width]
-        return flow, cost, int(state.used.sum() + evaluations.sum())
+            sparse.second_opinion(self.centres, labels, correlation, neighbours, reference, target)
+        self._choose(self._candidates(labels, neighbours))
 
-    def _candidates(
-        self, centres: NDArray[np.float32], labels: NDArray[np.float32], neighbours: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
+    def again(self, valid: NDArray[np.bool_]) -> None:
+        """Try, on every region, the motion that consistent regions around it suggest, as it is and refined."""
+        fitted = fit_regional_motion(self.flow(), valid, self.regions, self.half)
+        if fitted is None:
+            return
+        suggested = fitted.labels()
+        refined = suggested.copy()
+        self._sparse.refine(self.centres, refined, self._reference, self._target)
+        self._choose(np.stack([suggested, refined], axis=1))
+
+    def _choose(self, candidates: NDArray[np.float32]) -> None:
+        evaluations = np.zeros(len(self.centres), dtype=np.int64)
+        run_stripes(
+            aggregate_and_choose, len(self.centres), self._sparse.threads, self._sparse.pool, self.regions.members,
+            self.regions.starts, self.centres, candidates, side(self._reference), side(self._target), self._tables,
+            self.half.astype(np.float32) / np.float32(255), max(1, self.settings.dense_filter_radius_px // 2),
+            np.float32(self.settings.dense_filter_epsilon), self._best, self._winner, evaluations,
+        )  # fmt: skip
+        self.evaluations += int(evaluations.sum())
+
+    def flow(self) -> NDArray[np.float32]:
+        """Displacement of every full-image pixel under the labels chosen so far."""
+        height, width = self._reference.gray.shape
+        flow = np.empty((height, width, 2), dtype=np.float32)
+        run_stripes(
+            spread_labels, height, self._sparse.threads, self._sparse.pool, self._winner, self.regions.labels,
+            self.centres, flow,
+        )  # fmt: skip
+        return flow
+
+    def cost(self) -> NDArray[np.float32]:
+        """Aggregated cost of every full-image pixel, as a share of the largest possible."""
+        height, width = self._reference.gray.shape
+        y = np.minimum(np.arange(height) // 2, self.half.shape[0] - 1)
+        x = np.minimum(np.arange(width) // 2, self.half.shape[1] - 1)
+        return np.asarray(self._best[np.ix_(y, x)] / np.float32(self._tables.ceiling), dtype=np.float32)
+
+    def _candidates(self, labels: NDArray[np.float32], neighbours: NDArray[np.int64]) -> NDArray[np.float32]:
         """Each region's own label first, then its neighbours' as seen from its centre: float32 ``[K, C, 4]``."""
-        n, most = len(centres), min(self.settings.dense_candidates - 1, neighbours.shape[1])
+        n, most = len(labels), min(self.settings.dense_candidates - 1, neighbours.shape[1])
         seen = np.empty((n, most, 4), dtype=np.float32)
         extent = np.full((n, 4), 8.0, dtype=np.float32)
         transported_labels(
-            0, n, centres, labels, neighbours[:, :most], np.empty((0, 4), np.float32), -extent, extent, seen
+            0, n, self.centres, labels, neighbours[:, :most], np.empty((0, 4), np.float32), -extent, extent, seen
         )
         return np.concatenate([labels[:, None], seen], axis=1)
 

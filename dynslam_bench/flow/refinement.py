@@ -1,7 +1,7 @@
 """Photometric refinement of labels: Lucas-Kanade with four degrees of freedom.
 
-Inverse compositional (Baker and Matthews 2004): template gradients and Hessian are computed once a point, the similarity
-warp of the label is updated until it stands. Patch means are removed, so that a change of brightness does not pull.
+Inverse compositional (Baker and Matthews 2004): template gradients and Hessian are computed once a point, the label's
+warp is updated until it stands. Patch means are removed, so that a change of brightness does not pull.
 """
 
 from __future__ import annotations

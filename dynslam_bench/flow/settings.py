@@ -127,3 +127,15 @@ class FlowSettings(Settings):
         3.0, low=0.5, high=15.0, limits=(0.0, 100.0), scale="log", unit="px", when=_DAISY,
         meaning="dense mode: largest distance between a pixel and its way there and back",
     )  # fmt: skip
+    dense_second_round: bool = tunable(
+        True, when=_DAISY, meaning="dense mode: try on every region the motion that consistent regions nearby suggest"
+    )
+    dense_budget: int = tunable(
+        192, low=48, high=768, limits=(8, 4096), scale="log", when=_DAISY,
+        meaning="dense mode: cost evaluations a superpixel in the label search",
+    )  # fmt: skip
+    dense_sweeps: int = tunable(8, low=1, high=12, limits=(1, 32), when=_DAISY, meaning="dense mode: `sweeps`")
+    dense_range_px: float = tunable(
+        160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px", when=_DAISY,
+        meaning="dense mode: `range_px`",
+    )  # fmt: skip

@@ -27,9 +27,7 @@ class Superpixels:
     starts: NDArray[np.int64]
 
 
-def superpixels(
-    gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0, iterations: int = 4
-) -> Superpixels:
+def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0, iterations: int = 4) -> Superpixels:
     """Divide a uint8 ``[H, W]`` image into regions of about ``size * size`` pixels.
 
     Args:

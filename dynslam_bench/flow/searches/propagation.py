@@ -12,7 +12,7 @@ def transported_labels(start, stop, points, labels, neighbours, motions, lower, 
     """Labels of neighbours and of common motions, as seen from each point.
 
     A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
-    gives p. Scale and rotation are clipped to the point's box; the displacement is not, since what neighbours have found
+    gives p. Scale and rotation are clipped to the point's box; the displacement is not: what neighbours have found
     is no random guess (the box is where the search starts, not what the scene obeys).
 
     Args:
