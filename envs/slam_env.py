@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from dynslam_bench.core.cache import default_folder
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Settings, apply_overrides
@@ -86,6 +87,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         data_root: Folder of the recorded sequences; None for the default one.
         camera: Name or file of the camera for folders that do not say theirs; None to read it from the folder.
         threads: Threads that the tracker may use.
+        cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
+            stage times are the same either way, and `stats` says what came from it (``cached_stages``).
 
     Raises:
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
@@ -111,11 +114,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         data_root: str | Path | None = None,
         camera: str | Path | None = None,
         threads: int = 1,
+        cache: bool = False,
     ) -> None:
         EzPickle.__init__(
             self, sequence, tracker, settings=settings, control=control, observation=observation, reward=reward,
             protocol=protocol, frames=frames, stride=stride, lost_after=lost_after, device=device,
-            render_mode=render_mode, data_root=data_root, camera=camera, threads=threads,
+            render_mode=render_mode, data_root=data_root, camera=camera, threads=threads, cache=cache,
         )  # fmt: skip
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise SettingsError(f"unknown render mode '{render_mode}'", "known: rgb_array")
@@ -135,6 +139,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
+        self._cache = str(default_folder()) if cache else None
         self._open = lambda name: open_frames(name, data_root, camera, frames, stride)
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
@@ -339,6 +344,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 device=self.device,
                 threads=self._threads,
                 fps=self.sequence.fps,
+                cache=self._cache,
             )
             self._tracker = build_tracker(self.tracker_spec, self.settings, context)
             self._tracker_key = key

@@ -27,6 +27,7 @@ from .store import RunStore
 from .supervise import Verdict, supervise
 
 PROGRESS_EVERY = 50
+CACHED_TIMES = "times of features and masks are those of the stage cache's entries, not of this run"
 LOST_COVERAGE = 0.5
 LOST_AT_END = 10
 """A run whose coverage is below the first, or that is lost on so many frames at its end, has status ``lost``."""
@@ -86,7 +87,7 @@ def run_one(
         frames = FrameLog.read(work / FRAMES_FILE)
         frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
         (work / FRAMES_FILE).unlink(missing_ok=True)
-        record = _record(resolved, verdict, frames, started, time.perf_counter() - clock)
+        record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)
             store.publish(work, record)
@@ -137,6 +138,7 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         wall_s=wall_s, peak_memory_mb=verdict.peak_memory_mb or None, peak_gpu_memory_mb=final.get("gpu_memory_mb"),
         machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}), versions=versions(),
         git=git_revision(), command=list(sys.argv), identity=identity,
+        notes=[CACHED_TIMES] if spec.cache else [],
     )  # fmt: skip
 
 

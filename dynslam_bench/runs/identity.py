@@ -96,6 +96,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "seed": spec.seed,
         "device": device,
         "threads": spec.threads,
+        **({"cache": True} if spec.cache else {}),
         "realtime": spec.realtime,
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},

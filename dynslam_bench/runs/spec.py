@@ -41,6 +41,8 @@ class RunSpec(Record):
         seed: Seed of everything random.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         threads: Threads of the run.
+        cache: Take features and network masks from the stage cache where they are stored. Part of the run's identity:
+            its stage times are those of the time when the entries were made.
         realtime: Drop the frames that arrive while the tracker is busy.
         drop_share: Drop this share of the frames at random.
         degrade: Strengths of `DegradeFrames`, e.g. ``{"blur": 0.5}``.
@@ -60,6 +62,7 @@ class RunSpec(Record):
     seed: int = Field(default=0, ge=0, lt=2**63)
     device: str = "auto"
     threads: int = Field(default=1, ge=1)
+    cache: bool = False
     realtime: bool = False
     drop_share: float = Field(default=0.0, ge=0, lt=1)
     degrade: dict[str, float] = Field(default_factory=dict)
