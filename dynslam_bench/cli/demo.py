@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from .output import note, progress
+from .output import aligned, note, progress
 from .running import make_runs
+
+if TYPE_CHECKING:
+    from dynslam_bench.runs import RunStore
+
+DEFAULT_PROTOCOL = "tum-rgbd/v1"
 
 
 @dataclass(frozen=True)
@@ -14,7 +20,7 @@ class DemoOutcome:
     """What the demo made.
 
     Attributes:
-        leaderboard: The table as text.
+        leaderboard: Ranking and errors by sequence, as text.
         report: The HTML page.
         runs: How many runs there are.
         failed: How many of them failed.
@@ -51,9 +57,7 @@ def run_demo(results: Path | str = "results", *, frames: int = 150, jobs: int = 
     records = make_runs(specs, store, jobs=jobs)
     note("making the report")
     paths = build_report(store, store.root / "report", title="Demo: walking and sitting people, rendered")
-    return DemoOutcome(
-        leaderboard_text(paths.csv["leaderboard"]), paths.html, len(records), sum(record.failed for record in records)
-    )
+    return DemoOutcome(leaderboard_text(store), paths.html, len(records), sum(record.failed for record in records))
 
 
 def render(sequences: set[str]) -> None:
@@ -66,13 +70,18 @@ def render(sequences: set[str]) -> None:
             render_synthetic(name, find_data_root(None), progress=advance)
 
 
-def leaderboard_text(table: Path) -> str:
-    """A CSV table as aligned text."""
-    import csv
+def leaderboard_text(store: RunStore, protocol: str = DEFAULT_PROTOCOL) -> str:
+    """The leaderboard and the errors by sequence of a store, as aligned text."""
+    from dynslam_bench.evaluation import get_protocol
+    from dynslam_bench.reports.board import make_board
+    from dynslam_bench.reports.rows import load_runs
+    from dynslam_bench.reports.tables import leaderboard, per_sequence
 
-    with table.open(newline="") as file:
-        rows = list(csv.reader(file))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    chosen = get_protocol(protocol)
+    board = make_board([run.row for run in load_runs([store], chosen).runs])
+    parts = []
+    for table in (leaderboard(board, chosen), per_sequence(board, chosen)):
+        rows = [[column.name for column in table.columns]]
+        rows += [[f"{cell.text} {cell.small}".strip() for cell in row] for row in table.rows]
+        parts.append(f"{table.title}\n{aligned(rows)}\n{table.caption}")
+    return "\n\n".join(parts)

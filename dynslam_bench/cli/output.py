@@ -41,9 +41,15 @@ def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, tit
             table.add_row(*(Text(cell) for cell in row))
         Console().print(table)
         return
-    widths = [max(len(row[i]) for row in [list(columns), *cells]) for i in range(len(columns))]
-    for row in [list(columns), *cells]:
-        write("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    write(aligned([list(columns), *cells]))
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of text with their columns under each other."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
 
 
 def write_fields(fields: Mapping[str, object]) -> None:

@@ -1,0 +1,352 @@
+"""The command line: exit codes, one-line errors, JSON, quiet pipes; a verb does what its function does."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynslam_bench.cli.app import expand_lists, start
+from dynslam_bench.sequences import open_sequence
+from dynslam_bench.testing import CornerSequence
+
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = ROOT.parent / "shared"
+needs_shared = pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")
+
+
+@pytest.fixture
+def cli(capsys, monkeypatch, tmp_path):
+    """Runs the program in an empty folder; returns exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            start([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return ended.value.code or 0, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """The conformance scene as a folder in TUM layout."""
+    import cv2
+
+    from dynslam_bench.geometry.tum_file import write_tum
+    from dynslam_bench.sequences.cameras import write_camera
+
+    scene, folder = CornerSequence(4), tmp_path_factory.mktemp("data") / "walk"
+    lists = {"rgb": [], "depth": []}
+    for kind in lists:
+        (folder / kind).mkdir(parents=True)
+    for frame in (scene[i] for i in range(len(scene))):
+        images = {"rgb": frame.rgb[..., ::-1], "depth": np.round(frame.depth * 5000).astype(np.uint16)}
+        for kind, image in images.items():
+            cv2.imwrite(str(folder / kind / f"{frame.index}.png"), image)
+            lists[kind].append(f"{frame.timestamp:.6f} {kind}/{frame.index}.png")
+    for kind, lines in lists.items():
+        (folder / f"{kind}.txt").write_text("\n".join(lines))
+    write_tum(folder / "groundtruth.txt", scene.ground_truth)
+    write_camera(folder / "camera.toml", scene.camera, fps=30)
+    return folder
+
+
+def one_line(err):
+    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
+    return err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["sequences"], ["trackers"], ["runs"], ["protocols"], ["report", "--help"], ["segmenter"], ["cache"]],
+)
+def test_help_of_every_group(cli, arguments):
+    code, out, err = cli(*arguments)
+    assert code in (0, 2) and "Usage: dynslam-bench" in out + err
+
+
+def test_version(cli):
+    import dynslam_bench
+
+    assert cli("--version") == (0, f"dynslam-bench {dynslam_bench.__version__}\n", "")
+
+
+def test_usage_errors_exit_with_2(cli):
+    for arguments in (["nonsense"], ["run"], ["run", "orb-slam2", "x", "--jobs", "0"], ["sequences", "info"]):
+        code, _, err = cli(*arguments)
+        assert code == 2 and "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "orb-slam", "synthetic/walking_xyz"], "unknown tracker 'orb-slam' (did you mean"),
+        (["run", "never-move", "tum/fr3/walkin_xyz"], "did you mean 'tum/fr3/walking_xyz'"),
+        (["run", "never-move", "tum/fr3/walking_xyz"], "sequences fetch tum/fr3/walking_xyz"),
+        (["run", "orb-slam2", "synthetic/walking_xyz", "--set", "features.nonsense=3"], "unknown setting"),
+        (["run", "orb-slam2", "synthetic/walking_xyz", "--set", "features"], "is not an assignment"),
+        (["run", "orb-slam2", "synthetic/walking_xyz", "--settings", "none.toml"], "cannot read none.toml"),
+        (["run", "orb-slam2", "synthetic/walking_xyz", "--preset", "fast"], "has no preset 'fast'"),
+        (["run", "orb-slam2", "synthetic/walking_xyz", "--frames", "9"], "is no range of frames"),
+        (["run", "orb-slam2", "synthetic/walking_xyz", "--protocol", "tum"], "tum-rgbd/v1"),
+        (["bench", "smoky"], "did you mean 'smoke'"),
+        (["eval", "a.txt", "b.txt"], "cannot read a.txt"),
+        (["sequences", "fetch", "bonn/crowdy"], "did you mean 'bonn/crowd'"),
+        (["sequences", "fetch", "bonn/x*"], "no public sequence matches 'bonn/x*'"),
+        (["sequences", "info", "bonn/crowdy"], "did you mean"),
+        (["trackers", "info", "orb"], "unknown tracker 'orb'"),
+        (["trackers", "test", "./none.py:SPEC"], "no file"),
+        (["report"], "there is no results folder"),
+        (["runs", "show", "abc"], "there is no run 'abc'"),
+        (["runs", "rm"], "no run was named"),
+        (["report", "compare", "a", "b"], "a"),
+        (["segmenter", "evaluate", "nonsense:"], "nonsense"),
+    ],
+)
+def test_user_errors_are_one_line_and_exit_with_1(cli, arguments, words):
+    code, out, err = cli(*arguments)
+    assert code == 1 and out == "" and words in one_line(err)
+
+
+def test_nothing_is_written_for_a_run_that_cannot_begin(cli, tmp_path):
+    (tmp_path / "results").write_text("a file")
+    code, _, err = cli("run", "never-move", "synthetic/sitting_xyz?frames=3")
+    assert code == 1 and "cannot write" in one_line(err)
+
+
+def test_sequences_list(cli):
+    code, out, _ = cli("sequences", "list", "tum/fr3/walking*", "--tag", "high-dynamic")
+    lines = out.splitlines()
+    assert code == 0 and lines[0].split()[:3] == ["sequence", "here", "size"]
+    assert [line.split()[0] for line in lines[1:5]] == [
+        f"tum/fr3/walking_{motion}" for motion in ("static", "xyz", "halfsphere", "rpy")
+    ]
+    _, out, _ = cli("sequences", "list", "--here", "--json")
+    assert [each["id"].split("/")[0] for each in json.loads(out)] == ["synthetic"] * 8
+
+
+def test_sequences_info(cli, walk):
+    _, out, _ = cli("sequences", "info", "tum/fr1/360_validation", "--json")
+    found = json.loads(out)
+    assert (
+        found["ground_truth"] == "not public" and found["here"] is False and found["url"].endswith("360_validation.tgz")
+    )
+    _, out, _ = cli("sequences", "info", walk, "--json")
+    found = json.loads(out)
+    assert found["frames"] == 4 and found["ground_truth_poses"] == 4
+    _, out, _ = cli("sequences", "info", walk)
+    assert "4 frames of 4 colour and 4 depth images" in out
+
+
+def test_sequences_verify(cli, walk, tmp_path):
+    import shutil
+
+    assert cli("sequences", "verify", walk)[0] == 0
+    copy = shutil.copytree(walk, tmp_path / "copy")
+    (copy / "rgb" / "3.png").write_bytes((copy / "rgb" / "3.png").read_bytes()[:-30])
+    code, out, _ = cli("sequences", "verify", copy)
+    assert code == 4 and "1 faults" in out and "3.png is truncated" in out
+    code, out, _ = cli("sequences", "verify", copy, "--json")
+    assert code == 4 and json.loads(out)[0]["ok"] is False
+
+
+def test_sequences_render(cli, tmp_path):
+    code, out, _ = cli("sequences", "render", "synthetic/sitting_static@1?frames=2", "--data-root", tmp_path / "data")
+    assert code == 0 and Path(out.strip()).is_relative_to(tmp_path / "data")
+    assert len(open_sequence("synthetic/sitting_static@1?frames=2", data_root=tmp_path / "data")) == 2
+
+
+def test_trackers_list_and_info(cli):
+    _, out, _ = cli("trackers", "list", "--json")
+    ids = {each["id"]: each for each in json.loads(out)}
+    assert {"never-move", "orb-slam2", "mask-rcnn", "emfoa-oft", "orbslam3"} <= set(ids)
+    _, out, _ = cli("trackers", "info", "orb-slam2")
+    assert "| setting | default |" in out and "provenance" in out
+    _, out, _ = cli("trackers", "info", "orb-slam2", "--json")
+    assert json.loads(out)["settings"]
+
+
+def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
+    from dynslam_bench.trackers import TRACKERS
+
+    (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "broken.py:SPEC")
+    TRACKERS.refresh()
+    try:
+        code, out, _ = cli("trackers", "doctor")
+        assert code == 0 and "broken.py:SPEC" in out and "No module named 'nothing_of_this_name'" in out
+        assert cli("trackers", "list")[0] == 0
+    finally:
+        monkeypatch.undo()
+        TRACKERS.refresh()
+
+
+def test_a_new_tracker_passes_its_checks_and_runs(cli, walk):
+    code, out, _ = cli("trackers", "new", "My SLAM-2")
+    assert code == 0 and Path("my_slam_2.py").is_file() and "trackers test ./my_slam_2.py:SPEC" in out
+    code, out, _ = cli("trackers", "test", "./my_slam_2.py:SPEC", "--frames", "4")
+    assert code == 0, out
+    assert "0 of 15 checks failed" in out
+    code, out, _ = cli("run", "./my_slam_2.py:SPEC", walk, "--set", "features=300", "--json")
+    (row,) = json.loads(out)
+    assert code == 0 and row["status"] == "ok" and row["ate_rmse_m"] < 0.01
+    assert "exists already" in one_line(cli("trackers", "new", "my-slam-2")[2])
+    assert "is no name" in one_line(cli("trackers", "new", "../evil")[2])
+
+
+def test_a_faulty_tracker_fails_with_4(cli, tmp_path):
+    (tmp_path / "faulty.py").write_text(
+        "from dynslam_bench.trackers import TrackerSpec\n"
+        "class Faulty:\n"
+        "    def __init__(self, settings): pass\n"
+        "    def reset(self, camera, *, rng): pass\n"
+        "    def track(self, frame): return None\n"
+        "SPEC = TrackerSpec('faulty', f'{__file__}:Faulty', 'Faulty')\n"
+    )
+    code, out, _ = cli("trackers", "test", "faulty.py:SPEC")
+    assert code == 4 and "gave a NoneType, not a TrackResult" in out
+    code, out, _ = cli("trackers", "test", "faulty.py:SPEC", "--json")
+    assert code == 4 and json.loads(out)["ok"] is False
+
+
+def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
+    """One store through its life."""
+    code, out, err = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
+    assert code == 0 and err == ""  # quiet in pipes
+    assert [line.split()[4] for line in out.splitlines()] == ["status", "ok", "ok"]
+    runs = json.loads(cli("runs", "list", "--json")[1])
+    assert [(run["tracker"], run["seed"], run["coverage"]) for run in runs] == [
+        ("never-move", 0, 1.0),
+        ("never-move", 1, 1.0),
+    ]
+    stored = sorted(path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json"))
+    assert cli("run", "never-move", walk, "--seed", "0", "1", "--frames", ":3")[0] == 0  # nothing is made again
+    assert stored == sorted(path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json"))
+    code, out, _ = cli("runs", "show", runs[0]["run"][:8])
+    assert code == 0 and "ATE (rmse)" in out and "walk" in out
+    shown = json.loads(cli("runs", "show", "latest", "--json")[1])
+    assert shown["record"]["status"] == "ok" and shown["metrics"]["online"]["metrics"]["ate_rmse_m"] > 0
+    code, out, _ = cli("report", "results", "-o", "page")
+    assert code == 0 and out.strip().endswith("page/index.html") and Path("page/index.html").is_file()
+    assert json.loads(cli("report", "--json")[1])["html"].endswith("results/report/index.html")
+    assert cli("report", "compare", "results", "page")[0] == 0
+    code, out, _ = cli("runs", "rm", *[run["run"] for run in runs])
+    assert code == 0 and out.split() == [run["run"] for run in runs]
+    assert json.loads(cli("runs", "list", "--json")[1]) == []
+
+
+def test_failed_runs_exit_with_3_and_the_others_go_on(cli, walk, tmp_path):
+    (tmp_path / "raises.py").write_text(
+        "from dynslam_bench.trackers import TrackerSpec\n"
+        "class Raises:\n"
+        "    def __init__(self, settings): pass\n"
+        "    def reset(self, camera, *, rng): self.broken = rng.integers(2**62) % 2\n"
+        "    def track(self, frame): raise ValueError('a wall')\n"
+        "SPEC = TrackerSpec('raises', f'{__file__}:Raises', 'Raises')\n"
+    )
+    code, out, _ = cli("run", "raises.py:SPEC", walk, "--json")
+    (row,) = json.loads(out)
+    assert code == 3 and row["status"] == "crashed" and "ValueError: a wall" in row["reason"]
+    code, out, _ = cli("runs", "rm", "--failed")
+    assert code == 0 and out.strip() == row["run"]
+
+
+def test_eval_and_protocols(cli, walk, tmp_path):
+    truth = walk / "groundtruth.txt"
+    code, out, _ = cli("eval", truth, truth)
+    assert code == 0 and out.startswith("ATE (rmse) 0.0000 m over 4 poses [tum-rgbd/v1")
+    found = json.loads(cli("eval", truth, truth, "--protocol", "evo-default", "--json")[1])
+    assert found["protocol_id"] == "evo-default" and found["metrics"]["ate_rmse_m"] < 1e-9
+    code, out, _ = cli("protocols", "list")
+    assert code == 0 and "kitti" in out
+    code, out, _ = cli("protocols", "compare", truth, truth)
+    assert code == 0 and out.splitlines()[0].split()[:2] == ["metric", "protocol"]
+
+
+def test_import(cli, walk):
+    code, out, _ = cli("import", walk / "groundtruth.txt", "--tracker", "theirs", "--sequence", walk, "--json")
+    (row,) = json.loads(out)
+    assert code == 0 and row["tracker"] == "theirs" and row["ate_rmse_m"] < 1e-6
+
+
+def test_envs(cli):
+    ids = json.loads(cli("envs", "--json")[1])
+    assert "dynslam/Sequence-v0" in ids and "dynslam/bonn-crowd-v0" in ids
+
+
+def test_cache(cli, monkeypatch, tmp_path):
+    monkeypatch.setenv("DYNSLAM_BENCH_CACHE", str(tmp_path / "stages"))
+    from dynslam_bench.core.cache import StageCache
+
+    StageCache().put("masks", "ab" * 16, {"a": np.zeros(10)}, 0.5)
+    found = json.loads(cli("cache", "info", "--json")[1])
+    assert found["entries_by_stage"] == {"masks": 1} and found["bytes"] > 0
+    assert cli("cache", "clear", "--yes")[0] == 0
+    assert json.loads(cli("cache", "info", "--json")[1])["bytes"] == 0
+
+
+def test_bench(cli, walk, tmp_path):
+    (tmp_path / "mine.toml").write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")
+    code, out, _ = cli("bench", "mine.toml", "--json")
+    assert code == 0 and {row["tracker"] for row in json.loads(out)} == {"never-move", "constant-velocity"}
+    code, _, err = cli("bench", "mine.toml", "--scheduler", "tcp://127.0.0.1:9")
+    assert code == 1 and ("distributed" in err or "no Dask scheduler answers" in err)
+
+
+def test_settings_files(cli, walk, tmp_path):
+    (tmp_path / "nested.toml").write_text("[features]\ncount = 1\n")
+    assert "features.count" in one_line(cli("run", "orb-slam2", walk, "--settings", "nested.toml")[2])
+    (tmp_path / "table.toml").write_text("tracker = 'orb-slam2'\n[settings]\n'features.nothing' = 1\n")
+    assert "features.nothing" in one_line(cli("run", "orb-slam2", walk, "--settings", "table.toml")[2])
+    (tmp_path / "broken.toml").write_text("a = \n")
+    assert "not valid TOML" in one_line(cli("run", "orb-slam2", walk, "--settings", "broken.toml")[2])
+
+
+def test_seed_lists():
+    assert expand_lists(["run", "--seed", "0", "1", "2", "x"]) == [
+        "run",
+        "--seed",
+        "0",
+        "--seed",
+        "1",
+        "--seed",
+        "2",
+        "x",
+    ]
+    assert expand_lists(["--seed", "4", "--jobs", "2", "7"]) == ["--seed", "4", "--jobs", "2", "7"]
+    assert expand_lists(["a", "--seed", "1", "--seed", "2", "3"]) == ["a", "--seed", "1", "--seed", "2", "--seed", "3"]
+
+
+@needs_shared
+def test_real_sequences_by_data_root(cli):
+    code, out, _ = cli("run", "never-move", "bonn/crowd", "--data-root", SHARED / "data", "--frames", "0:5", "--json")
+    (row,) = json.loads(out)
+    assert code == 0 and row["sequence"] == "bonn/crowd" and row["status"] == "ok"
+    found = json.loads(cli("sequences", "list", "--here", "--data-root", SHARED / "data", "--json")[1])
+    assert {"bonn/crowd", "tum/fr1/xyz", "tum/fr1/rpy"} <= {each["id"] for each in found}
+
+
+HEAVY = ("torch", "cv2", "numpy", "scipy", "pandas", "optuna", "gymnasium", "numba", "gtsam")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["report", "--help"]])
+def test_help_loads_nothing_heavy(arguments):
+    code = (
+        "import sys\nfrom dynslam_bench.cli.app import start\n"
+        f"try: start({arguments!r})\nexcept SystemExit: pass\n"
+        f"sys.stderr.write(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stderr == "" and "Usage: dynslam-bench" in done.stdout
+
+
+def test_output_to_a_closed_pipe_is_no_error():
+    script = f"{sys.executable} -m dynslam_bench.cli sequences list | head -1"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stderr == "" and done.stdout.startswith("sequence")
