@@ -72,8 +72,8 @@ def row(name: str, frames: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, fl
         else f"{np.mean(people):.2f} (max {np.max(people):.2f}) | {np.mean(moving):.2f}"
     )
     return (
-        f"| {name} | {np.mean(corners):.0f} | {np.mean(valid):.2f} | {np.mean(contrast):.0f} | {np.median(medians):.1f} "
-        f"| {np.median(tails):.1f} | {areas} |"
+        f"| {name} | {np.mean(corners):.0f} | {np.mean(valid):.2f} | {np.mean(contrast):.0f} "
+        f"| {np.median(medians):.1f} | {np.median(tails):.1f} | {areas} |"
     )
 
 

@@ -8,11 +8,12 @@ import sys
 from pathlib import Path
 
 import cv2
+import numba
 import numpy as np
 import pytest
 
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
+from dynslam_bench.sequences.synthetic import compiled, open_synthetic, render_synthetic
 from dynslam_bench.sequences.synthetic.people import draw_person
 from dynslam_bench.sequences.synthetic.plan import plan_room
 from dynslam_bench.sequences.synthetic.scene import Scene
@@ -142,6 +143,30 @@ def test_two_processes_may_render_the_same_sequence(tmp_path: Path) -> None:
     sequence = open_synthetic("synthetic/walking_static?frames=5", tmp_path)
     assert sequence.render() == 0
     assert not [path for path in tmp_path.rglob(".*")]
+
+
+def test_a_forked_child_can_render_on(tmp_path: Path) -> None:
+    code = """
+import os, sys
+from dynslam_bench.sequences.synthetic import open_synthetic
+sequence = open_synthetic("synthetic/walking_xyz", None, threads=2)
+before = sequence[3].rgb.tobytes()
+child = os.fork()
+if child == 0:
+    os._exit(0 if sequence[3].rgb.tobytes() == before else 1)
+print(os.waitpid(child, 0)[1])
+"""
+    assert in_child(code) == "0"
+
+
+def test_kernels_compile_where_nothing_can_be_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**options: object):
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return numba.njit(**options)
+
+    monkeypatch.setattr(compiled, "njit", refuse)
+    assert compiled.kernel(lambda x: x + 1)(2) == 3
 
 
 def test_a_cache_that_cannot_be_written_is_one_clear_line(tmp_path: Path) -> None:

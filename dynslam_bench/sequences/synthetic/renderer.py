@@ -54,7 +54,8 @@ class Renderer:
         self.scene = Scene(sequence, settings)
         self.atlas = self.scene.atlas()
         self.threads = threads or default_threads()
-        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
+        self._pool_process = 0
         text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
         self._density = self._texel_density()
@@ -133,9 +134,11 @@ class Renderer:
 
     def _rows(self, work: Callable[[int, int], None]) -> None:
         bands = [(a, min(a + _BAND, CAMERA.height)) for a in range(0, CAMERA.height, _BAND)]
-        if self._pool is None:
+        if self.threads == 1:
             work(0, CAMERA.height)
             return
+        if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
+            self._pool, self._pool_process = ThreadPoolExecutor(self.threads), os.getpid()
         for done in [self._pool.submit(work, a, b) for a, b in bands]:
             done.result()
 
