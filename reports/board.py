@@ -14,6 +14,8 @@ from .statistics import Standing, standings
 NEVER_MOVE = "never move (from the ground truth)"
 _GROUPS = (("static", "static"), ("low-dynamic", "low dynamic"), ("high-dynamic", "high dynamic"))
 
+_OTHER = "other"
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -115,6 +117,8 @@ def make_board(rows: Sequence[RunRow], reference: str = "orb-slam2") -> Board:
         else:
             board.unscored.append(key)
         board.groups[key] = _group(next(row for row in rows if row.sequence_key == key))
+    if set(board.groups.values()) == {_OTHER}:
+        board.groups = dict.fromkeys(board.groups, "")
     order = {name: position for position, (_, name) in enumerate(_GROUPS)}
     board.sequences = sorted(board.never_move, key=lambda key: (order.get(board.groups[key], 9), key))
     for key in board.labels:
@@ -198,4 +202,4 @@ def _group(row: RunRow) -> str:
     for tag, name in _GROUPS:
         if tag in row.tags:
             return name
-    return "other"
+    return _OTHER

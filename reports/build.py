@@ -319,12 +319,12 @@ def _representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, L
 
 def _write(draft: _Draft, board: Board, protocol: Protocol, title: str, output: Path, data: ReportData) -> ReportPaths:
     failed = sum(1 for row in board.rows if row.failed)
-    facts = [
-        (str(len(board.labels)), "trackers"),
-        (str(len(board.sequences) + len(board.unscored)), "sequences"),
-        (str(len(board.rows)), "runs"),
-        (str(failed), "failed"),
-    ]
+    counts = (
+        (len(board.labels), "tracker"),
+        (len(board.sequences) + len(board.unscored), "sequence"),
+        (len(board.rows), "run"),
+    )
+    facts = [(str(count), name + ("" if count == 1 else "s")) for count, name in counts] + [(str(failed), "failed")]
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     footer = f"Made by dynslam-bench {data.version} on {now}. This page works without a network."
     page = render(draft.sections, draft.figures, title=title, protocol=protocol.describe(), facts=facts, footer=footer)

@@ -79,7 +79,7 @@ def speed_figure(board: Board) -> Figure | None:
     standings = {s.key: s for s in board.standings}
     points = []
     for key in board.trackers:
-        factors = [row.real_time_factor for row in board.runs(key) if row.real_time_factor]
+        factors = [row.real_time_factor for row in board.runs(key) if row.real_time_factor and not row.failed]
         if key in standings and factors and np.isfinite(standings[key].ratio.value):
             points.append((key, float(np.median(factors)), standings[key].ratio))
     if not points:

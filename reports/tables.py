@@ -95,7 +95,9 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
     """Median ATE of every tracker on every sequence, with spread, number of runs and imputed ones."""
     columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
-    medians = {key: [_median(board.cells[key].get(sequence)) for sequence in board.sequences] for key in board.trackers}
+    medians = {
+        key: [_competing(board.cells[key].get(sequence)) for sequence in board.sequences] for key in board.trackers
+    }
     marks: dict[str, list[Emphasis]] = {key: [""] * len(board.sequences) for key in board.trackers}
     for at in range(len(board.sequences)):
         for key, mark in zip(board.ranked, emphasise([medians[key][at] for key in board.ranked]), strict=True):
@@ -290,13 +292,14 @@ def _standing_cells(board: Board, key: str, standing: Standing | None, mark: Emp
 def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
     coverage = float(np.mean([row.coverage for row in runs]))
     success = float(np.mean([not row.failed for row in runs]))
+    ended = [row for row in runs if not row.failed]
     kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
     provenance = runs[0].provenance
     return [
         TableCell(f"{100 * coverage:.1f} %", value=coverage),
         TableCell(f"{100 * success:.0f} %", value=success),
-        _speed_cell(_middle(row.real_time_factor for row in runs), _middle(row.frame_ms for row in runs)),
-        number_cell(_middle(row.peak_memory_mb for row in runs), ".0f"),
+        _speed_cell(_middle(row.real_time_factor for row in ended), _middle(row.frame_ms for row in ended)),
+        number_cell(_middle(row.peak_memory_mb for row in ended), ".0f"),
         TableCell(tag=kinds),
         TableCell(provenance, tip=_PROVENANCE.get(provenance, "")),
     ]
@@ -369,8 +372,9 @@ def _kind_tag(board: Board, key: str) -> str:
     return "imported" if board.first(key).kind == "imported" else ""
 
 
-def _median(cell: Cell | None) -> float | None:
-    return None if cell is None else cell.median
+def _competing(cell: Cell | None) -> float | None:
+    """The median of a cell that holds more than failures."""
+    return None if cell is None or cell.imputed == len(cell.scores) else cell.median
 
 
 def _middle(values: Iterable[float | None]) -> float | None:

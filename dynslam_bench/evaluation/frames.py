@@ -19,16 +19,20 @@ STAMP_TOLERANCE = 1e-3
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
     """Which input frames ``[N]`` have a pose in the estimate.
 
+    A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some systems write the depth
+    image's stamp, and files round.
+
     Raises:
         EvaluationError: The estimate has poses at stamps that are no input frame's.
     """
     stamps = np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
-    index, _ = associate(stamps, estimate.timestamps, STAMP_TOLERANCE, strict=False)
+    interval = float(np.median(np.diff(np.sort(stamps)))) if len(stamps) > 1 else 0.0
+    index, _ = associate(stamps, estimate.timestamps, max(interval / 2, STAMP_TOLERANCE), strict=False)
     if len(index) < len(estimate):
         raise EvaluationError(
             f"{len(estimate) - len(index)} of {len(estimate)} estimated poses belong to none of {len(stamps)} "
             "input frames",
-            "the estimate has to carry the stamps of the colour images",
+            "the estimate has to carry the stamps of the images",
         )
     tracked = np.zeros(len(stamps), dtype=bool)
     tracked[index] = True

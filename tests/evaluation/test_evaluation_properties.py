@@ -235,9 +235,15 @@ def test_frames_lost_before_the_first_tracked_one_take_its_pose():
 
 def test_foreign_stamps_are_refused_with_their_count():
     truth = walk(n=20)
-    shifted = Trajectory(truth.timestamps + 0.01, truth.T_world_cam)
-    with pytest.raises(EvaluationError, match="20 of 20 estimated poses belong to none of 20 input frames"):
+    shifted = Trajectory(truth.timestamps + 0.4, truth.T_world_cam)
+    with pytest.raises(EvaluationError, match="12 of 20 estimated poses belong to none of 20 input frames"):
         evaluate(shifted, truth, input_timestamps=truth.timestamps)
+
+
+def test_stamps_of_the_depth_images_count_for_their_frames():
+    truth = walk(n=30)
+    tracked = Trajectory(truth.timestamps + 0.011, truth.T_world_cam).select(np.r_[0:10, 20:30])
+    assert coverage(tracked, truth.timestamps) == pytest.approx(20 / 30)
 
 
 def test_common_frames_are_those_of_all():
