@@ -8,7 +8,7 @@ from typing import Annotated, Optional
 import typer
 
 from .groups import DefaultGroup
-from .options import AsJson, Jobs, ProtocolId, Results
+from .options import AsJson, DataRoot, Jobs, ProtocolId, Results
 from .output import SOME_RUNS_FAILED, write, write_json
 
 report = typer.Typer(
@@ -65,6 +65,39 @@ def compare(
     write(found.to_markdown().rstrip())
     if found.only_a or found.only_b:
         write(f"\nonly in {a}: {found.only_a} runs; only in {b}: {found.only_b} runs")
+
+
+@report.command("audit-paper")
+def audit_paper(
+    data_root: DataRoot = None,
+    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Markdown file.")] = None,  # noqa: UP045
+    as_json: AsJson = False,
+) -> None:
+    """Hold the numbers that the paper prints against arithmetic, and against a camera that never moves."""
+    from dataclasses import asdict
+
+    from dynslam_bench.core.records import write_atomic
+    from dynslam_bench.geometry.tum_file import read_tum
+    from dynslam_bench.reports.audit import audit_paper as audit
+    from dynslam_bench.reports.reported import claimed
+    from dynslam_bench.sequences.catalogue import entry_of
+    from dynslam_bench.sequences.roots import find_data_root
+
+    truth = {}
+    for name in sorted({each.sequence for each in claimed()}):
+        entry = entry_of(name)
+        folder = None if entry is None else entry.find(find_data_root(data_root))
+        if folder is not None and (folder / "groundtruth.txt").is_file():
+            truth[name] = read_tum(folder / "groundtruth.txt")
+    found = audit(truth)
+    if output is not None:
+        write_atomic(output, found.to_markdown())
+    if as_json:
+        write_json([asdict(finding) for finding in found.findings])
+    elif output is not None:
+        write(str(output))
+    else:
+        write(found.to_markdown().rstrip())
 
 
 def demo(

@@ -53,6 +53,14 @@ def run(
     threads: Threads = 1,
     jobs: Jobs = 1,
     realtime: Annotated[bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.")] = False,
+    drop: Annotated[float, typer.Option(min=0.0, max=0.99, help="Drop this share of the frames at random.")] = 0.0,
+    degrade: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            metavar="KIND=STRENGTH", help="Spoil the images: lighting, glare, shadow, blur, noise; repeatable."
+        ),
+    ] = None,
+    cache: Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")] = False,
     retry: Retry = None,
     time_limit: Annotated[Optional[float], typer.Option(help="Seconds that a run may take.")] = None,  # noqa: UP045
@@ -74,10 +82,12 @@ def run(
         chosen = dict(presets[preset])
     overrides = gather_settings(assignments, settings, chosen)
     part = None if frames is None else parse_frames(frames)
+    strengths = parse_strengths(degrade or ())
     specs = [
         RunSpec(
             tracker=tracker, sequence=sequence, settings=overrides, frames=part, stride=stride, seed=number,
-            device=device, threads=threads, realtime=realtime, video=video, camera=camera,
+            device=device, threads=threads, realtime=realtime, video=video, camera=camera, cache=cache,
+            drop_share=drop, degrade=strengths,
             data_root=None if data_root is None else str(data_root),
             limits=Limits(time_s=time_limit, memory_mb=memory_limit),
         )
@@ -85,6 +95,26 @@ def run(
         for number in (seed or [0])
     ]  # fmt: skip
     finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json)
+
+
+def parse_strengths(assignments: Sequence[str]) -> dict[str, float]:
+    """Strengths of `DegradeFrames` by kind.
+
+    Raises:
+        SettingsError: An assignment is none, or its value no number.
+    """
+    from dynslam_bench.core.errors import SettingsError
+    from dynslam_bench.core.settings import parse_assignments
+
+    strengths = {}
+    for kind, text in parse_assignments(assignments).items():
+        try:
+            strengths[kind] = float(text)
+        except ValueError:
+            raise SettingsError(
+                f"strength '{text}' of '{kind}' is no number", "for example --degrade blur=0.5"
+            ) from None
+    return strengths
 
 
 def bench(

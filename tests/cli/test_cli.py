@@ -299,6 +299,20 @@ def test_bench(cli, walk, tmp_path):
     assert code == 1 and ("distributed" in err or "no Dask scheduler answers" in err)
 
 
+def test_audit_of_the_paper(cli, tmp_path):
+    found = json.loads(cli("report", "audit-paper", "--json")[1])
+    assert found and {"check", "printed", "expected", "holds"} <= set(found[0])
+    code, out, _ = cli("report", "audit-paper", "-o", "audit.md")
+    assert code == 0 and out.strip() == "audit.md" and "| check |" in (tmp_path / "audit.md").read_text()
+
+
+def test_degradation(cli, walk):
+    code, out, _ = cli("run", "never-move", walk, "--degrade", "blur=0.5", "--drop", "0.3", "--json")
+    assert code == 0 and json.loads(out)[0]["status"] == "ok"
+    assert "is no number" in one_line(cli("run", "never-move", walk, "--degrade", "blur=much")[2])
+    assert "blurr" in one_line(cli("run", "never-move", walk, "--degrade", "blurr=1")[2])
+
+
 def test_settings_files(cli, walk, tmp_path):
     (tmp_path / "nested.toml").write_text("[features]\ncount = 1\n")
     assert "features.count" in one_line(cli("run", "orb-slam2", walk, "--settings", "nested.toml")[2])
