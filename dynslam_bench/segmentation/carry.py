@@ -20,53 +20,101 @@ ROUND_TRIP_PX = 1.0
 """A corner that does not come back to within this distance is not trusted."""
 
 
-def dense_backward_flow(previous: Gray, current: Gray) -> NDArray[np.float32]:
-    """For every pixel of the current image its displacement to the previous one, by DIS (Kroeger et al. 2016).
+def dense_flow(previous: Gray, current: Gray) -> NDArray[np.float32]:
+    """Where each pixel of the previous image went, by DIS (Kroeger et al. 2016).
 
     Args:
         previous: uint8 ``[H, W]``.
         current: uint8 ``[H, W]``.
 
     Returns:
-        float32 ``[h, w, 2]`` at the reduced size, in pixels of the full size.
+        float32 ``[h, w, 2]`` at the reduced size and in its pixels.
     """
     height, width = current.shape
     ratio = min(1.0, WORK_SIDE / min(height, width))
     size = (max(16, round(width * ratio)), max(16, round(height * ratio)))
-    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (current, previous)]
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (previous, current)]
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     dis.setFinestScale(1)
-    flow = dis.calc(small[0], small[1], np.zeros((size[1], size[0], 2), np.float32))
-    return np.asarray(flow * np.array([width / size[0], height / size[1]], np.float32), np.float32)
+    return np.asarray(dis.calc(small[0], small[1], np.zeros((size[1], size[0], 2), np.float32)), np.float32)
 
 
-def warp_masks(masks: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Masks ``[K, H, W]`` of the previous image, as they lie in the current one.
+def object_flow(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The flow of one object, smoothed and continued beyond its edge.
+
+    Dense flow blurs across the edge of a moving object, which would leave a trail of its mask behind; only the inside
+    is believed, and its local means are continued outwards.
 
     Args:
-        masks: Of the previous image.
-        flow: Backward flow ``[h, w, 2]`` in pixels of the full size; a smaller field is interpolated.
+        mask: bool ``[h, w]``.
+        flow: float32 ``[h, w, 2]``.
+    """
+    core = cv2.erode(mask.view(np.uint8), np.ones((7, 7), np.uint8)).astype(np.float32)
+    if np.count_nonzero(core) < 0.2 * np.count_nonzero(mask):
+        core = mask.astype(np.float32)
+    inside = flow[core > 0]
+    field = np.broadcast_to(np.median(inside, axis=0), flow.shape).astype(np.float32)
+    for window in (61, 15):
+        kernel = (window, window)
+        weight = cv2.boxFilter(core, -1, kernel, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(flow * core[:, :, None], -1, kernel, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        near = np.asarray(weight >= 8)
+        field = np.where(near[:, :, None], total / np.maximum(weight, 1)[:, :, None], field).astype(np.float32)
+    return field
+
+
+def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Move a mask along a smooth flow.
+
+    Args:
+        mask: bool ``[H, W]``.
+        field: Flow ``[h, w, 2]`` from the mask's image to the next, in its own pixels; a smaller field is interpolated.
 
     Returns:
-        Bool ``[K, H, W]``; what comes from outside the previous image is not part of a mask.
+        Bool ``[H, W]``; an object that was cut by the image's edge is continued as it comes in.
     """
-    if not len(masks):
-        return masks
-    height, width = masks.shape[1:]
-    if flow.shape[:2] != (height, width):
-        flow = np.asarray(cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-    columns = np.arange(width, dtype=np.float32)[None] + flow[:, :, 0]
-    rows = np.arange(height, dtype=np.float32)[:, None] + flow[:, :, 1]
-    fixed = cv2.convertMaps(columns, rows, cv2.CV_16SC2)
-    moved = [cv2.remap(mask.view(np.uint8) * np.uint8(255), fixed[0], fixed[1], cv2.INTER_LINEAR) for mask in masks]
-    return np.asarray(np.stack(moved) >= 128)
+    height, width = mask.shape
+    rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
+    back = field  # the flow at the place a pixel came from: x = x' - f(x), by fixed-point iteration
+    for _ in range(3):
+        back = np.asarray(cv2.remap(field, columns - back[:, :, 0], rows - back[:, :, 1], cv2.INTER_LINEAR,
+                                    borderMode=cv2.BORDER_REPLICATE), np.float32)  # fmt: skip
+    scale = np.array([width / field.shape[1], height / field.shape[0]], np.float32)
+    full = back * scale
+    if field.shape[:2] != (height, width):
+        full = np.asarray(cv2.resize(full, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    at_x = np.arange(width, dtype=np.float32)[None] - full[:, :, 0]
+    at_y = np.arange(height, dtype=np.float32)[:, None] - full[:, :, 1]
+    moved = cv2.remap(mask.view(np.uint8) * np.uint8(255), at_x, at_y, cv2.INTER_LINEAR,
+                      borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    return np.asarray(np.asarray(moved) >= 128)
 
 
 def carry_dense(found: Instances, previous: Gray, current: Gray) -> Instances:
     """The objects of the previous image in the current one, moved by dense flow; lost objects are left out."""
     if not len(found):
         return found
-    return _moved(found, warp_masks(found.masks, dense_backward_flow(previous, current)))
+    flow = dense_flow(previous, current)
+    masks = np.zeros_like(found.masks)
+    for index, mask in enumerate(found.masks):
+        _carry_object(mask, flow, masks[index])
+    return _moved(found, masks)
+
+
+def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32], moved: NDArray[np.bool_]) -> None:
+    """Write one object's moved mask into `moved`, working in the object's surroundings only."""
+    step_y, step_x = mask.shape[0] / flow.shape[0], mask.shape[1] / flow.shape[1]
+    small = cv2.resize(mask.view(np.uint8), (flow.shape[1], flow.shape[0]), interpolation=cv2.INTER_NEAREST) > 0
+    rows, columns = np.flatnonzero(small.any(axis=1)), np.flatnonzero(small.any(axis=0))
+    if not rows.size:
+        return
+    inside = flow[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    reach = 4 + int(np.ceil(min(float(np.abs(inside).max()), max(flow.shape[:2]))))
+    y0, y1 = max(0, int(rows[0]) - reach), min(flow.shape[0], int(rows[-1]) + 1 + reach)
+    x0, x1 = max(0, int(columns[0]) - reach), min(flow.shape[1], int(columns[-1]) + 1 + reach)
+    field = object_flow(np.ascontiguousarray(small[y0:y1, x0:x1]), np.ascontiguousarray(flow[y0:y1, x0:x1]))
+    part = (slice(round(y0 * step_y), round(y1 * step_y)), slice(round(x0 * step_x), round(x1 * step_x)))
+    moved[part] = push_mask(np.ascontiguousarray(mask[part]), field)
 
 
 def carry_sparse(found: Instances, previous: Gray, current: Gray) -> Instances:

@@ -35,8 +35,8 @@ def as_rgb(image: NDArray[Any]) -> NDArray[np.uint8]:
     elif array.dtype == np.bool_:
         array = array.astype(np.uint8) * 255
     elif np.issubdtype(array.dtype, np.floating):
-        low, high = float(np.nanmin(array)), float(np.nanmax(array))
-        if not (0.0 <= low and high <= 1.0) or np.isnan(array).any():
+        low, high = float(array.min()), float(array.max())  # NaN if there is one
+        if not (0.0 <= low and high <= 1.0):
             raise SegmentationError(f"a floating-point image has values {low:g}..{high:g}", "expected 0..1, no NaN")
         array = np.rint(array * 255).astype(np.uint8)
     elif array.dtype != np.uint8:

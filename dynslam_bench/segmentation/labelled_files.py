@@ -16,6 +16,8 @@ from dynslam_bench.core.errors import SegmentationError
 from .classes import COCO_NAMES
 from .labelled import LabelledImage
 
+FINER = 4
+"""Polygons are filled at this many times the image's resolution."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
@@ -136,11 +138,19 @@ def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: lis
 
 
 def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    mask = np.zeros(shape, np.uint8)
+    """Pixels at least half covered by the union of polygons (x, y in pixels, the image's corner is 0, 0)."""
+    mask = np.zeros(shape, bool)
     for polygon in polygons:
-        if len(polygon) >= 3:  # rounding is to 1/16 pixel
-            cv2.fillPoly(mask, [np.rint((polygon - 0.5) * 16).astype(np.int32)], 1, shift=4)
-    return mask.astype(bool)
+        low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int) if len(polygon) >= 3 else np.zeros(2, int)
+        high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int) if len(polygon) >= 3 else low
+        if (high <= low).any():
+            continue
+        size = (high - low) * FINER  # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
+        fine = np.zeros((size[1], size[0]), np.uint8)
+        cv2.fillPoly(fine, [np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)], 255, shift=4)
+        whole = cv2.resize(fine, (high - low).tolist(), interpolation=cv2.INTER_AREA)
+        mask[low[1] : high[1], low[0] : high[0]] |= whole >= 128
+    return mask
 
 
 def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:

@@ -1,0 +1,299 @@
+"""Post-processing, carrying masks over, bridging missed detections, the schedule, and mask metrics."""
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation import carry
+from dynslam_bench.segmentation.compensation import MissedDetections
+from dynslam_bench.segmentation.images import boxes_of
+from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.segmentation.labelled import LabelledImage
+from dynslam_bench.segmentation.mask_metrics import MaskTally, average_precision, mask_iou
+from dynslam_bench.segmentation.postprocess import dilate, dynamic_mask, fill_holes, repair, select
+from dynslam_bench.segmentation.schedule import MaskScheduler
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.frame import Frame
+
+H, W = 120, 160
+
+
+def block(y0, y1, x0, x1):
+    mask = np.zeros((H, W), bool)
+    mask[y0:y1, x0:x1] = True
+    return mask
+
+
+def instances(*masks, names=None, scores=None, moving=None):
+    stack = np.stack(masks) if masks else np.zeros((0, H, W), bool)
+    return Instances(
+        stack, boxes_of(stack), tuple(names or ["person"] * len(stack)),
+        np.array(scores if scores is not None else [0.9] * len(stack), np.float32),
+        None if moving is None else np.array(moving, bool),
+    )  # fmt: skip
+
+
+def iou(a, b):
+    return (a & b).sum() / (a | b).sum()
+
+
+# --- post-processing ---------------------------------------------------------------------------------------------
+
+
+def test_selection_by_class_score_area_and_motion():
+    masks = [block(0, 20, 0, 20), block(30, 50, 0, 20), block(60, 80, 0, 20), block(90, 92, 0, 2)]
+    found = instances(*masks, names=["person", "chair", "person", "person"], scores=[0.9, 0.9, 0.2, 0.9])
+    assert len(select(found, SegmentationSettings())) == 2
+    assert len(select(found, SegmentationSettings(min_area_px=5))) == 1
+    assert len(select(found, SegmentationSettings(confidence=0.1))) == 3
+    assert len(select(found, SegmentationSettings(classes="person,chair"))) == 3
+    oracle = instances(*masks[:2], names=["person", "chair"], moving=[False, True])
+    assert select(oracle, SegmentationSettings()).class_names == ("person", "chair")
+
+
+@pytest.mark.parametrize("radius", [0, 1, 7, 15, 200])
+def test_dilation_is_a_disc_of_that_radius(radius):
+    mask = np.zeros((H, W), bool)
+    mask[50, 60] = mask[0, 0] = True
+    yy, xx = np.mgrid[:H, :W]
+    expected = ((yy - 50) ** 2 + (xx - 60) ** 2 <= radius**2) | (yy**2 + xx**2 <= radius**2)
+    assert np.array_equal(dilate(mask, radius), expected)
+    assert not dilate(np.zeros((H, W), bool), radius).any()
+
+
+def test_dilation_is_close_to_the_31_pixel_ellipse():
+    mask = block(40, 80, 50, 90)
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (31, 31))
+    expected = cv2.dilate(mask.astype(np.uint8), ellipse) > 0
+    assert iou(dilate(mask, 15), expected) > 0.99
+
+
+def test_dynamic_mask_of_nothing_and_of_wrong_depth():
+    assert not dynamic_mask(Instances.empty(H, W), SegmentationSettings()).any()
+    found = instances(block(10, 50, 10, 50), scores=[0.05])
+    assert not dynamic_mask(found, SegmentationSettings()).any()
+    with pytest.raises(SegmentationError, match="depth image is 80x60, the masks 160x120"):
+        dynamic_mask(found, SegmentationSettings(), np.zeros((60, 80), np.float32))
+
+
+def test_holes_are_filled_and_bays_stay():
+    mask = block(10, 110, 20, 100)
+    holed = mask.copy()
+    holed[40:60, 40:60] = False
+    assert np.array_equal(fill_holes(holed), mask)
+    bay = mask.copy()
+    bay[40:80, 60:100] = False
+    assert np.array_equal(fill_holes(bay)[45:75, 65:100], bay[45:75, 65:100])
+    assert fill_holes(np.ones((H, W), bool)).all() and not fill_holes(np.zeros((H, W), bool)).any()
+
+
+def test_depth_repair_fits_the_border_to_the_depth_edge():
+    truth = block(20, 100, 50, 110)
+    depth = np.where(truth, 1.5, 3.0).astype(np.float32)
+    depth[::7] = 0  # missing rows decide nothing
+    settings = SegmentationSettings(repair="depth", dilation_px=0)
+    for wrong in (block(25, 95, 55, 105), block(15, 105, 45, 115), block(20, 100, 54, 114)):
+        repaired = dynamic_mask(instances(wrong), settings, depth)
+        assert iou(repaired, truth) > 0.93 > iou(wrong, truth)
+    wrong = block(25, 95, 55, 105)
+    assert np.array_equal(dynamic_mask(instances(wrong), settings), wrong)
+    assert np.array_equal(repair(wrong, np.zeros((H, W), np.float32), settings), wrong)
+
+
+# --- carrying ----------------------------------------------------------------------------------------------------
+
+
+def scene(shift_x, shift_y=0, scale=1.0, seed=0):
+    """A textured square that moves over another texture; the image and the square's mask."""
+    rng = np.random.default_rng(seed)
+    background = cv2.GaussianBlur(rng.integers(0, 255, (480, 640)).astype(np.uint8), (0, 0), 2.5)
+    texture = cv2.GaussianBlur(rng.integers(0, 255, (480, 640)).astype(np.uint8), (0, 0), 2.5)
+    stretch = [cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX) for image in (background, texture)]
+    square = np.zeros((480, 640), np.uint8)
+    square[150:330, 200:360] = 255
+    move = np.array([[scale, 0, 280 * (1 - scale) + shift_x], [0, scale, 240 * (1 - scale) + shift_y]])
+    mask = cv2.warpAffine(square, move, (640, 480)) >= 128
+    image = np.where(mask, cv2.warpAffine(stretch[1], move, (640, 480)), stretch[0]).astype(np.uint8)
+    return image, mask
+
+
+@pytest.mark.parametrize("move", [carry.carry_dense, carry.carry_sparse])
+@pytest.mark.parametrize("motion", [(0, 0, 1.0), (9, 3, 1.0), (-14, 6, 1.05)])
+def test_masks_follow_the_motion(move, motion):
+    before, mask = scene(0)
+    after, moved = scene(*motion)
+    found = Instances(mask[None], boxes_of(mask[None]), ("person",), np.array([0.8], np.float32))
+    carried = move(found, before, after)
+    assert iou(carried.masks[0], moved) > 0.93
+    assert carried.boxes[0] == pytest.approx(boxes_of(moved[None])[0], abs=8)
+    assert carried.class_names == ("person",) and carried.scores == pytest.approx([0.8])
+
+
+@pytest.mark.parametrize("move", [carry.carry_dense, carry.carry_sparse])
+def test_carrying_nothing_and_carrying_over_black_images(move):
+    black = np.zeros((H, W), np.uint8)
+    assert len(move(Instances.empty(H, W), black, black)) == 0
+    kept = move(instances(block(20, 80, 30, 90)), black, black)
+    assert iou(kept.masks[0], block(20, 80, 30, 90)) > 0.95
+
+
+def test_an_exact_flow_moves_masks_exactly():
+    mask = block(30, 60, 40, 80)
+    flow = np.zeros((H, W, 2), np.float32)
+    flow[:] = 7, -4
+    assert np.array_equal(carry.push_mask(mask, flow), block(26, 56, 47, 87))
+    assert not carry.push_mask(mask, flow + 500).any()
+    half = np.zeros((H // 2, W // 2, 2), np.float32)
+    half[:] = 3.5, -2
+    assert np.array_equal(carry.push_mask(mask, half), block(26, 56, 47, 87))
+
+
+# --- missed detections -------------------------------------------------------------------------------------------
+
+
+def walker(k):
+    return block(30, 90, 20 + 5 * k, 50 + 5 * k)
+
+
+def test_a_missed_detection_is_bridged_at_constant_velocity():
+    bridge = MissedDetections(2)
+    for k in range(4):
+        assert len(bridge.update(instances(walker(k)))) == 1
+    for k in (4, 5):
+        bridged = bridge.update(instances())
+        assert len(bridged) == 1 and bridged.scores[0] < 0.9
+        assert iou(bridged.masks[0], walker(k)) > 0.75
+    assert len(bridge.update(instances())) == 0
+
+
+def test_single_detections_leaving_objects_and_oracles_are_not_bridged():
+    bridge = MissedDetections(5)
+    bridge.update(instances(walker(0)))
+    assert len(bridge.update(instances())) == 0
+    for k in range(4):
+        bridge.update(instances(block(30, 90, max(0, 30 - 12 * k), 60 - 12 * k)))
+    counts = [len(bridge.update(instances())) for _ in range(3)]
+    assert counts[-1] == 0
+    assert len(MissedDetections(0).update(instances(walker(0)))) == 1
+    oracle = MissedDetections(5)
+    for k in range(3):
+        oracle.update(instances(walker(k), moving=[True]))
+    assert len(oracle.update(instances(moving=[]))) == 0
+
+
+# --- schedule ----------------------------------------------------------------------------------------------------
+
+
+class Square:
+    """Finds the square of `scene` where it is."""
+
+    def __init__(self):
+        self.calls = []
+
+    def segment(self, frame):
+        self.calls.append(frame.index)
+        mask = scene(3 * frame.index)[1]
+        return Instances(mask[None], boxes_of(mask[None]), ("person",), np.array([0.9], np.float32))
+
+
+def run(settings, count=10, keyframes=()):
+    segmenter = Square()
+    stage = MaskScheduler(settings, segmenter)
+    quality = []
+    for index in range(count):
+        gray, truth = scene(3 * index)
+        rgb = gray[:, :, None].repeat(3, 2)
+        frame = Frame(index, index / 30, rgb, np.zeros(gray.shape, np.float32))
+        found = stage.masks_for(frame, gray, keyframe=index in keyframes)
+        assert stage.segmented == (segmenter.calls[-1] == index)
+        quality.append(iou(found.union(), truth))
+    assert stage.runs == len(segmenter.calls)
+    return segmenter.calls, quality
+
+
+def test_every_frame_every_nth_and_keyframes():
+    assert run(SegmentationSettings())[0] == list(range(10))
+    calls, quality = run(SegmentationSettings(schedule="every_nth", n=4))
+    assert calls == [0, 4, 8] and min(quality) > 0.9
+    calls, quality = run(SegmentationSettings(schedule="keyframes", max_carry=30), keyframes=(0, 7))
+    assert calls == [0, 7] and min(quality) > 0.88
+    assert run(SegmentationSettings(schedule="keyframes", max_carry=3))[0] == [0, 3, 6, 9]
+    assert min(run(SegmentationSettings(schedule="every_nth", n=5, carry="sparse"))[1]) > 0.9
+
+
+def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
+    segmenter = Square()
+    stage = MaskScheduler(SegmentationSettings(schedule="every_nth", n=10), segmenter)
+    gray = scene(0)[0]
+
+    def step(index):
+        stage.masks_for(
+            Frame(index, 0.0, gray[:, :, None].repeat(3, 2), np.zeros((480, 640), np.float32)), gray, keyframe=False
+        )
+
+    step(0)
+    step(1)
+    stage.settings = stage.settings.model_copy(update={"n": 1})
+    step(2)
+    stage.settings = stage.settings.model_copy(update={"n": 10})
+    step(3)
+    assert segmenter.calls == [0, 2]
+    stage.reset(None)
+    step(4)
+    assert segmenter.calls == [0, 2, 4] and stage.runs == 1
+
+
+# --- metrics -----------------------------------------------------------------------------------------------------
+
+
+def labelled(*masks, names=None):
+    stack = np.stack(masks) if masks else np.zeros((0, H, W), bool)
+    return LabelledImage(np.zeros((H, W, 3), np.uint8), stack, tuple(names or ["person"] * len(stack)))
+
+
+def test_average_precision_by_hand():
+    hits = np.array([True, False, True])
+    # recall .5 at precision 1, recall 1 at precision 2/3: 51 points at 1, 50 at 2/3
+    assert average_precision(np.array([0.9, 0.8, 0.7]), hits, 2) == pytest.approx((51 + 50 * 2 / 3) / 101)
+    assert average_precision(np.array([0.9]), np.array([True]), 2) == pytest.approx(51 / 101)
+    assert average_precision(np.array([]), np.zeros(0, bool), 3) == 0.0
+    assert np.isnan(average_precision(np.array([0.5]), np.array([False]), 0))
+
+
+def test_mask_iou_matrix():
+    a, b = np.stack([walker(0), walker(2)]), np.stack([walker(0), walker(1), block(0, 5, 0, 5)])
+    assert mask_iou(a, b) == pytest.approx(np.array([[iou(x, y) for y in b] for x in a]))
+    assert mask_iou(a[:0], b).shape == (0, 3)
+
+
+def test_quality_of_perfect_shifted_missed_and_false_detections():
+    tally = MaskTally({"person", "chair"})
+    truth = labelled(walker(0), walker(10))
+    tally.add(truth, instances(walker(0), walker(10)))
+    perfect = tally.quality().classes["person"]
+    assert (perfect.ap, perfect.iou, perfect.instance_iou, perfect.recall, perfect.truths) == (1, 1, 1, 1, 2)
+    tally.add(labelled(walker(5)), instances())
+    tally.add(labelled(), instances(walker(5)))
+    worse = tally.quality()
+    quality = worse.classes["person"]
+    assert (quality.truths, quality.detections, worse.images) == (3, 3, 3)
+    assert quality.recall == pytest.approx(2 / 3) and quality.instance_iou == pytest.approx(2 / 3)
+    area = walker(0).sum()
+    assert quality.iou == pytest.approx(2 * area / (4 * area)) and quality.frame_iou == pytest.approx(1 / 3)
+    assert 0 < quality.ap50 < 1 and np.isnan(worse.classes["chair"].ap)
+    assert worse.mean_ap == quality.ap
+
+
+def test_two_detections_of_one_object_count_once_and_small_objects_are_left_out():
+    tally = MaskTally({"person"})
+    tally.add(labelled(walker(0)), instances(walker(0), walker(0), scores=[0.9, 0.8]))
+    assert tally.quality().classes["person"].ap50 == 1.0
+    tally.add(labelled(walker(0)), instances(walker(0), scores=[0.7]))
+    assert tally.quality().classes["person"].ap50 < 1.0  # the duplicate at .8 lies between the hits
+    small = MaskTally({"person"}, min_area=100)
+    small.add(labelled(walker(0), block(0, 5, 0, 5)), instances(walker(0), block(0, 5, 0, 5)))
+    quality = small.quality().classes["person"]
+    assert (quality.truths, quality.ap) == (1, 1.0)
+    with pytest.raises(SegmentationError, match="cannot be compared"):
+        small.add(labelled(walker(0)), Instances.empty(5, 5))

@@ -1,0 +1,298 @@
+"""Settings, classes, oracle and recorded masks, and the choice among the sources."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
+from dynslam_bench.core.settings import apply_overrides, build, parameters
+from dynslam_bench.segmentation import build as building
+from dynslam_bench.segmentation import checkpoints
+from dynslam_bench.segmentation.build import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation.classes import COCO_IDS, COCO_NAMES, VOC_NAMES, expand_classes
+from dynslam_bench.segmentation.images import as_rgb
+from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.segmentation.oracle import OracleSegmenter
+from dynslam_bench.segmentation.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.registry import SEGMENTERS, SegmenterSpec
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.frame import Frame, FrameMasks
+
+
+def frame(index=0, stamp=0.0, shape=(24, 32)):
+    return Frame(index, stamp, np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32))
+
+
+class Masks:
+    """Person 1 left, chair 2 right; the chair moves from frame 1 on."""
+
+    def __getitem__(self, index):
+        if not 0 <= index < 3:
+            raise IndexError(index)
+        labels = np.zeros((24, 32), np.uint8)
+        labels[4:20, 2:8] = 1
+        labels[10:20, 20:28] = 2
+        return FrameMasks(labels, {1: "person", 2: "chair"}, frozenset({2} if index else ()))
+
+
+# --- settings ----------------------------------------------------------------------------------------------------
+
+
+def test_settings_need_neither_torch_nor_opencv():
+    code = (
+        "import sys; import dynslam_bench.segmentation.settings, dynslam_bench.segmentation.registry, "
+        "dynslam_bench.segmentation.train_settings, dynslam_bench.segmentation.checkpoints; "
+        "print([m for m in ('torch', 'cv2') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["auto", "none", "oracle", "embedded", "coco", "onnx:a b.onnx", "recorded:x", "weights:C:/w.pt", "plugin:p"],
+)
+def test_known_sources(source):
+    assert SegmentationSettings(source=source).source == source
+
+
+@pytest.mark.parametrize(("source", "text"), [("orcale", "did you mean 'oracle'"), ("onnx:", "needs a path"),
+                                              ("", "not one of auto"), ("yolo:x", "not one of auto")])  # fmt: skip
+def test_unknown_sources(source, text):
+    with pytest.raises(SettingsError, match=text):
+        build(SegmentationSettings, {"source": source})
+
+
+def test_classes_are_names_and_presets():
+    assert SegmentationSettings().class_names() == {"person"}
+    assert len(SegmentationSettings(classes="dynaslam19").class_names()) == 19
+    both = apply_overrides(SegmentationSettings(), {"classes": '["person", "chair"]'})
+    assert both.classes == "person,chair" and both.class_names() == {"person", "chair"}
+    assert SegmentationSettings(classes="dynaslam19, chair").class_names() > {"person", "chair", "zebra"}
+    with pytest.raises(SettingsError, match=r"unknown class 'persson' .did you mean 'person'"):
+        build(SegmentationSettings, {"classes": "persson"})
+    with pytest.raises(SettingsError, match="empty"):
+        build(SegmentationSettings, {"classes": " , "})
+    with pytest.raises(SegmentationError):
+        expand_classes([])
+
+
+def test_what_studies_tune_and_agents_steer():
+    found = {parameter.name: parameter for parameter in parameters(SegmentationSettings)}
+    assert {"confidence", "mask_threshold", "dilation_px", "classes", "schedule", "n", "repair"} <= set(found)
+    assert found["classes"].choices == ("person", "dynaslam19")
+    assert found["dilation_px"].default == 15 and found["dilation_px"].unit == "px"
+    online = {parameter.name for parameter in parameters(SegmentationSettings, online_only=True)}
+    assert {"confidence", "dilation_px", "n"} <= online and "mask_threshold" not in online
+
+
+def test_class_tables():
+    assert len(COCO_NAMES) == len(set(COCO_NAMES)) == 80 and len(COCO_IDS) == 80
+    assert (COCO_IDS[1], COCO_IDS[13], COCO_IDS[62], COCO_IDS[90]) == ("person", "stop sign", "chair", "toothbrush")
+    assert VOC_NAMES[15] == "person" and set(VOC_NAMES[1:]) <= set(COCO_NAMES)
+
+
+# --- images ------------------------------------------------------------------------------------------------------
+
+
+def test_any_image_becomes_rgb():
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    for image in (grey, grey[:, :, None], grey[:, :, None].repeat(3, 2), grey[:, :, None].repeat(4, 2),
+                  grey.astype(np.uint16) * 257, grey / 255.0):  # fmt: skip
+        assert np.array_equal(as_rgb(image), grey[:, :, None].repeat(3, 2))
+    for bad in (np.zeros((3, 4, 2), np.uint8), np.zeros(5, np.uint8), np.zeros((0, 4, 3), np.uint8),
+                np.full((3, 4), 2.0), np.full((3, 4), np.nan), np.zeros((3, 4), np.int32)):  # fmt: skip
+        with pytest.raises(SegmentationError, match="image"):
+            as_rgb(bad)
+
+
+# --- oracle ------------------------------------------------------------------------------------------------------
+
+
+def test_oracle_gives_everything_and_the_stage_what_is_dynamic():
+    found = OracleSegmenter(Masks()).segment(frame(1))
+    assert found.class_names == ("person", "chair") and found.moving.tolist() == [False, True]
+    assert found.boxes.tolist() == [[2, 4, 8, 20], [20, 10, 28, 20]] and found.masks.sum() == 16 * 6 + 10 * 8
+    stage = build_segmenter(SegmentationSettings(source="oracle"), masks=Masks())
+    assert stage.segment(frame(0)).class_names == ("person",)
+    assert stage.segment(frame(1)).class_names == ("person", "chair")
+
+
+def test_oracle_refuses_what_does_not_fit():
+    with pytest.raises(SegmentationError, match="has no exact masks"):
+        build_segmenter(SegmentationSettings(source="oracle"), sequence_id="tum/fr3/walking_xyz")
+    with pytest.raises(SegmentationError, match=r"32x24, the frame 40x30"):
+        OracleSegmenter(Masks()).segment(frame(shape=(30, 40)))
+    with pytest.raises(SegmentationError, match="frame 7"):
+        OracleSegmenter(Masks()).segment(frame(7))
+
+    class Nameless:
+        def __getitem__(self, index):
+            return FrameMasks(np.full((24, 32), 9, np.uint8), {1: "person"}, frozenset())
+
+    with pytest.raises(SegmentationError, match="instance 9 has no class name"):
+        OracleSegmenter(Nameless()).segment(frame())
+
+
+# --- recorded ----------------------------------------------------------------------------------------------------
+
+
+def record(folder, name, values, shape=(24, 32), dtype=np.uint8):
+    labels = np.zeros(shape, dtype)
+    for k, value in enumerate(values):
+        labels[2:8, 4 * k : 4 * k + 3] = value
+    assert cv2.imwrite(str(folder / name), labels)
+
+
+def test_recorded_by_stamp_and_by_index(tmp_path):
+    for stamp, values in ((100.0, [255]), (100.033333, [1, 2]), (100.066667, [])):
+        record(tmp_path, f"{stamp:.6f}.png", values)
+    segmenter = RecordedSegmenter(tmp_path)
+    assert [len(segmenter.segment(frame(5, stamp))) for stamp in (100.001, 100.04, 100.07)] == [1, 2, 0]
+    with pytest.raises(SegmentationError, match=r"within 0.02 s of frame 5 .* 100.066667.png, 0.933 s away"):
+        segmenter.segment(frame(5, 101.0))
+    indexed = tmp_path / "indexed"
+    indexed.mkdir()
+    record(indexed, "000000.png", [1])
+    record(indexed, "000010.png", [1, 300], dtype=np.uint16)
+    segmenter = build_segmenter(SegmentationSettings(source=f"recorded:{indexed}"))
+    assert len(segmenter.segment(frame(10, 55.0))) == 2 and segmenter.source == f"recorded:{indexed}"
+    with pytest.raises(SegmentationError, match=r"frame 3 .*there are 2, indices 0 to 10"):
+        segmenter.segment(frame(3))
+
+
+def test_recorded_classes(tmp_path):
+    record(tmp_path, "0.png", [1, 7])
+    (tmp_path / "classes.json").write_text(json.dumps({"1": "person", "7": "chair"}))
+    assert RecordedSegmenter(tmp_path).segment(frame()).class_names == ("person", "chair")
+    record(tmp_path, "0.png", [2])
+    with pytest.raises(SegmentationError, match="object 2 has no class"):
+        RecordedSegmenter(tmp_path).segment(frame())
+    (tmp_path / "classes.json").write_text("{nope")
+    with pytest.raises(SegmentationError, match="cannot read"):
+        RecordedSegmenter(tmp_path)
+
+
+def test_recorded_refuses_what_does_not_fit(tmp_path):
+    with pytest.raises(SegmentationError, match="does not exist"):
+        RecordedSegmenter(tmp_path / "none")
+    with pytest.raises(SegmentationError, match="holds no PNG files"):
+        RecordedSegmenter(tmp_path)
+    record(tmp_path, "0.png", [1], shape=(12, 16))
+    with pytest.raises(SegmentationError, match=r"mask is 16x12, the frame 32x24"):
+        RecordedSegmenter(tmp_path).segment(frame())
+    (tmp_path / "0.png").write_bytes(b"\x89PNG nothing")
+    with pytest.raises(SegmentationError, match="cannot read the mask"):
+        RecordedSegmenter(tmp_path).segment(frame())
+    colour = np.zeros((24, 32, 3), np.uint8)
+    colour[3, 3] = 1, 2, 3
+    cv2.imwrite(str(tmp_path / "0.png"), colour)
+    with pytest.raises(SegmentationError, match="is a colour image"):
+        RecordedSegmenter(tmp_path).segment(frame())
+    record(tmp_path, "1.5.png", [1])
+    with pytest.raises(SegmentationError, match="1 of 2 mask files are named by stamp"):
+        RecordedSegmenter(tmp_path)
+
+
+# --- choice ------------------------------------------------------------------------------------------------------
+
+
+def test_auto(monkeypatch, tmp_path):
+    monkeypatch.setenv(checkpoints.CACHE_VARIABLE, str(tmp_path))
+    auto = SegmentationSettings()
+    monkeypatch.setattr(building, "embedded_weights", lambda: tmp_path / "embedded.pt")
+    assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "embedded"
+    monkeypatch.setattr(building, "embedded_weights", lambda: None)
+    assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "oracle"
+    with pytest.raises(SegmentationError, match=r"'bonn/crowd'.*choose one of: segmentation.source=none.*onnx:PATH"):
+        resolve_source(auto, "bonn/crowd")
+    (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
+    assert resolve_source(auto, "bonn/crowd") == "coco"
+    assert weights_digest(auto, "bonn/crowd") == hashlib.sha256(b"weights").hexdigest()[:12]
+    assert build_segmenter(SegmentationSettings(source="none")) is None
+    assert weights_digest(SegmentationSettings(source="oracle"), masks=Masks()) == ""
+
+
+class FixedSegmenter:
+    def __init__(self, settings, context):
+        self.context = context
+
+    def segment(self, frame):
+        masks = np.zeros((2, 24, 32), bool)
+        masks[:, 3:9, 3:9] = True
+        boxes = np.array([[3, 3, 9, 9]] * 2, np.float32)
+        return Instances(masks, boxes, ("person", "person"), np.array([0.9, 0.2], np.float32))
+
+
+def small_masks(settings, context):
+    class Small(FixedSegmenter):
+        def segment(self, frame):
+            return Instances.empty(12, 16)
+
+    return Small(settings, context)
+
+
+def no_segmenter(settings, context):
+    return 3
+
+
+FIXED = SegmenterSpec("fixed", f"{__name__}:FixedSegmenter")
+SMALL = SegmenterSpec("small", f"{__name__}:small_masks")
+BROKEN = SegmenterSpec("broken", f"{__name__}:no_segmenter")
+
+
+def test_plugins():
+    def source(name):
+        return SegmentationSettings(source=f"plugin:{__file__}:{name}")
+
+    sys.modules.setdefault(__name__, sys.modules[__name__])
+    built = build_segmenter(source("FIXED"), threads=2)
+    assert built.inner.context.threads == 2
+    assert built.segment(frame()).scores == pytest.approx([0.9])
+    built.settings = built.settings.model_copy(update={"confidence": 0.15})
+    assert len(built.segment(frame())) == 2
+    with pytest.raises(SegmentationError, match=r"masks of shape \(0, 12, 16\), the frame is 32x24"):
+        build_segmenter(source("SMALL")).segment(frame())
+    with pytest.raises(SegmentationError, match="gave a int without segment"):
+        build_segmenter(source("BROKEN"))
+    with pytest.raises(PluginError, match=r"unknown segmenter 'oracel'.*'oracle'"):
+        build_segmenter(SegmentationSettings(source="plugin:oracel"))
+    ids = {found.spec.id for found in SEGMENTERS.all()}
+    assert ids >= {"oracle", "recorded", "onnx", "embedded", "coco", "weights"}
+
+
+# --- downloads ---------------------------------------------------------------------------------------------------
+
+
+def published(tmp_path, content, prefix=None):
+    file = tmp_path / "published.pth"
+    file.write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    return checkpoints.Checkpoint("test", "test.pth", file.as_uri(), prefix or digest[:8], 1, "MIT", "nothing")
+
+
+def test_a_checkpoint_is_fetched_once_and_verified(monkeypatch, tmp_path):
+    monkeypatch.setenv(checkpoints.CACHE_VARIABLE, str(tmp_path / "cache"))
+    content = bytes(range(256)) * 3000
+    checkpoint = published(tmp_path, content)
+    told = []
+    path = checkpoints.fetch_checkpoint(checkpoint, lambda done, total: told.append((done, total)))
+    assert path.read_bytes() == content and told[-1] == (len(content), len(content)) and len(told) > 1
+    (tmp_path / "published.pth").unlink()
+    assert checkpoints.fetch_checkpoint(checkpoint) == path
+    assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["test.pth"]
+
+
+def test_a_damaged_or_missing_download_leaves_nothing(monkeypatch, tmp_path):
+    monkeypatch.setenv(checkpoints.CACHE_VARIABLE, str(tmp_path / "cache"))
+    checkpoint = published(tmp_path, b"something else", prefix="00000000")
+    with pytest.raises(SegmentationError, match=r"damaged: SHA-256 .*expected 00000000.*put the file of"):
+        checkpoints.fetch_checkpoint(checkpoint)
+    (tmp_path / "published.pth").unlink()
+    with pytest.raises(SegmentationError, match=r"cannot fetch the checkpoint 'test'.*1 MB.*test.pth"):
+        checkpoints.fetch_checkpoint(checkpoint)
+    assert not list((tmp_path / "cache").iterdir())

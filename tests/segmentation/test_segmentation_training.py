@@ -1,0 +1,257 @@
+"""Labelled data from files and sequences, training with resume, evaluation."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.evaluate import SegmenterScore, evaluate_segmenter
+from dynslam_bench.segmentation.labelled import LabelledImage, open_labelled
+from dynslam_bench.segmentation.labelled_files import CocoImages, YoloImages, decode_runs
+from dynslam_bench.segmentation.labelled_sequences import RenderedFrames
+from dynslam_bench.segmentation.loading import load_network
+from dynslam_bench.segmentation.matching import IGNORED, NEGATIVE, match, sample
+from dynslam_bench.segmentation.prepared import PreparedImages, prepare, shrink, vary
+from dynslam_bench.segmentation.roi_heads import crop_masks
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.train import network_config, train
+from dynslam_bench.segmentation.train_settings import TrainSettings
+
+COCO128 = Path(__file__).resolve().parents[3] / "shared" / "data" / "coco128-seg"
+
+
+def write_yolo(folder, count=6, seed=0):
+    """Images with one textured rectangle 'person' each (and a 'chair' nobody learns)."""
+    rng = np.random.default_rng(seed)
+    for part in ("images", "labels"):
+        (folder / part).mkdir(parents=True)
+    for k in range(count):
+        image = np.full((120, 160, 3), 90, np.uint8)
+        x, y = int(rng.integers(10, 90)), int(rng.integers(10, 50))
+        image[y : y + 60, x : x + 40] = (20, 40, 200)
+        image[100:115, 5:20] = (200, 200, 20)
+        assert cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+        corners = [(x, y), (x + 40, y), (x + 40, y + 60), (x, y + 60)]
+        flat = " ".join(f"{a / 160:.6f} {b / 120:.6f}" for a, b in corners)
+        chair = "0.03125 0.83333 0.125 0.83333 0.125 0.95833 0.03125 0.95833"
+        (folder / "labels" / f"{k}.txt").write_text(f"0 {flat}\n56 {chair}\n")
+    return folder
+
+
+# --- data --------------------------------------------------------------------------------------------------------
+
+
+def test_yolo_polygons(tmp_path):
+    images = YoloImages(write_yolo(tmp_path))
+    assert len(images) == 6
+    image = images[2]
+    assert image.class_names == ("person", "chair") and image.rgb.shape == (120, 160, 3)
+    red = (image.rgb == (200, 40, 20)).all(axis=2)
+    assert (image.masks[0] & red).sum() / (image.masks[0] | red).sum() > 0.95
+    (tmp_path / "labels" / "2.txt").write_text("0 0.1 0.2 0.3\n")
+    with pytest.raises(SegmentationError, match=r"2.txt line 1 is no polygon label"):
+        images[2]
+    (tmp_path / "labels" / "2.txt").unlink()
+    assert images[2].masks.shape == (0, 120, 160)
+    with pytest.raises(SegmentationError, match="there are no images"):
+        YoloImages(tmp_path / "none")
+
+
+def coco_file(folder, segmentation, **extra):
+    cv2.imwrite(str(folder / "a.png"), np.zeros((6, 8, 3), np.uint8))
+    content = {
+        "images": [{"id": 5, "file_name": "a.png", "width": 8, "height": 6}],
+        "annotations": [{"id": 1, "image_id": 5, "category_id": 1, "segmentation": segmentation, **extra}],
+        "categories": [{"id": 1, "name": "person"}],
+    }
+    path = folder / "instances.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_coco_polygons_and_run_lengths(tmp_path):
+    expected = np.zeros((6, 8), bool)
+    expected[1:4, 2:6] = True
+    polygon = [[2, 1, 6, 1, 6, 4, 2, 4]]
+    counts = [13, 3, 3, 3, 3, 3, 3, 3, 14]
+    for segmentation in (polygon, {"size": [6, 8], "counts": counts}):
+        image = CocoImages(coco_file(tmp_path, segmentation))[0]
+        assert image.class_names == ("person",)
+        assert np.count_nonzero(image.masks[0] != expected) == 0
+    assert len(CocoImages(coco_file(tmp_path, polygon, iscrowd=1))[0].masks) == 0
+    with pytest.raises(SegmentationError, match="a mask of 9x6"):
+        CocoImages(coco_file(tmp_path, {"size": [6, 9], "counts": [54]}))[0]
+    (tmp_path / "instances.json").write_text('{"images": []}')
+    with pytest.raises(SegmentationError, match="not in COCO's annotation format"):
+        CocoImages(tmp_path / "instances.json")
+
+
+def encode_runs(runs):
+    """The inverse of `decode_runs`, from the format's description."""
+    text = ""
+    for k, run in enumerate(runs):
+        value = run - (runs[k - 2] if k > 2 else 0)
+        while True:
+            digit, value = value & 0x1F, value >> 5
+            more = not ((value == 0 and not digit & 0x10) or (value == -1 and digit & 0x10))
+            text += chr(48 + (digit | (0x20 if more else 0)))
+            if not more:
+                break
+    return text
+
+
+def test_compressed_run_lengths():
+    assert decode_runs("06") == [0, 6]
+    for seed in range(20):
+        runs = np.random.default_rng(seed).integers(0, 5000, 30).tolist()
+        assert decode_runs(encode_runs(runs)) == runs
+
+
+@pytest.mark.skipif(not COCO128.is_dir(), reason="needs ../shared/data/coco128-seg")
+def test_coco128():
+    images = open_labelled(f"yolo:{COCO128}")
+    assert len(images) == 128
+    persons = sum(name == "person" for k in range(0, 128, 4) for name in images[k].class_names)
+    assert persons > 30
+
+
+def test_rendered_frames_are_a_function_of_their_name():
+    text = "synthetic:instances=3-4,frames=2,length=30,options=0.5,seed=7"
+    one, two = open_labelled(text), open_labelled(text)
+    assert isinstance(one, RenderedFrames) and one.name == text and len(one) == 2 * 8 * 2
+    a, b = one[5], two[5]
+    assert np.array_equal(a.rgb, b.rgb) and np.array_equal(a.masks, b.masks) and "person" in a.class_names
+    assert not np.array_equal(a.rgb, one[4].rgb)
+    for bad in ("instances=0-200", "frames=0", "colour=1", "frames=x", "frames=40,length=30"):
+        with pytest.raises(SegmentationError, match="synthetic:"):
+            open_labelled(f"synthetic:{bad}")
+    with pytest.raises(SegmentationError, match=r"did you mean 'synthetic'"):
+        open_labelled("syntetic:x")
+
+
+def test_shrinking_keeps_the_aspect_ratio_and_the_smaller_object_in_front():
+    masks = np.zeros((2, 100, 100), bool)
+    masks[0, 40:60, 40:60] = True
+    masks[1, 20:80, 20:80] = True
+    rgb, labels, names = shrink(LabelledImage(np.full((100, 100, 3), 9, np.uint8), masks, ("chair", "person")), 60, 80)
+    assert rgb.shape == (60, 80, 3) and (rgb[:, :10] == 114).all() and (rgb[:, 10:70] == 9).all()
+    assert names == ["person", "chair"]
+    assert (labels[24:36, 34:46] == 2).all() and (labels == 2).sum() == 144 and (labels > 0).sum() == 36 * 36
+
+
+def test_variation_moves_image_and_labels_alike():
+    rgb = np.zeros((120, 160, 3), np.uint8)
+    rgb[30:90, 40:100] = 255
+    labels = (rgb[:, :, 0] > 0).astype(np.uint8)
+    seen = set()
+    for seed in range(12):
+        image, moved = vary(rgb, labels, np.random.default_rng(seed))
+        assert image.shape == rgb.shape and image.dtype == np.uint8
+        bright = image.mean(axis=2) > (float(image.mean(axis=2)[moved > 0].mean()) + 60) / 2
+        if (moved > 0).any():
+            assert (bright & (moved > 0)).sum() / (moved > 0).sum() > 0.8
+        seen.add(int(moved.sum()))
+    assert len(seen) > 5
+
+
+# --- training ----------------------------------------------------------------------------------------------------
+
+
+def test_matching_and_sampling():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 14], [50, 50, 60, 60], [0, 0, 40, 40], [100, 100, 101, 101]])
+    truth = torch.tensor([[0.0, 0, 10, 10], [20, 20, 60, 60]])
+    assert match(boxes, truth, high=0.7, low=0.3, keep_best=False).tolist() == [0, 0, NEGATIVE, NEGATIVE, NEGATIVE]
+    best = match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist()
+    assert best == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
+    assert match(boxes, truth[:0], high=0.7, low=0.3, keep_best=True).tolist() == [NEGATIVE] * 5
+    chosen = sample(torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9), count=8, positive_share=0.25,
+                    generator=torch.Generator().manual_seed(0))  # fmt: skip
+    assert len(chosen.positive) == 2 and len(chosen.negative) == 6 and int(chosen.negative.max()) < 54
+
+
+def test_mask_targets_are_the_mask_inside_the_box():
+    masks = torch.zeros(1, 40, 60, dtype=torch.bool)
+    masks[0, 10:30, 20:40] = True
+    target = crop_masks(masks, torch.tensor([[20.0, 10, 60, 30]]), 28)
+    assert (target[0, :, :14] == 1).all() and (target[0, :, 14:] == 0).all()
+
+
+def settings_for(folder, **changes):
+    values = {
+        "data": (f"yolo:{folder}",), "validation": f"yolo:{folder}", "iterations": 3, "batch": 1, "proposals": 16,
+        "warmup": 2, "evaluate_every": 3, "checkpoint_every": 1, "average": 0.5, **changes,
+    }  # fmt: skip
+    return TrainSettings(**values)
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
+    data = write_yolo(tmp_path / "data", 4)
+    cache = tmp_path / "cache"
+    whole = train(settings_for(data), tmp_path / "whole", data_cache=cache)
+    assert whole.stopped == "finished" and whole.best == tmp_path / "whole" / "best.pt"
+
+    class Stop(Exception):
+        pass
+
+    def stop(progress):
+        if progress.stage == "train" and progress.done == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(settings_for(data), tmp_path / "parts", data_cache=cache, progress=stop)
+    train(settings_for(data), tmp_path / "parts", data_cache=cache)
+    first, second = (torch.load(tmp_path / run / "last.pt", weights_only=True) for run in ("whole", "parts"))
+    assert first["step"] == second["step"] == 3
+    assert all(torch.equal(value, second["network"][key]) for key, value in first["network"].items())
+    assert json.loads(first["rows"]) == json.loads(second["rows"])
+    for name in ("curve.csv", "curve.png", "best.pt", "settings.json"):
+        assert (tmp_path / "whole" / name).stat().st_size > 0
+    assert cv2.imread(str(tmp_path / "whole" / "curve.png")).shape[2] == 3
+    assert (tmp_path / "whole" / "curve.csv").read_text().startswith("step,objectness,anchor,class,box,mask,loss,iou")
+    assert load_network(whole.best).config == network_config(settings_for(data))
+    with pytest.raises(SegmentationError, match="another learning_rate"):
+        train(settings_for(data, learning_rate=0.5), tmp_path / "parts", data_cache=cache)
+    started = train(
+        settings_for(data, iterations=1, init=str(whole.best), cfpn=True), tmp_path / "fine", data_cache=cache
+    )
+    assert started.step == 1
+
+
+def test_losses_fall_on_a_simple_task_and_early_stop_ends_it(tmp_path):
+    data = write_yolo(tmp_path / "data", 4)
+    seen = []
+    train(settings_for(data, iterations=12, batch=1, evaluate_every=12, learning_rate=2e-3, checkpoint_every=12),
+          tmp_path / "run", data_cache=tmp_path / "cache",
+          progress=lambda p: seen.append(sum(p.values.values())) if p.stage == "train" else None)  # fmt: skip
+    assert np.mean(seen[-3:]) < 0.75 * np.mean(seen[:3])
+    stopped = train(settings_for(data, iterations=50, evaluate_every=1, checkpoint_every=50, patience=1, learning_rate=1e-9, warmup=0),
+                    tmp_path / "stop", data_cache=tmp_path / "cache")  # fmt: skip
+    assert stopped.stopped == "no gain"
+
+
+def test_what_cannot_be_trained_is_refused(tmp_path):
+    with pytest.raises(SegmentationError, match="'unicorn' is no COCO class"):
+        network_config(TrainSettings(classes="person,unicorn"))
+    with pytest.raises(SegmentationError, match="named twice"):
+        network_config(TrainSettings(classes="person,person"))
+    assert len(network_config(TrainSettings(classes="dynaslam19", network="resnet18")).classes) == 19
+    with pytest.raises(SegmentationError, match="no images"):
+        train(settings_for(tmp_path / "none"), tmp_path / "run")
+
+
+# --- evaluation --------------------------------------------------------------------------------------------------
+
+
+def test_evaluating_a_network_and_writing_the_score(tmp_path):
+    data = write_yolo(tmp_path / "data", 3)
+    trained = train(settings_for(data, iterations=1), tmp_path / "run", data_cache=tmp_path / "cache")
+    settings = SegmentationSettings(source=f"weights:{trained.best}", network_side=0)
+    score = evaluate_segmenter(settings, f"yolo:{data}", output=tmp_path / "score.json", limit=2)
+    assert score.images == 2 and score.classes["person"]["truths"] == 2 and len(score.weights) == 12
+    assert SegmenterScore.read(tmp_path / "score.json") == score
+    prepared = PreparedImages(prepare(open_labelled(f"yolo:{data}"), tmp_path / "cache", 240, 320), ("person",))
+    assert len(prepared) == 3 and prepared[0].labels.tolist() == [1] and prepared[0].masks.shape == (1, 240, 320)
