@@ -15,7 +15,7 @@ from dynslam_bench.sequences.roots import user_cache
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
 HINT = (
-    f"name ORBvoc.txt of the ORB-SLAM3 repository (or any ORB vocabulary in DBoW2's text format, .txt or .txt.xz) "
+    f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
     f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
 )
 TOKENS = 35  # parent, whether it is a leaf, 32 bytes of the descriptor, weight
