@@ -74,6 +74,7 @@ def tracker_report(
     run = _Runner(construct, scene, frames, seed)
     if not report.run("results", lambda: _results(run)):
         return report
+    report.run("same stats on every frame", lambda: _same_keys(run))
     report.run("frames are left alone", lambda: _frames_left_alone(run))
     report.run("results are kept", lambda: _results_are_kept(run))
     deterministic = spec is None or spec.deterministic
@@ -184,15 +185,19 @@ def _construct(construct: Callable[[], Tracker]) -> None:
 
 def _results(run: _Runner) -> None:
     results = run.track(run.frames)
+    states = [result.state for result in results]
+    require("ok" in states, f"no frame of an easy scene was tracked: {states}",
+            "on this scene features abound and depth is exact")  # fmt: skip
+    _direction(run, results)
+
+
+def _same_keys(run: _Runner) -> None:
+    results = run.track(run.frames)
     keys = set(results[0].stats)
     for frame, result in zip(run.frames, results, strict=True):
         changed = keys ^ set(result.stats)
         require(not changed, f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}",
                 "the keys must be the same on every frame; use 0 where there is nothing to say")  # fmt: skip
-    states = [result.state for result in results]
-    require("ok" in states, f"no frame of an easy scene was tracked: {states}",
-            "on this scene features abound and depth is exact")  # fmt: skip
-    _direction(run, results)
 
 
 def _direction(run: _Runner, results: list[TrackResult]) -> None:
