@@ -14,8 +14,8 @@ import math
 import numpy as np
 
 from .compiled import kernel
+from .parts import BOX, ROUND_CONE
 
-BOX, ROUND_CONE, QUAD = 0, 1, 2
 TILE = 8
 _NEAR = 0.05
 _PER_TURN = 1.0 / (2.0 * math.pi)

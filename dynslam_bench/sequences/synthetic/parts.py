@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-BOX, ROUND_CONE, QUAD = 0, 1, 2  # as in kernels.py, which needs numba
+BOX, ROUND_CONE, QUAD = 0, 1, 2
 
 
 @dataclass

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import kernels, sensors
+from .parts import QUAD, ROUND_CONE
 from .scene import Scene, Snapshot
 from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
 
@@ -224,9 +225,9 @@ class Renderer:
         axes = (snap.T_world_cam[:3, :3].T @ snap.rotation).transpose(0, 2, 1)
         facets = np.empty((len(axes), 6, 5))
         facets[:, 0::2, :3], facets[:, 1::2, :3] = -axes, axes
-        facets[scene.kind == kernels.QUAD, 4:, :3] = axes[scene.kind == kernels.QUAD, 2:]
+        facets[scene.kind == QUAD, 4:, :3] = axes[scene.kind == QUAD, 2:]
         seen = snap.T_world_cam[:3, 3] - snap.origin
-        behind = (np.einsum("pij,pi->pj", snap.rotation, seen) < 0)[:, 2] & (scene.kind == kernels.QUAD)
+        behind = (np.einsum("pij,pi->pj", snap.rotation, seen) < 0)[:, 2] & (scene.kind == QUAD)
         facets[behind, 4:, :3] *= -1
         facets[:, :, 3] = lights[0, 3] + np.maximum(facets[:, :, :3] @ lights[1:, :3].T, 0) @ lights[1:, 3]
         facets[:, :, 4] = self._density
@@ -236,7 +237,7 @@ class Renderer:
         """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
         scene = self.scene
         repeats = np.abs(scene.uv[:, :, :2])
-        cones = scene.kind == kernels.ROUND_CONE
+        cones = scene.kind == ROUND_CONE
         girth = math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3)
         repeats[cones, :, 0] /= girth[:, None]
         repeats[cones] /= scene.scale[cones].mean(axis=1)[:, None, None]

@@ -12,7 +12,7 @@ from dynslam_bench.core.seeding import stream
 from . import textures
 from .furniture import add_chair
 from .motion import camera_poses
-from .parts import Parts, turn
+from .parts import QUAD, ROUND_CONE, Parts, turn
 from .people import add_person, draw_person
 from .plan import plan_room
 from .room import build_room
@@ -143,8 +143,8 @@ class Scene:
     def _corners(self) -> Array:
         """Corners ``[P, 8, 3]`` of each primitive's box in its local frame."""
         low, high = -self.shape.copy(), self.shape.copy()
-        low[self.kind == 2, 2] = high[self.kind == 2, 2] = 0.0
-        cones = self.kind == 1
+        low[self.kind == QUAD, 2] = high[self.kind == QUAD, 2] = 0.0
+        cones = self.kind == ROUND_CONE
         h, r1, r2 = self.shape[cones].T
         radius = np.maximum(r1, r2)
         low[cones] = np.stack([-radius, -radius, np.minimum(-r1, h - r2)], 1)
