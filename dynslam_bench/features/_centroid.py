@@ -23,12 +23,12 @@ def _orientations(
     radius = len(half_widths) - 1
     for i in range(len(xy)):
         x0, y0 = int(xy[i, 0]), int(xy[i, 1])
-        m10, m01 = 0, 0
+        m10, m01 = np.int64(0), np.int64(0)
         for dy in range(-radius, radius + 1):
             w = half_widths[abs(dy)]
-            row = 0
+            row = np.int64(0)
             for dx in range(-w, w + 1):
-                value = int(image[y0 + dy, x0 + dx])
+                value = np.int64(image[y0 + dy, x0 + dx])
                 m10 += dx * value
                 row += value
             m01 += dy * row

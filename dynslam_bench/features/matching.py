@@ -47,15 +47,15 @@ def hamming(a: Words, b: Words) -> NDArray[np.int64]:
 
 
 @njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
-def distance(a: Words, b: Words) -> int:
+def distance(a: Words, b: Words) -> np.int64:
     """Hamming distance of two descriptors ``[W]``; for use inside compiled kernels."""
-    total = 0
+    total = np.int64(0)
     for w in range(a.shape[0]):
         v = a[w] ^ b[w]
         v = v - ((v >> _ONE) & _M1)
         v = (v & _M2) + ((v >> _TWO) & _M2)
         v = (v + (v >> _FOUR)) & _M4
-        total += int((v * _H01) >> _TOP)
+        total += np.int64((v * _H01) >> _TOP)
     return total
 
 

@@ -264,3 +264,14 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     )  # fmt: skip
     limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
     return BundleResult(poses, points, chi2 <= limit, before, after)
+
+
+def reprojection_chi2(problem: BundleProblem, poses: Array, points: Array) -> tuple[float, Array]:
+    """Huber cost and chi-square of each observation ``[N]`` at given poses and points; inf behind the camera."""
+    c = problem.camera
+    chi2 = np.zeros(len(problem.obs_pose))
+    cost = _cost(
+        np.ascontiguousarray(poses), np.ascontiguousarray(points), problem.obs_pose, problem.obs_point, problem.uv,
+        problem.right, problem.info, problem.info_right, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2,
+    )  # fmt: skip
+    return float(cost), chi2

@@ -14,6 +14,7 @@ from .bundle import BundleProblem, adjust_bundle
 from .map import Map
 from .observation import Observations
 from .settings import BackendSettings, BundleAdjustmentSettings
+from .triangulation import triangulate
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
@@ -71,6 +72,9 @@ class LocalMapper:
         if not first:
             neighbours, _ = world.covisible(slot)
             neighbours = neighbours[: self.settings.mapping.neighbours]
+            share = np.count_nonzero((seen.z > 0) & (seen.z < self.close_m)) / max(len(seen), 1)
+            if share < self.settings.mapping.triangulate_below:
+                self._points_from_views(slot, seen, neighbours)
             self._fuse(slot, neighbours)
             start = perf_counter()
             if self.settings.bundle_adjustment.enabled:
@@ -97,6 +101,17 @@ class LocalMapper:
         created = world.add_points(position, seen.rgb[free], slot, free)
         world.refresh(created)
         self._young = np.concatenate([self._young, created])
+
+    def _points_from_views(self, slot: int, seen: Observations, neighbours: Slots) -> None:
+        """Points for features that have no point yet, by triangulation with the neighbours."""
+        world = self.world
+        for other in neighbours.tolist():
+            ours, theirs, position = triangulate(world, slot, other, self.settings.mapping.min_parallax_deg)
+            if len(ours):
+                created = world.add_points(position, seen.rgb[ours], slot, ours)
+                world.observe(other, theirs, created)
+                world.refresh(created)
+                self._young = np.concatenate([self._young, created])
 
     def _cull_points(self) -> None:
         """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
@@ -171,7 +186,10 @@ class LocalMapper:
         if chosen is None:
             return
         problem, poses, points, features = chosen
-        result = adjust_bundle(problem, self.settings.bundle_adjustment.iterations)
+        solver = adjust_bundle
+        if self.settings.bundle_adjustment.solver == "gtsam":
+            from .bundle_gtsam import adjust_bundle_gtsam as solver
+        result = solver(problem, self.settings.bundle_adjustment.iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
             return
         for k in range(problem.variable):

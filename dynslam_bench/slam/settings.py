@@ -84,7 +84,13 @@ class MappingSettings(Settings):
     neighbours: int = tunable(
         8, low=3, high=20, limits=(1, 100), meaning="covisible keyframes that new points are sought in and fused with"
     )
-    triangulate: bool = tunable(True, meaning="triangulate features without depth")
+    triangulate_below: float = tunable(
+        0.8,
+        low=0.0,
+        high=1.0,
+        meaning="features without depth are triangulated where fewer than this share of all have a close depth; "
+        "elsewhere they lie mostly on edges of occlusion and on mirrors and make bad points",
+    )
     min_parallax_deg: float = tunable(
         1.0, low=0.2, high=3.0, limits=(0.01, 30.0), unit="deg", meaning="smallest parallax of a triangulated point"
     )
