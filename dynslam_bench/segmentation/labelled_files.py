@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.records import digest
 
 from .classes import COCO_NAMES
 from .labelled import LabelledImage
@@ -65,6 +66,11 @@ class CocoImages:
         """The annotation file."""
         return f"coco:{self.path.name}"
 
+    @property
+    def version(self) -> str:
+        """Digest of the files' names and sizes."""
+        return _files_digest([self.path, *(entry.image for entry in self._entries)])
+
     def __len__(self) -> int:
         return len(self._entries)
 
@@ -100,6 +106,11 @@ class YoloImages:
         """The folder."""
         return f"yolo:{self.folder.name}"
 
+    @property
+    def version(self) -> str:
+        """Digest of the files' names and sizes."""
+        return _files_digest([*self._images, *sorted((self.folder / "labels").rglob("*.txt"))])
+
     def __len__(self) -> int:
         return len(self._images)
 
@@ -121,6 +132,10 @@ class YoloImages:
             masks.append(_fill([polygon], rgb.shape[:2]))
             names.append(name)
         return _labelled(rgb, masks, names)
+
+
+def _files_digest(paths: list[Path]) -> str:
+    return digest([(str(path), path.stat().st_size) for path in paths if path.is_file()])
 
 
 def _read(path: Path) -> NDArray[np.uint8]:

@@ -12,7 +12,12 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.frame import Sequence
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
-from dynslam_bench.sequences.synthetic.settings import SYNTHETIC_IDS, RenderSettings, parse_synthetic_id
+from dynslam_bench.sequences.synthetic.settings import (
+    RENDERER_VERSION,
+    SYNTHETIC_IDS,
+    RenderSettings,
+    parse_synthetic_id,
+)
 
 from .labelled import LabelledImage
 from .oracle import instances_of
@@ -50,6 +55,11 @@ class SequenceFrames:
     def name(self) -> str:
         """The sequence's id."""
         return self.sequence.id
+
+    @property
+    def version(self) -> str:
+        """Digest of the sequence's content."""
+        return self.sequence.digest()
 
     def __len__(self) -> int:
         return len(self.sequence)
@@ -110,6 +120,11 @@ class RenderedFrames:
             f"synthetic:instances={self.instances.start}-{self.instances.stop - 1},frames={self.frames},"
             f"length={self.length},options={self.options:g},seed={self.seed}"
         )
+
+    @property
+    def version(self) -> str:
+        """The renderer's version."""
+        return f"renderer {RENDERER_VERSION}"
 
     def __len__(self) -> int:
         return len(self.instances) * len(SYNTHETIC_IDS) * self.frames

@@ -80,7 +80,7 @@ def prepare(source: LabelledImages, folder: Path, height: int, width: int, progr
 
     Args:
         source: The images.
-        folder: Under which a folder is made, named by the digest of the set's name, length and size.
+        folder: Under which a folder is made, named by the digest of the set's name, content and size.
         height: Rows of the network's input.
         width: Columns.
         progress: Called with (images done, images in all).
@@ -88,7 +88,7 @@ def prepare(source: LabelledImages, folder: Path, height: int, width: int, progr
     Returns:
         The folder for `PreparedImages`.
     """
-    key = digest({"name": source.name, "count": len(source), "height": height, "width": width})
+    key = digest({"name": source.name, "version": source.version, "count": len(source), "size": [height, width]})
     target = folder / f"prepared-{key}"
     if (target / "names.json").is_file():
         return target

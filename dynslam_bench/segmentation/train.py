@@ -188,6 +188,7 @@ class _Run:
         self.step = 0
         self.rows: list[dict[str, float]] = []
         self.best = {"iou": -1.0, "step": 0.0}
+        self.recent: dict[str, list[float]] = {name: [] for name in LOSSES}
 
     def go(
         self, sets: list[PreparedImages], validation: PreparedImages, tell: Callable[[TrainProgress], None]
@@ -196,22 +197,21 @@ class _Run:
         total = sum(len(one) for one in sets)
         if not total or not len(validation):
             raise SegmentationError("there are no images to learn from or to validate on")
-        recent: dict[str, list[float]] = {name: [] for name in LOSSES}
         stopped = "finished"
         while self.step < settings.iterations:
             losses = self._learn(_batch(sets, settings, self.step))
             self.step += 1
             for name, value in losses.items():
-                recent[name].append(value)
+                self.recent[name].append(value)
             tell(TrainProgress("train", self.step, settings.iterations, losses))
             evaluate = self.step % settings.evaluate_every == 0 or self.step == settings.iterations
             if evaluate:
                 row = {"step": float(self.step)}
-                row.update({name: float(np.mean(values)) for name, values in recent.items() if values})
+                row.update({name: float(np.mean(values)) for name, values in self.recent.items() if values})
                 row["loss"] = sum(row[name] for name in LOSSES if name in row)
                 row.update(validate(self.average, validation, self.device))
                 self._record(row)
-                recent = {name: [] for name in LOSSES}
+                self.recent = {name: [] for name in LOSSES}
                 tell(TrainProgress("validation", self.step, settings.iterations, row))
             if evaluate or self.step % settings.checkpoint_every == 0:
                 self.save()
@@ -272,7 +272,7 @@ class _Run:
         content = {
             "format": "dynslam-bench/training/1", "step": self.step, "network": self.network.state_dict(),
             "average": self.average.state_dict(), "optimiser": self.optimiser.state_dict(),
-            "rows": json.dumps(self.rows), "best": json.dumps(self.best),
+            "rows": json.dumps(self.rows), "best": json.dumps(self.best), "recent": json.dumps(self.recent),
         }  # fmt: skip
         temporary = self.output / ".last.pt.tmp"
         torch.save(content, temporary)
@@ -289,9 +289,8 @@ class _Run:
             self.network.load_state_dict(content["network"])
             self.average.load_state_dict(content["average"])
             self.optimiser.load_state_dict(content["optimiser"])
-            self.step, self.rows, self.best = (
-                int(content["step"]), json.loads(content["rows"]), json.loads(content["best"])
-            )  # fmt: skip
+            self.step, self.rows = int(content["step"]), json.loads(content["rows"])
+            self.best, self.recent = json.loads(content["best"]), json.loads(content["recent"])
         except (KeyError, RuntimeError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise SegmentationError(f"{self.output / 'last.pt'} does not fit these settings: {reason}") from error

@@ -224,11 +224,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
 def test_losses_fall_on_a_simple_task_and_early_stop_ends_it(tmp_path):
     data = write_yolo(tmp_path / "data", 4)
     seen = []
-    train(settings_for(data, iterations=12, batch=1, evaluate_every=12, learning_rate=2e-3, checkpoint_every=12),
+    train(settings_for(data, iterations=14, batch=2, evaluate_every=14, checkpoint_every=14),
           tmp_path / "run", data_cache=tmp_path / "cache",
           progress=lambda p: seen.append(sum(p.values.values())) if p.stage == "train" else None)  # fmt: skip
     assert np.mean(seen[-3:]) < 0.75 * np.mean(seen[:3])
-    stopped = train(settings_for(data, iterations=50, evaluate_every=1, checkpoint_every=50, patience=1, learning_rate=1e-9, warmup=0),
+    stopped = train(settings_for(data, iterations=50, evaluate_every=1, patience=1, learning_rate=1e-9, warmup=0),
                     tmp_path / "stop", data_cache=tmp_path / "cache")  # fmt: skip
     assert stopped.stopped == "no gain"
 
