@@ -52,10 +52,12 @@ class DegradeFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         depth_noise: float = 0.0,
         seed: int = 0,
     ) -> None:
-        strengths = dict(lighting=lighting, glare=glare, shadow=shadow, blur=blur, noise=noise, depth_noise=depth_noise)
-        RecordConstructorArgs.__init__(self, seed=seed, **strengths)
+        RecordConstructorArgs.__init__(
+            self, lighting=lighting, glare=glare, shadow=shadow, blur=blur, noise=noise, depth_noise=depth_noise,
+            seed=seed,
+        )  # fmt: skip
         gym.Wrapper.__init__(self, env)
-        self.degradation = Degradation(**strengths, seed=seed)
+        self.degradation = Degradation(lighting, glare, shadow, blur, noise, depth_noise, seed)
         slam_env_of(env, "DegradeFrames").frame_transforms.append(self.degradation)
 
 
@@ -88,7 +90,8 @@ class Degradation:
             image += self._blob(frame.index, *image.shape[:2])[..., None]
         rng = stream(self.seed, "degrade", frame.index)
         if self.blur:
-            image = cv2.filter2D(np.clip(image, 0, 255), -1, _motion_kernel(25.0 * self.blur, rng))
+            kernel = _motion_kernel(25.0 * self.blur, rng)
+            image = np.asarray(cv2.filter2D(np.clip(image, 0, 255), -1, kernel), dtype=np.float32)
         if self.noise:
             image = image + rng.normal(0.0, 40.0 * self.noise, image.shape).astype(np.float32)
         depth = self._noisy_depth(frame.depth, rng) if self.depth_noise else frame.depth
@@ -112,7 +115,7 @@ class Degradation:
         y, x = np.mgrid[0:height, 0:width].astype(np.float32)
         side = (x - width / 2) * math.cos(angle) + (y - height / 2) * math.sin(angle) - offset
         dark = 1.0 / (1.0 + np.exp(np.clip(-side / (0.02 * width), -30, 30)))
-        return (1.0 - 0.85 * self.shadow * dark).astype(np.float32)
+        return np.asarray(1.0 - 0.85 * self.shadow * dark, dtype=np.float32)
 
     def _blob(self, index: int, height: int, width: int) -> NDArray[np.float32]:
         along, up, pulse = self._phase("glare", 3)
@@ -121,7 +124,7 @@ class Degradation:
         radius = 0.45 * self.glare * width * (0.75 + 0.25 * math.sin(2 * math.pi * index / 60.0 + pulse)) / 2
         y, x = np.mgrid[0:height, 0:width].astype(np.float32)
         distance = ((x - centre_x) ** 2 + (y - centre_y) ** 2) / max(radius, 1.0) ** 2
-        return (510.0 * np.exp(-distance)).astype(np.float32)
+        return np.asarray(510.0 * np.exp(-distance), dtype=np.float32)
 
     def _noisy_depth(self, depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
         noisy = depth + rng.normal(size=depth.shape) * (0.02 * self.depth_noise) * depth.astype(np.float64) ** 2
@@ -138,4 +141,4 @@ def _motion_kernel(length: float, rng: np.random.Generator) -> NDArray[np.float3
     along = x * math.cos(angle) + y * math.sin(angle)
     across = np.abs(-x * math.sin(angle) + y * math.cos(angle))
     kernel = np.clip(1.0 - across, 0.0, 1.0) * np.clip(extent / 2 + 0.5 - np.abs(along), 0.0, 1.0)
-    return (kernel / kernel.sum()).astype(np.float32)
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry.trajectory import Trajectory
+
 FrameState = Literal["initialising", "ok", "lost", "dropped"]
 
 

@@ -40,7 +40,7 @@ class RecordTimings(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, info | {"timings": self._last()}
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """``median`` and ``p95`` of every stage over the episode so far, seconds; stages that did not run count as 0."""
+        """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
         return summarise(self._base.timings)
 
     def _last(self) -> dict[str, float]:

@@ -25,7 +25,7 @@ def register_envs() -> list[str]:
     Returns:
         All ids, the generic one first.
     """
-    ids = {GENERIC_ID: {}} | {env_id(name): {"sequence": name} for name in sequence_ids()}
+    ids: dict[str, dict[str, str]] = {GENERIC_ID: {}} | {env_id(name): {"sequence": name} for name in sequence_ids()}
     for name, kwargs in ids.items():
         if name not in gym.registry:
             gym.register(id=name, entry_point=_ENTRY_POINT, kwargs=kwargs)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -181,7 +183,7 @@ def _estimate_beside_truth(episode: Episode, truth: dict[int, Array]) -> tuple[A
         placed = se3.inverse(poses[0]) @ poses
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
     bounds = [0, *breaks.tolist(), len(placed)]
-    return placed[:, [0, 2], 3], [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    return placed[:, [0, 2], 3], [slice(a, b) for a, b in pairwise(bounds)]
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:

@@ -1,7 +1,7 @@
 """Runs: a child process that steps an environment; the run store; parallel execution.
 
-`run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol, `import_trajectory` puts
-trajectories from elsewhere beside them.
+`run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol, and
+`import_trajectory` puts trajectories from elsewhere beside them.
 """
 
 from __future__ import annotations

@@ -138,9 +138,7 @@ class _Bench:
 
         return self._collect(futures, take)
 
-    def _collect(
-        self, futures: dict[Future[Any], str], take: Callable[[Any, str], RunRecord]
-    ) -> dict[str, RunRecord]:
+    def _collect(self, futures: dict[Future[Any], str], take: Callable[[Any, str], RunRecord]) -> dict[str, RunRecord]:
         try:
             return {futures[future]: take(future.result(), futures[future]) for future in as_completed(futures)}
         except BaseException:

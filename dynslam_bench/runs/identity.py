@@ -157,7 +157,7 @@ def _check_degradation(strengths: dict[str, float]) -> None:
     unknown = sorted(set(strengths) - known)
     if unknown:
         raise RunError(f"unknown degradation '{unknown[0]}'", "known: " + ", ".join(sorted(known)))
-    Degradation(**strengths)
+    Degradation(seed=0, **strengths)
 
 
 @cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime, timezone
 from hashlib import sha256
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -85,18 +85,18 @@ def import_trajectory(
         notes.append(f"{odd} of {len(trajectory)} poses carry stamps that are no input frame's")
     covered = len(exact) if matching else len(near)
     part = None if frames is None else parse_frames(frames if isinstance(frames, str) else (frames[0] or 0, frames[1]))
-    identity = {
+    identity: dict[str, Any] = {
         "kind": "imported", "tracker": tracker, "which": which, "file": sha256(file.read_bytes()).hexdigest(),
         "sequence": opened.id, "content": opened.digest(), "frames": part, "stride": stride,
     }  # fmt: skip
     record = RunRecord(
         kind="imported", run_id=digest(identity, 16), status="ok",
         tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        sequence=sequence_info(opened, identity["content"], part_digest(identity)), frames=part, stride=stride,
+        sequence=sequence_info(opened, opened.digest(), part_digest(identity)), frames=part, stride=stride,
         n_frames=len(opened), n_tracked=covered, n_lost=len(opened) - covered, coverage=covered / len(opened),
         stamps_match=matching, started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(), identity=identity, provenance=provenance or str(file), notes=notes,
-    )  # fmt: skip
+    ).normalised()  # fmt: skip
     store.prepare()
     with store.work_folder(record.run_id) as work:
         write_tum(work / f"trajectory_{which}.txt", trajectory, comment=f"imported: {tracker} on {opened.id}")

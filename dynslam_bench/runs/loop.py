@@ -50,7 +50,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     )  # fmt: skip
     env: gym.Env[Any, Any] = base
     if any(spec.degrade.values()):
-        env = DegradeFrames(env, **spec.degrade)
+        env = DegradeFrames(env, seed=0, **spec.degrade)
     if spec.realtime or spec.drop_share:
         env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
     send({"type": "started", "frames": len(base.sequence)})

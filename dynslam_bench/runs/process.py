@@ -13,6 +13,7 @@ from pathlib import Path
 
 from .forkserver import SERVER, child_environment
 
+_PROC = Path("/proc/self")
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 
@@ -68,9 +69,11 @@ class ForkedChild(Child):
         os.set_blocking(self._status_fd, False)
 
     def wait_handle(self) -> int | None:
+        """The read end of the status pipe, until the exit code is known."""
         return self._status_fd if self._exit is None else None
 
     def poll(self) -> int | None:
+        """Its exit code as the server reported it, None while it runs."""
         while self._exit is None:
             try:
                 data = os.read(self._status_fd, 4096)
@@ -88,6 +91,7 @@ class ForkedChild(Child):
         return self._exit
 
     def close(self) -> None:
+        """Kill it if it still runs, and release the pipes."""
         super().close()
         if self._status_fd >= 0:
             os.close(self._status_fd)
@@ -113,9 +117,11 @@ class FreshChild(Child):
         self.pid = self._process.pid
 
     def poll(self) -> int | None:
+        """Its exit code, None while it runs."""
         return self._process.poll()
 
     def close(self) -> None:
+        """Kill it if it still runs, and reap it."""
         super().close()
         self._process.wait()
 
@@ -132,7 +138,7 @@ def start_child() -> Child:
 
 def resident_mb(pid: int) -> float:
     """Resident memory of a process and its descendants in its process group, MB; 0 if it is gone."""
-    if sys.platform == "linux":
+    if _PROC.is_dir():
         return sum(_linux_rss_mb(member) for member in _group_members(pid))
     result = subprocess.run(["ps", "-o", "rss=", "-g", str(pid)], capture_output=True, text=True, check=False)
     return sum(float(line) for line in result.stdout.split()) * 1024 / 1e6

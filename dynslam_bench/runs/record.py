@@ -79,8 +79,9 @@ class RunRecord(Record):
         schema_version: Of this record; older ones stay loadable.
         kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
         run_id: Digest of `identity`.
-        status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`); ``crashed``, ``timeout``,
-            ``out-of-memory``; ``invalid``: the tracker broke its contract; ``stopped``: ended early on request.
+        status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`); ``crashed``,
+            ``timeout``, ``out-of-memory``; ``invalid``: the tracker broke its contract; ``stopped``: ended early
+            on request.
         reason: One line, empty for ``ok``.
         tracker: The tracker.
         overrides: The settings that were asked for, dotted name to value.
@@ -164,6 +165,10 @@ class RunRecord(Record):
     provenance: str = ""
     stamps_match: bool = True
     notes: list[str] = Field(default_factory=list)
+
+    def normalised(self) -> RunRecord:
+        """The record as it reads after it was written: tuples inside settings are lists then."""
+        return RunRecord.model_validate_json(self.to_json())
 
     @property
     def failed(self) -> bool:

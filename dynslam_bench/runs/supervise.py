@@ -89,8 +89,10 @@ class _Watch:
             handles: list[Any] = [self.child.connection] if open_connection else []
             status = self.child.wait_handle()
             handles += [] if status is None else [status]
-            ready = wait(handles, _POLL_S) if handles else time.sleep(_POLL_S)
-            if ready and self.child.connection in ready:
+            ready: list[Any] = wait(handles, _POLL_S) if handles else []
+            if not handles:
+                time.sleep(_POLL_S)
+            if self.child.connection in ready:
                 open_connection = self._receive()
             ended = self.child.poll() is not None
             if ended:
@@ -190,5 +192,3 @@ def _reason_of_exit(code: int, where: str) -> tuple[Status, str]:
     if name == "SIGKILL":
         meaning = "killed from outside; on Linux often because memory ran out"
     return "crashed", f"{name}{f' ({meaning})' if meaning else ''}, {where}"
-
-

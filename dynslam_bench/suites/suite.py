@@ -136,8 +136,8 @@ def load_suite(name: str | Path) -> Suite:
     """A suite by its name, or from a TOML file.
 
     Raises:
-        RunError: There is no such suite, the file cannot be read or is no TOML, or it does not describe a suite (with the
-            first fault).
+        RunError: There is no such suite, the file cannot be read or is no TOML, or it does not describe a suite
+            (with the first fault).
         PluginError: One of its trackers is not known.
     """
     text, where = _read(str(name))

@@ -1,0 +1,177 @@
+"""Many runs: resuming, retrying, parallel and elsewhere; imported trajectories; suites."""
+
+from __future__ import annotations
+
+import io
+import multiprocessing
+import zipfile
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from envs_toys import TARGET, truth
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
+from dynslam_bench.runs.packing import pack, unpack
+
+
+def specs(folder: str, seeds: range, **change) -> list[RunSpec]:
+    return [RunSpec(tracker=TARGET, sequence=folder, frames=(0, 8), seed=seed, **change) for seed in seeds]
+
+
+def follow(events: list) -> dict:
+    return {"on_event": lambda event: events.append((event.kind, event.run_id))}
+
+
+def kinds(events: list) -> dict[str, int]:
+    found = [kind for kind, _ in events if kind != "progress"]
+    return {kind: found.count(kind) for kind in sorted(set(found))}
+
+
+def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
+    events: list = []
+    first = run_many(specs(toy_folder, range(2)), results=store, **follow(events))
+    assert kinds(events) == {"finished": 2, "started": 2}
+    events.clear()
+    second = run_many(specs(toy_folder, range(4)), results=store, jobs=2, **follow(events))
+    assert kinds(events) == {"finished": 2, "reused": 2, "started": 2}
+    assert second[:2] == first and [record.seed for record in second] == [0, 1, 2, 3]
+    assert all(score(store, record).metrics["ate_rmse_m"] > 0 for record in second)
+
+
+def test_equal_specs_are_made_once(store: RunStore, toy_folder: str) -> None:
+    events: list = []
+    records = run_many([*specs(toy_folder, range(1)), *specs(toy_folder, range(1))], results=store, **follow(events))
+    assert kinds(events) == {"finished": 1, "started": 1} and records[0] == records[1]
+
+
+def test_one_failure_stops_nothing_and_is_made_again_only_on_request(store: RunStore, toy_folder: str) -> None:
+    wanted = [*specs(toy_folder, range(1), settings={"mode": "segfault"}), *specs(toy_folder, range(2))]
+    assert [record.status for record in run_many(wanted, results=store)] == ["crashed", "ok", "ok"]
+    for retry, made in (((), 0), (("failed",), 1), (("timeout",), 0), (("ok",), 2)):
+        events: list = []
+        run_many(wanted, results=store, retry=retry, **follow(events))
+        assert kinds(events).get("started", 0) == made, retry
+    with pytest.raises(RunError, match="unknown status 'broken'"):
+        run_many(wanted, results=store, retry=("broken",))
+
+
+def test_a_wrong_name_is_refused_before_anything_runs(store: RunStore, toy_folder: str) -> None:
+    wrong = [*specs(toy_folder, range(2)), RunSpec(tracker="orb-slam", sequence=toy_folder)]
+    with pytest.raises(DynslamError, match=r"unknown tracker 'orb-slam'.*orb-slam2"):
+        run_many(wrong, results=store)
+    assert store.ids() == []
+    with pytest.raises(RunError, match="jobs is 0"):
+        run_many(specs(toy_folder, range(1)), results=store, jobs=0)
+
+
+def test_a_damaged_record_is_made_again(store: RunStore, toy_folder: str) -> None:
+    record = run_many(specs(toy_folder, range(1)), results=store)[0]
+    (store.folder(record.run_id) / "run.json").write_text("{")
+    assert run_many(specs(toy_folder, range(1)), results=store)[0].status == "ok"
+
+
+def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:
+    whole = [RunSpec(tracker=TARGET, sequence=toy_folder, seed=seed) for seed in range(2)]
+    keep = resolve(whole[0]).run_id
+    records = run_many(whole, results=store, on_progress=lambda run_id, partial: run_id == keep)
+    assert records[0].status == "ok" and store.ids() == [keep]
+    assert records[1].status in ("stopped", "ok")
+
+
+def test_any_executor(tmp_path: Path, toy_folder: str) -> None:
+    here = run_many(specs(toy_folder, range(2)), results=tmp_path / "here")
+    executors = [
+        ThreadPoolExecutor(2),
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")),
+    ]
+    for number, executor in enumerate(executors):
+        events: list = []
+        with executor:
+            there = run_many(
+                specs(toy_folder, range(2)), results=tmp_path / f"there{number}", executor=executor, **follow(events)
+            )
+        assert kinds(events) == {"finished": 2, "started": 2}
+        store = RunStore(tmp_path / f"there{number}")
+        assert sorted(record.run_id for record in there) == store.ids()
+        for mine, theirs in zip(here, there, strict=True):
+            paths = (tmp_path / "here" / "runs" / mine.run_id, store.folder(theirs.run_id))
+            assert len({(path / "trajectory_online.txt").read_text() for path in paths}) == 1
+        assert score(store, there[0], "evo-default").metrics["ate_rmse_m"] > 0
+
+
+def test_children_can_be_made_in_a_daemonic_process(tmp_path: Path, toy_folder: str) -> None:
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=_run_one_here, args=(toy_folder, str(tmp_path / "results")), daemon=True)
+    process.start()
+    process.join(120)
+    assert process.exitcode == 0
+    assert len(RunStore(tmp_path / "results").ids()) == 1
+
+
+def _run_one_here(folder: str, root: str) -> None:
+    assert multiprocessing.current_process().daemon
+    record = run_many(specs(folder, range(1)), results=root)[0]
+    assert record.status == "ok", record.reason
+
+
+def test_packed_runs_that_are_none(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="5 bytes from a worker are no packed run"):
+        unpack(b"bytes", store)
+    record = run_one(specs(toy_folder, range(1))[0], store)
+    good = pack(store, record)
+    other = RunStore(tmp_path / "other")
+    other.prepare()
+    for name in ("../evil.txt", "/etc/evil", f"runs/{record.run_id}/../../evil.txt", "runs/zz/x.txt"):
+        buffer = io.BytesIO(good)
+        with zipfile.ZipFile(buffer, "a") as archive:
+            archive.writestr(name, "x")
+        with pytest.raises(RunError, match="packed run holds"):
+            unpack(buffer.getvalue(), other)
+    assert other.ids() == [] and not list(tmp_path.rglob("evil*"))
+    assert unpack(good, other) == record and other.ids() == [record.run_id]
+
+
+# -- imported trajectories -------------------------------------------------------------------------------------------
+
+
+def write_estimate(path: Path, shift_s: float = 0.0, every: int = 1) -> Path:
+    stamps = 100.0 + np.arange(0, 60, every) / 30.0 + shift_s
+    poses = truth(60)[::every].copy()
+    poses[:, 0, 3] += 0.01 * np.sin(np.arange(len(poses)))
+    write_tum(path, Trajectory(stamps, poses))
+    return path
+
+
+def test_import(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+    path = write_estimate(tmp_path / "theirs.txt", every=2)
+    record = import_trajectory(path, "their-slam", toy_folder, results=store, provenance="https://example.org")
+    assert record.kind == "imported" and record.status == "ok" and record.coverage == 0.5
+    assert record.tracker.label == "their-slam (imported)" and record.provenance == "https://example.org"
+    metrics = score(store, record)
+    assert metrics.trajectory == "final" and metrics.online is None
+    assert 0.001 < metrics.metrics["ate_rmse_m"] < 0.01 and metrics.primary.coverage == 0.5
+    assert import_trajectory(path, "their-slam", toy_folder, results=store).run_id == record.run_id
+
+
+def test_import_with_stamps_of_its_own(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+    path = write_estimate(tmp_path / "theirs.txt", shift_s=0.005)
+    record = import_trajectory(path, "their-slam", toy_folder, results=store, which="online")
+    assert not record.stamps_match and record.coverage == 1.0
+    assert record.notes == ["60 of 60 poses carry stamps that are no input frame's"]
+    assert score(store, record).online.n_pairs == 60
+
+
+def test_import_of_something_else(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+    far = write_estimate(tmp_path / "far.txt", shift_s=1000.0)
+    with pytest.raises(RunError, match=r"shares 0 stamps with .*, at least 2 are needed \(the nearest is 998"):
+        import_trajectory(far, "x", toy_folder, results=store)
+    with pytest.raises(DynslamError, match="cannot read"):
+        import_trajectory(tmp_path / "none.txt", "x", toy_folder, results=store)
+    with pytest.raises(RunError, match="name of its tracker"):
+        import_trajectory(far, " ", toy_folder, results=store)
+    assert store.ids() == []

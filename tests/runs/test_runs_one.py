@@ -1,0 +1,252 @@
+"""One run: what is stored of it, and that every way to fail becomes a status with a reason."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from envs_toys import TARGET, truth, write_folder
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.envs import SlamEnv
+from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_one, score
+
+
+def leftovers(store: RunStore) -> list[str]:
+    return [path.name for path in store.runs.iterdir() if path.name.startswith(".")]
+
+
+def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=3, settings={"noise.clip": 3.0}), store)
+    assert (record.status, record.reason, record.n_frames, record.n_tracked, record.coverage) == ("ok", "", 60, 60, 1.0)
+    folder = store.folder(record.run_id)
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "frames.csv", "log.txt", "run.json", "trajectory_final.txt", "trajectory_online.txt",
+    ]  # fmt: skip
+    assert RunRecord.read(folder / "run.json") == record
+    assert (store.root / "latest").resolve() == folder.resolve()
+    assert leftovers(store) == []
+    assert record.tracker.id == "toy" and record.settings["noise.clip"] == 3.0 and record.overrides == {"noise.clip": 3}
+    assert list(record.timings) == ["read", "total", "features", "tracking"]
+    assert record.timings["tracking"].median_s == record.timings["tracking"].p95_s == 0.002
+    assert record.peak_memory_mb and 20 < record.peak_memory_mb < 4000
+    assert record.machine and record.machine.cores >= 1 and record.versions["numpy"] == np.__version__
+    assert record.device == "cpu" and record.sequence.ground_truth
+
+
+def test_the_run_is_the_environment(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=11, frames=(5, 45), stride=2), store)
+    env = SlamEnv(toy_folder, TARGET, frames=(5, 45), stride=2)
+    _, info = env.reset(seed=11)
+    rewards = [0.0]
+    for _ in range(19):
+        _, reward, _, truncated, info = env.step(0)
+        rewards.append(reward)
+    assert truncated
+    online = read_tum(store.folder(record.run_id) / "trajectory_online.txt")
+    assert np.allclose(online.T_world_cam, env.online_trajectory().T_world_cam, atol=1e-8)
+    rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
+    assert [float(row["reward_m"]) for row in rows[1:]] == rewards[1:]
+    assert float(rows[-1]["pose_error_trans_m"]) == info["pose_error_trans_m"]
+    assert float(rows[-1]["stat_keypoints"]) == 100 and float(rows[-1]["tracking_s"]) == 0.002
+    assert [row["state"] for row in rows] == ["ok"] * 20 and rows[0]["frame_error_trans_m"] == ""
+    scored = score(store, record).metrics
+    assert scored["ate_rmse_m"] == pytest.approx(info["episode_metrics"]["ate_rmse_m"], rel=1e-5)
+
+
+def test_same_seed_same_run_and_other_seed_other_run(store: RunStore, toy_folder: str) -> None:
+    texts = []
+    for seed in (1, 1, 2):
+        record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=seed), store)
+        texts.append((record.run_id, (store.folder(record.run_id) / "trajectory_online.txt").read_text()))
+    assert texts[0] == texts[1]
+    assert texts[0][0] != texts[2][0] and texts[0][1] != texts[2][1]
+
+
+LIMITS = Limits(frame_s=3.0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "status", "reason"),
+    [
+        ("raise", "crashed", "ValueError: the toy tracker raised on purpose"),
+        ("segfault", "crashed", "SIGSEGV (segmentation fault), after frame 3 of 60"),
+        ("exit", "crashed", "the process left with exit code 3, after frame 3 of 60"),
+        ("nan", "invalid", "tracker 'toy' at frame 4 returned a pose with 16 values that are not finite"),
+        ("scaled", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
+        ("mirrored", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
+        ("string", "invalid", "tracker 'toy' at frame 4 returned a str"),
+        ("memoryerror", "out-of-memory", "MemoryError: the toy tracker ran out of memory on purpose"),
+        ("hang", "timeout", "no sign of life for 3 s, after frame 3 of 60"),
+        ("lost", "lost", "tracked on 4 of 60 frames"),
+        ("initialising", "lost", "tracked on 4 of 60 frames"),
+    ],
+)
+def test_every_failure_is_a_record_with_status_and_reason(
+    store: RunStore, toy_folder: str, mode: str, status: str, reason: str
+) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": mode}, limits=LIMITS), store)
+    assert record.status == status and record.reason.startswith(reason)
+    assert "\n" not in record.reason
+    assert store.read(record.run_id) == record
+    assert record.n_tracked == 4 and record.coverage == pytest.approx(4 / 60)
+    assert len(store.trajectory(record.run_id)) == 4  # what it had done is kept
+    assert leftovers(store) == []
+
+
+def test_the_log_holds_the_traceback(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "raise"}), store)
+    log = (store.folder(record.run_id) / "log.txt").read_text()
+    assert "Traceback" in log and "raised on purpose" in log
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "segfault"}), store)
+    assert "Segmentation fault" in (store.folder(record.run_id) / "log.txt").read_text()
+
+
+def test_memory_limit(store: RunStore, toy_folder: str) -> None:
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "memory"}, limits=Limits(memory_mb=900))
+    record = run_one(spec, store)
+    assert record.status == "out-of-memory" and "the limit is 900 MB, after frame 3 of 60" in record.reason
+    assert record.peak_memory_mb > 900
+
+
+def test_time_limit(store: RunStore, toy_folder: str) -> None:
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "hang"}, limits=Limits(time_s=2.0))
+    record = run_one(spec, store)
+    assert record.status == "timeout" and record.reason.startswith("not done within 2 s")
+
+
+def test_lost_at_the_end_and_found_again(store: RunStore, toy_folder: str) -> None:
+    def outcome(at: int, until: int) -> tuple[str, str]:
+        settings = {"mode": "lost", "at": at, "until": until}
+        record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings=settings), store)
+        return record.status, record.reason
+
+    assert outcome(20, 40) == ("ok", "")
+    assert outcome(50, 100) == ("lost", "lost from frame 50 to the end, tracked on 50 of 60 frames")
+    assert outcome(55, 100) == ("ok", "")
+
+
+def test_partial_metrics_and_stopping(store: RunStore, toy_folder: str) -> None:
+    seen = []
+
+    def follow(run_id: str, partial: dict) -> bool:
+        seen.append((run_id, partial))
+        return len(seen) < 2
+
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store, on_progress=follow, progress_every=10)
+    assert record.status == "stopped" and "stopped on request" in record.reason
+    assert store.get(record.run_id) is None and leftovers(store) == []
+    assert [partial["frames_done"] for _, partial in seen][:2] == [10, 20]
+    partial = seen[0][1]
+    assert partial["frames"] == 60 and partial["metrics"]["coverage"] == 1 and partial["frame_time_s"] > 0
+    assert 0 < partial["metrics"]["ate_rmse_m"] < 0.01
+    seen.clear()
+    whole = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store, on_progress=lambda *a: seen.append(a) or True)
+    assert [partial["frames_done"] for _, partial in seen] == [50, 60]
+    assert seen[-1][1]["metrics"]["ate_rmse_m"] == pytest.approx(score(store, whole).metrics["ate_rmse_m"], rel=1e-5)
+
+
+def test_cancelling(store: RunStore, toy_folder: str) -> None:
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "hang"})
+    record = run_one(spec, store, cancelled=lambda: True)
+    assert record.status == "stopped" and store.get(record.run_id) is None
+
+
+def test_no_ground_truth(store: RunStore, tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "blind", 12, has_truth=False)
+    record = run_one(RunSpec(tracker=TARGET, sequence=str(folder)), store)
+    assert record.status == "ok" and not record.sequence.ground_truth
+    metrics = score(store, record)
+    assert metrics.primary is None and "has no ground truth" in metrics.reasons["online"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tracker": "mask-rccn"}, "unknown tracker 'mask-rccn'.*mask-rcnn"),
+        ({"settings": {"noise.levl_m": 1}}, "unknown setting 'noise.levl_m'.*noise.level_m"),
+        ({"sequence": "bonn/crowdd"}, "unknown sequence 'bonn/crowdd'.*bonn/crowd"),
+        ({"frames": (3, 4)}, "1 frames here, a run needs 2 or more"),
+        ({"device": "cuda:77"}, "cuda:77"),
+        ({"degrade": {"fog": 1.0}}, "unknown degradation 'fog'.*blur"),
+        ({"degrade": {"blur": 2.0}}, r"expected a strength in \[0, 1\]"),
+    ],
+)
+def test_a_request_that_cannot_begin_is_an_error_and_leaves_nothing(
+    store: RunStore, toy_folder: str, change: dict, message: str
+) -> None:
+    with pytest.raises(DynslamError, match=message):
+        run_one(RunSpec(**({"tracker": TARGET, "sequence": toy_folder} | change)), store)
+    assert list(store.runs.iterdir()) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_unwritable_results_folder_without_permission(tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    with pytest.raises(RunError, match="cannot write into"):
+        RunStore(tmp_path / "locked").prepare()
+
+
+def test_results_folder_that_is_a_file(tmp_path: Path, toy_folder: str) -> None:
+    (tmp_path / "results").write_text("I am a file")
+    store = RunStore(tmp_path / "results")
+    with pytest.raises(RunError, match=r"cannot write into .*results/runs: (Not a directory|File exists)"):
+        store.prepare()
+    with pytest.raises(RunError, match="cannot write into"):
+        run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store)
+
+
+def test_degraded_and_dropped_frames(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, degrade={"noise": 0.5}, drop_share=0.4), store)
+    assert record.status == "ok" and record.n_dropped > 10
+    assert record.coverage == pytest.approx(1 - record.n_dropped / 60) and record.n_processed == 60 - record.n_dropped
+    rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
+    assert sum(row["state"] == "dropped" for row in rows) == record.n_dropped
+
+
+def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
+    spec = RunSpec(tracker="mask-rcnn", sequence="synthetic/walking_xyz", frames=(0, 4))
+    record = run_one(spec.model_copy(update={"settings": {"segmentation.source": "oracle"}}), store)
+    assert record.status == "ok" and record.segmentation == "oracle" and 0.3 < record.mask_iou <= 1
+    assert (store.folder(record.run_id) / "keyframes.csv").is_file()
+    assert (store.folder(record.run_id) / "map.ply").is_file()
+    assert record.keyframes >= 1 and record.map_points > 10
+    rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
+    assert np.mean([float(row["mask_iou"]) for row in rows]) == pytest.approx(record.mask_iou)
+
+
+def test_a_fresh_interpreter_does_the_same(store: RunStore, toy_folder: str, monkeypatch, tmp_path: Path) -> None:
+    forked = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=5), store)
+    text = (store.folder(forked.run_id) / "trajectory_online.txt").read_text()
+    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")
+    other = RunStore(tmp_path / "other")
+    other.prepare()
+    fresh = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=5), other)
+    assert (other.folder(fresh.run_id) / "trajectory_online.txt").read_text() == text
+    crashed = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "segfault"}), other)
+    assert (crashed.status, crashed.reason[:7]) == ("crashed", "SIGSEGV")
+
+
+def test_video(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 5), video=True), store)
+    assert (store.folder(record.run_id) / "video.mp4").stat().st_size > 1000
+
+
+def test_scores_under_another_protocol_need_no_run(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store)
+    first = score(store, record)
+    before = sorted(path.stat().st_mtime_ns for path in store.folder(record.run_id).iterdir())
+    second = score(store, record, "evo-default")
+    assert second.protocol_digest != first.protocol_digest
+    assert sorted(path.stat().st_mtime_ns for path in store.folder(record.run_id).iterdir()) == before
+    want = evaluate(store.trajectory(record.run_id), read_tum(Path(toy_folder) / "groundtruth.txt"), "evo-default")
+    assert second.metrics["ate_rmse_m"] == pytest.approx(want.metrics["ate_rmse_m"], abs=1e-12)
+    assert score(store, record) == first and first.online and first.final
+    assert json.loads((store.root / "metrics" / first.protocol_digest / f"{record.run_id}.json").read_text())
+    assert np.allclose(store.ground_truth(record.sequence.part).T_world_cam, truth(60), atol=1e-6)

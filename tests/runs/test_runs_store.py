@@ -1,0 +1,185 @@
+"""The store: identity, listing, damaged folders, what killed processes leave."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from envs_toys import TARGET
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.runs import MetricRecord, RunRecord, RunSpec, RunStore, resolve, run_one, score
+
+HERE = Path(__file__).parent
+
+
+def test_run_id_depends_on_what_matters_and_on_nothing_else(toy_folder: str, tmp_path: Path) -> None:
+    base = {"tracker": TARGET, "sequence": toy_folder}
+    first = resolve(RunSpec(**base)).run_id
+    assert len(first) == 16 and resolve(RunSpec(**base)).run_id == first
+    same = [
+        {"settings": {"noise.clip": "2.0"}}, {"settings": {"noise.clip": 2}}, {"limits": {"time_s": 5}},
+        {"video": True}, {"degrade": {"blur": 0.0}}, {"data_root": str(tmp_path)},
+    ]  # fmt: skip
+    assert {resolve(RunSpec(**(base | change))).run_id for change in same} == {first}
+    other = [
+        {"seed": 1}, {"settings": {"noise.clip": 2.5}}, {"frames": (0, 30)}, {"stride": 2}, {"threads": 2},
+        {"degrade": {"blur": 0.1}}, {"drop_share": 0.1}, {"realtime": True},
+        {"tracker": TARGET.replace(":SPEC", ":FIXED")},
+    ]  # fmt: skip
+    ids = [resolve(RunSpec(**(base | change))).run_id for change in other]
+    assert len({first, *ids}) == len(ids) + 1
+
+
+def test_an_edited_plug_in_is_another_run(toy_folder: str, tmp_path: Path) -> None:
+    plugin = tmp_path / "envs_toys.py"
+    shutil.copy(TARGET.rpartition(":")[0], plugin)
+    spec = RunSpec(tracker=f"{plugin}:SPEC", sequence=toy_folder)
+    before = resolve(spec).run_id
+    plugin.write_text(plugin.read_text() + "\n# edited\n")
+    assert resolve(spec).run_id != before
+
+
+def test_changed_weights_are_another_run(toy_folder: str, tmp_path: Path) -> None:
+    weights = tmp_path / "net.onnx"
+    weights.write_bytes(b"one")
+    spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": f"onnx:{weights}"})
+    before = resolve(spec)
+    weights.write_bytes(b"three")
+    assert list(before.identity["weights"]) == ["segmentation.source"]
+    assert resolve(spec).run_id != before.run_id
+
+
+def test_listing_finding_and_removing(store: RunStore, toy_folder: str) -> None:
+    first, second = (
+        run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 5), seed=s), store) for s in (0, 1)
+    )
+    score(store, first)
+    records, unreadable = store.all()
+    assert [record.run_id for record in records] == [first.run_id, second.run_id] and not unreadable
+    assert store.find(first.run_id[:10]) == first.run_id and store.find("latest") == second.run_id
+    assert store.read("latest") == second
+    with pytest.raises(RunError, match="no run 'zzzz'"):
+        store.find("zzzz")
+    with pytest.raises(RunError, match=r"2 runs begin|no run ''"):
+        store.find("")
+    store.remove(first.run_id[:12])
+    assert store.ids() == [second.run_id] and not list((store.root / "metrics").glob(f"*/{first.run_id}.json"))
+    store.remove("latest")
+    assert store.ids() == [] and not (store.root / "latest").is_symlink()
+    with pytest.raises(RunError, match="there are no runs in"):
+        store.read("latest")
+
+
+def test_a_damaged_record_is_named_and_breaks_nothing(store: RunStore, toy_folder: str) -> None:
+    good = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 5)), store)
+    for name, text in (("0" * 16, "{"), ("1" * 16, '{"run_id": "x"}')):
+        (store.runs / name).mkdir()
+        (store.runs / name / "run.json").write_text(text)
+    (store.runs / ("2" * 16)).mkdir()
+    records, unreadable = store.all()
+    assert records == [good] and len(unreadable) == 3
+    assert all(str(bad.path) in bad.reason for bad in unreadable)
+    assert store.get("0" * 16) is None
+    with pytest.raises(DynslamError, match="is not a valid RunRecord"):
+        store.read("0" * 16)
+
+
+def test_records_of_the_first_schema_stay_loadable() -> None:
+    record = RunRecord.read(HERE / "data" / "run_v1.json")
+    assert record.schema_version == 1 and record.status == "ok" and record.timings["total"].median_s > 0
+    metrics = MetricRecord.read(HERE / "data" / "metrics_v1.json")
+    assert metrics.schema_version == 1 and metrics.run_id == record.run_id and metrics.metrics["ate_rmse_m"] > 0
+
+
+def test_a_newer_record_is_refused_not_misread(tmp_path: Path) -> None:
+    text = (HERE / "data" / "run_v1.json").read_text().replace('"coverage"', '"coverage_new"')
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(DynslamError, match="coverage_new"):
+        RunRecord.read(tmp_path / "run.json")
+
+
+def test_what_a_killed_process_left_is_swept_up_and_nothing_else(store: RunStore) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    host = socket.gethostname()
+    names = {
+        "dead": f".{'a' * 16}.{host}.{gone.pid}.deadbeef",
+        "alive": f".{'b' * 16}.{host}.{os.getpid()}.deadbeef",
+        "elsewhere": f".{'c' * 16}.another-machine.{gone.pid}.deadbeef",
+        "foreign": ".git",
+    }
+    for name in names.values():
+        (store.runs / name).mkdir()
+    store.prepare()
+    assert {path.name for path in store.runs.iterdir()} == {names["alive"], names["elsewhere"], names["foreign"]}
+
+
+PARENT = """
+import sys
+sys.path[:0] = {path!r}
+from dynslam_bench.runs import RunSpec, RunStore, run_one
+print("ready", flush=True)
+run_one(RunSpec(tracker={tracker!r}, sequence={sequence!r}, settings={{"mode": "hang"}}), RunStore({root!r}))
+"""
+
+
+def running_children(marker: str) -> list[int]:
+    """Processes whose log lies in a folder of that name."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if marker in str((process / "fd" / "1").readlink()):
+                found.append(int(process.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("start", ["fork", "fresh"])
+def test_kill_9_of_the_parent_leaves_no_child_and_no_record(tmp_path: Path, toy_folder: str, start: str) -> None:
+    root = tmp_path / "results"
+    code = PARENT.format(path=sys.path, tracker=TARGET, sequence=toy_folder, root=str(root))
+    environment = os.environ | {"DYNSLAM_BENCH_START": start}
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, env=environment)
+    try:
+        assert wait_for(lambda: len(running_children(str(root))) > 0), "the child never began"
+        assert wait_for(lambda: len(list(root.glob("runs/.*/frames.jsonl"))) > 0)
+    finally:
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+    assert wait_for(lambda: not running_children(str(root))), "the child lives on"
+    store = RunStore(root)
+    assert store.ids() == []
+    store.prepare()
+    assert list(store.runs.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_kill_9_of_the_child_is_a_crashed_run(store: RunStore, toy_folder: str) -> None:
+    def kill(run_id: str, partial: dict) -> bool:
+        for pid in running_children(str(store.root)):
+            os.kill(pid, signal.SIGKILL)
+        return True
+
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": "hang", "at": 30})
+    record = run_one(spec, store, on_progress=kill, progress_every=20)
+    assert record.status == "crashed" and record.reason.startswith("SIGKILL (killed from outside")
+    assert record.n_tracked >= 20 and store.read(record.run_id) == record
+
+
+def wait_for(condition, seconds: float = 60.0) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False

@@ -1,0 +1,90 @@
+"""Suites: what comes with the package, and what a user writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
+from dynslam_bench.suites import load_suite, suite_names
+from dynslam_bench.trackers.registry import TRACKERS
+
+
+def test_the_suites_that_are_promised_are_there() -> None:
+    assert {"smoke", "demo", "dynamic", "dynamic-full", "real", "robustness"} <= set(suite_names())
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_every_suite_names_only_what_exists(name: str) -> None:
+    suite = load_suite(name)
+    assert suite.title and suite.description and suite.name == name
+    for sequence in suite.sequences:
+        assert sequence in sequence_ids() or entry_of(sequence) is not None
+    specs = suite.specs()
+    assert len(specs) == len({spec.model_dump_json() for spec in specs}) > 0
+
+
+def test_dynamic_holds_every_ranked_system_on_the_eight_twins() -> None:
+    suite = load_suite("dynamic")
+    assert len(suite.sequences) == 8 and suite.frames == (0, 300) and len(suite.seeds) == 2
+    composed = {found.spec.id for found in TRACKERS.all() if "trackers.systems" in found.spec.entry_point}
+    ablations = {name for name in composed if name.startswith("emfoa-oft-")} | {"dynaslam-code"}
+    assert composed - ablations <= set(suite.trackers)
+    assert load_suite("dynamic-full").trackers == suite.trackers
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "mine.toml",
+        """
+        trackers = ["never-move", "orb-slam2"]
+        sequences = ["synthetic/walking_xyz"]
+        seeds = [0, 1]
+        frames = [0, 20]
+        [settings]
+        "features.count" = 500
+        [tracker_settings.orb-slam2]
+        "guard.min_features" = 30
+        [[variants]]
+        [[variants]]
+        name = "blur"
+        degrade = { blur = 0.5 }
+        """,
+    )
+    specs = load_suite(path).specs(data_root="/data", device="cpu", threads=2)
+    assert (
+        len(specs) == 8 and {spec.threads for spec in specs} == {2} and {spec.data_root for spec in specs} == {"/data"}
+    )
+    assert [spec.degrade for spec in specs] == [{}] * 4 + [{"blur": 0.5}] * 4
+    orb = next(spec for spec in specs if spec.tracker == "orb-slam2")
+    assert orb.settings["guard.min_features"] == 30
+    assert all(spec.settings == {} for spec in specs if spec.tracker == "never-move")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trackers = [", "not valid TOML"),
+        ('trackers = ["never-move"]', "sequences: field required"),
+        ('trackers = []\nsequences = ["a/b"]', "trackers"),
+        ('trackers = ["never-mov"]\nsequences = ["a/b"]', "unknown tracker 'never-mov'.*never-move"),
+        ('trackers = ["never-move"]\nsequences = ["a/b"]\nseed = [1]', "unknown key 'seed'.*seeds"),
+    ],
+)
+def test_bad_suites(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(DynslamError, match=message):
+        load_suite(write(tmp_path / "bad.toml", text))
+
+
+def test_unknown_suites(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"unknown suite 'dynamics'.*dynamic"):
+        load_suite("dynamics")
+    with pytest.raises(RunError, match="cannot read"):
+        load_suite(tmp_path / "none.toml")
