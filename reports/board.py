@@ -14,6 +14,7 @@ from .statistics import Standing, standings
 NEVER_MOVE = "never move (from the ground truth)"
 _GROUPS = (("static", "static"), ("low-dynamic", "low dynamic"), ("high-dynamic", "high dynamic"))
 
+_NAMES = (("walking", "high dynamic"), ("sitting", "low dynamic"))
 _OTHER = "other"
 
 
@@ -128,7 +129,7 @@ def make_board(rows: Sequence[RunRow], reference: str = "orb-slam2") -> Board:
         }
     scored = [key for key, cell in board.cells.items() if any(cell[s].scores for s in board.sequences if s in cell)]
     complete = [key for key in scored if all(s in board.cells[key] for s in board.sequences)]
-    board.ranked = [key for key in complete if board.first(key).ranked]
+    board.ranked = [k for k in complete if board.first(k).ranked and board.first(k).provenance != "control"]
     board.incomplete = [key for key in scored if key not in complete]
     candidates = [key for key in complete if board.first(key).tracker == reference]
     if candidates:
@@ -201,5 +202,8 @@ def _cell(rows: list[RunRow]) -> Cell:
 def _group(row: RunRow) -> str:
     for tag, name in _GROUPS:
         if tag in row.tags:
+            return name
+    for part, name in _NAMES:
+        if part in row.sequence:
             return name
     return _OTHER

@@ -214,7 +214,7 @@ def _details(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) ->
             Block(
                 kind="details",
                 summary=sequence,
-                small=f"{board.groups[sequence]}, {len(estimates)} trackers",
+                small=", ".join(filter(None, (board.groups[sequence], f"{len(estimates)} trackers"))),
                 open=position == 0,
                 figures=[(f"path-{position}", caption), (f"error-{position}", over_time)],
             )

@@ -394,7 +394,8 @@ def _log_axis(title: str, values: Sequence[float]) -> dict[str, Any]:
     low, high = float(np.log10(min(finite))), float(np.log10(max(finite)))
     margin = max(0.06 * (high - low), 0.06)
     low, high = low - margin, high + margin
-    steps = (1, 2, 5) if high - low < 3 else (1,)
+    span = high - low
+    steps = range(1, 10) if span < 0.9 else (1, 2, 5) if span < 3 else (1,)
     ticks = [m * 10.0**e for e in range(int(np.floor(low)), int(np.ceil(high)) + 1) for m in steps]
     shown = [tick for tick in ticks if low <= np.log10(tick) <= high]
     return _axis(title, type="log") | {

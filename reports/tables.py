@@ -295,13 +295,14 @@ def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
     ended = [row for row in runs if not row.failed]
     kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
     provenance = runs[0].provenance
+    masks = " + ".join(sorted({row.segmentation for row in runs if row.segmentation not in ("", "none")}))
     return [
         TableCell(f"{100 * coverage:.1f} %", value=coverage),
         TableCell(f"{100 * success:.0f} %", value=success),
         _speed_cell(_middle(row.real_time_factor for row in ended), _middle(row.frame_ms for row in ended)),
         number_cell(_middle(row.peak_memory_mb for row in ended), ".0f"),
         TableCell(tag=kinds),
-        TableCell(provenance, tip=_PROVENANCE.get(provenance, "")),
+        TableCell(provenance, f"{masks} masks" if masks else "", tip=_PROVENANCE.get(provenance, "")),
     ]
 
 
