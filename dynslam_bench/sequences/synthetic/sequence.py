@@ -161,7 +161,8 @@ class SyntheticSequence:
         Raises:
             DynslamError: The cache cannot be written; frames already rendered stay.
         """
-        todo = [i for i in range(len(self)) if self.store is None or not self._cached(i)]
+        store = self.store
+        todo = [i for i in range(len(self)) if store is None or not store.is_intact(float(self._timestamps[i]))]
         done = len(self) - len(todo)
         if progress is not None:
             progress(done, len(self))
@@ -179,11 +180,6 @@ class SyntheticSequence:
         if self.store is not None:
             self.store.write_lists(self.ground_truth)
         return len(todo)
-
-    def _cached(self, index: int) -> bool:
-        assert self.store is not None
-        stamp = float(self._timestamps[index])
-        return all(self.store.read(kind, stamp) is not None for kind in ("rgb", "depth", "masks"))
 
     def _make(self, index: int, renderer: Renderer | None = None, lists: bool = True) -> Rendered:
         """Render a frame and store it."""

@@ -82,12 +82,24 @@ class FrameStore:
         """Where a frame's image of a kind (``rgb``, ``depth``, ``masks``) lies."""
         return self.folder / kind / f"{stamp:.6f}.png"
 
+    def is_intact(self, stamp: float) -> bool:
+        """Whether all images of a frame lie in the cache, complete and of the right size and type."""
+        return all(self._bytes(kind, stamp) is not None for kind in _KINDS)
+
     def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
         """An image (RGB order), or None if it is missing or damaged.
 
         Raises:
             SequenceError: The file exists but cannot be read (permissions, input error).
         """
+        data = self._bytes(kind, stamp)
+        image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            return None
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if kind == "rgb" else image
+
+    def _bytes(self, kind: str, stamp: float) -> bytes | None:
+        """The bytes of an image file if it is intact and what it should be."""
         path = self.path(kind, stamp)
         try:
             data = path.read_bytes()
@@ -97,14 +109,9 @@ class FrameStore:
             raise SequenceError(
                 f"cannot read {path}: {error.strerror}", "check the permissions of the cache"
             ) from error
-        if not is_intact_png(data):
-            return None
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        expected = np.uint16 if kind == "depth" else np.uint8
-        shape = (self.camera.height, self.camera.width, 3)[: 3 if kind == "rgb" else 2]
-        if image is None or image.shape != shape or image.dtype != expected:
-            return None
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if kind == "rgb" else image
+        bits, color = {"rgb": (8, 2), "depth": (16, 0), "masks": (8, 0)}[kind]
+        header = struct.pack(">IIBB", self.camera.width, self.camera.height, bits, color)
+        return data if is_intact_png(data) and data[16:26] == header else None
 
     def write(self, stamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.uint16], masks: NDArray[np.uint8]) -> None:
         """Store a frame; the colour image comes last, so that a frame with one is complete.
