@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numba
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-F = TypeVar("F", bound=Callable[..., Any])
+Function = Callable[..., Any]
 
 
-def kernel(function: F) -> F:
+def kernel(function: Function) -> Function:
     """Compile a function at its first call.
 
     The compiled code is cached beside the source (or in the user's cache folder); where neither can be written it is
@@ -22,17 +22,17 @@ def kernel(function: F) -> F:
     depend on the processor's vector width.
     """
     try:
-        return cast("F", numba.njit(cache=True, nogil=True)(function))
+        return cast("Function", numba.njit(cache=True, nogil=True)(function))
     except RuntimeError:  # numba finds no folder in which it may cache
-        return cast("F", numba.njit(nogil=True)(function))
+        return cast("Function", numba.njit(nogil=True)(function))
 
 
-def inlined(function: F) -> F:
+def inlined(function: Function) -> Function:
     """Compile a small function into its callers."""
-    return cast("F", numba.njit(nogil=True, forceinline=True)(function))
+    return cast("Function", numba.njit(nogil=True, forceinline=True)(function))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def sum_abs_diff8(typing_context, first, i, second, j):  # type: ignore[no-untyped-def]
     """L1 distance of eight adjacent bytes: ``sum |first[i + b] - second[j + b]|`` for flat uint8 arrays.
 

@@ -40,6 +40,10 @@ def build_daisy(settings: FlowSettings, *, device: str = "cpu", threads: int = 1
     """Sparse DAISY Filter Flow."""
     from .sparse import SparseDaisyFlow
 
+    if device != "cpu":
+        from .torch_sparse import TorchSparseFlow
+
+        return TorchSparseFlow(settings, device=device, threads=threads)
     return SparseDaisyFlow(settings, threads=threads)
 
 

@@ -85,6 +85,8 @@ class DenseDaisyFlow:
         Identical images give zero flow that is not valid, as in the sparse mode.
         """
         height, width = reference.gray.shape
+        if target.gray.shape != (height, width):
+            raise ValueError(f"images differ in size: {reference.gray.shape} and {target.gray.shape}")
         if same_image(reference.gray, target.gray):
             shape = (height, width)
             return DenseFlow(
@@ -129,17 +131,17 @@ class _OneWay:
         self.regions = superpixels(self.half, max(2, settings.dense_superpixel_px // 2))
         self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
         self.evaluations = 0
-        self._tables = tables_for(*reference.gray.shape, settings.model_copy(update={"support": 1}))
+        self._tables = tables_for(reference.gray.shape, settings.model_copy(update={"support": 1}))
         self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
 
     def found(self, seed: int) -> None:
         """Search a label for each region and let its pixels choose among it and the neighbours'."""
         sparse, reference, target = self._sparse, self._reference, self._target
-        tables = tables_for(*reference.gray.shape, sparse.settings)
+        tables = tables_for(reference.gray.shape, sparse.settings)
         neighbours = sparse.neighbours(self.centres)
         described = sparse.describe(reference, self.centres, tables)
-        state = sparse.search(described, target, tables, neighbours, None, seed)
+        state = sparse.search(described, reference, target, tables, neighbours, None, seed)
         self.evaluations += int(state.used.sum())
         labels = np.ascontiguousarray(state.flames[:, 0])
         correlation = sparse.refine(self.centres, labels, reference, target)

@@ -75,8 +75,8 @@ def fit_regional_motion(
     for column, values in enumerate(columns):
         mean[:, column] = np.bincount(region[kept], weights=values, minlength=count) / np.maximum(consistent, 1)
     centres = regions.centres.astype(np.float64) * 2 + 0.5
-    grey = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
-    grey /= np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
+    total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
+    grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
     near = min(NEIGHBOURS, len(reliable))
     distance, index = cKDTree(mean[reliable, :2]).query(centres, k=near)
     chosen = reliable[np.asarray(index).reshape(count, near)]

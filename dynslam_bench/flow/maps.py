@@ -74,8 +74,10 @@ def map_geometry(height: int, width: int) -> MapGeometry:
         shift.append(int(np.log2(step * layout.SUBPIXEL)))
         bias.append(layout.SUBPIXEL // 2 + margin * step * layout.SUBPIXEL)
         total += (rows + 2 * margin) * (columns + 2 * margin)
-    arrays = [np.asarray(values, dtype=np.int64) for values in (base, stride, shift, bias)]
-    return MapGeometry(*arrays, total)
+    return MapGeometry(
+        np.asarray(base, dtype=np.int64), np.asarray(stride, dtype=np.int64), np.asarray(shift, dtype=np.int64),
+        np.asarray(bias, dtype=np.int64), total,
+    )  # fmt: skip
 
 
 def orientation_maps(
@@ -109,6 +111,14 @@ def orientation_maps(
         )  # fmt: skip
         source, sigma = target, wanted
     return OrientationMaps(gray, framed(gray), framed(half), histograms, geometry)
+
+
+def half_image(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Rounded mean over 2 x 2 pixels of a uint8 ``[H, W]`` image."""
+    rows, columns = _level_shape(*gray.shape, 2)
+    half, exact = np.empty((rows, columns), dtype=np.uint8), np.empty((rows, columns), dtype=np.float32)
+    _halve(0, rows, gray, exact, half)
+    return half
 
 
 def framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -78,8 +78,9 @@ def side(maps: OrientationMaps) -> Side:
     return Side(maps.histograms.reshape(-1), maps.gray)
 
 
-def tables_for(height: int, width: int, settings: FlowSettings) -> CostTables:
-    """The tables of an image size under the settings' weights of Eq. 1."""
+def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
+    """The tables of an image's shape ``(H, W)`` under the settings' weights of Eq. 1."""
+    height, width = shape[:2]
     return cost_tables(
         height, width, settings.truncation, settings.intensity_weight, settings.intensity_limit,
         settings.gradient_weight, settings.gradient_limit, settings.support, settings.support_spacing_px,

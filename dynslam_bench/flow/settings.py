@@ -110,14 +110,14 @@ class FlowSettings(Settings):
         meaning="matching cost, as a share of its largest value, above which a point is not found",
     )  # fmt: skip
     dense_superpixel_px: int = tunable(
-        16, low=8, high=32, limits=(4, 128), unit="px", when=_DAISY, meaning="dense mode: side of a superpixel"
+        12, low=8, high=32, limits=(4, 128), unit="px", when=_DAISY, meaning="dense mode: side of a superpixel"
     )
     dense_candidates: int = tunable(
-        7, low=2, high=9, limits=(1, 9), when=_DAISY,
+        5, low=2, high=9, limits=(1, 9), when=_DAISY,
         meaning="dense mode: labels tried at each pixel, its superpixel's own and its neighbours'",
     )  # fmt: skip
     dense_filter_radius_px: int = tunable(
-        9, low=2, high=16, limits=(2, 32), unit="px", when=_DAISY, meaning="dense mode: guided filter's radius (Eq. 2)"
+        5, low=2, high=16, limits=(2, 32), unit="px", when=_DAISY, meaning="dense mode: guided filter's radius (Eq. 2)"
     )
     dense_filter_epsilon: float = tunable(
         0.01, low=1e-4, high=0.1, limits=(1e-9, 10.0), scale="log", when=_DAISY,

@@ -21,7 +21,7 @@ from .neighbours import nearest_neighbours
 from .refinement import BORDER, similarity_lucas_kanade
 from .searches.common import SearchState, new_state
 from .searches.propagation import common_motions, transported_labels
-from .searches.schedule import PROPAGATING, make_plan, phase_runner
+from .searches.schedule import PROPAGATING, Phase, Plan, make_plan, phase_runner
 from .settings import FlowSettings
 from .subpixel import parabola
 from .workers import run_stripes
@@ -64,6 +64,8 @@ class SparseDaisyFlow:
         seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`."""
+        if reference.gray.shape != target.gray.shape:
+            raise ValueError(f"images differ in size: {reference.gray.shape} and {target.gray.shape}")
         points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
         if not len(points):
             return empty_result()
@@ -82,10 +84,10 @@ class SparseDaisyFlow:
         guess: NDArray[np.float32] | None, seed: int,
     ) -> FlowResult:  # fmt: skip
         settings = self.settings
-        tables = tables_for(*reference.gray.shape, settings)
+        tables = tables_for(reference.gray.shape, settings)
         described = self.describe(reference, points, tables)
         neighbours = self.neighbours(points)
-        state = self.search(described, target, tables, neighbours, guess, seed)
+        state = self.search(described, reference, target, tables, neighbours, guess, seed)
         labels, cost = state.flames[:, 0].copy(), state.costs[:, 0]
         evaluations = state.used.copy()
         n = len(points)
@@ -131,16 +133,23 @@ class SparseDaisyFlow:
         nearest_neighbours(points, np.argsort(points[:, 0], kind="stable"), NEIGHBOUR_WINDOW, found)
         return found
 
+    def _runner(
+        self, plan: Plan, described: Reference, reference: OrientationMaps, target: OrientationMaps,
+        tables: CostTables, state: SearchState, seed: int,
+    ) -> Phase:  # fmt: skip
+        """The function that spends one phase's evaluations on all points."""
+        return phase_runner(plan, self.settings, described, side(target), tables, state, seed, self.threads, self.pool)
+
     def search(
-        self, reference: Reference, target: OrientationMaps, tables: CostTables, neighbours: NDArray[np.int64],
-        guess: NDArray[np.float32] | None, seed: int,
+        self, described: Reference, reference: OrientationMaps, target: OrientationMaps, tables: CostTables,
+        neighbours: NDArray[np.int64], guess: NDArray[np.float32] | None, seed: int,
     ) -> SearchState:  # fmt: skip
         """The label search alone: phases of `FlowSettings.search` with propagation between them.
 
         Returns:
             The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
         """
-        settings, points = self.settings, reference.points
+        settings, points = self.settings, described.points
         n = len(points)
         start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
         if guess is not None:
@@ -154,7 +163,7 @@ class SparseDaisyFlow:
         plan = make_plan(settings)
         state = new_state(n, plan.population, lower, upper, tables.ceiling)
         state.flames[:, :] = start
-        run = phase_runner(plan, settings, reference, side(target), tables, state, seed, self.threads, self.pool)
+        run = self._runner(plan, described, reference, target, tables, state, seed)
         run(0, start)
         if settings.search in PROPAGATING:
             neighbours = neighbours[:, : settings.neighbours]

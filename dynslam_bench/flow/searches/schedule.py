@@ -60,6 +60,12 @@ def make_plan(settings: FlowSettings) -> Plan:
     return Plan(population, ends, rules, iterations, 1.0 if settings.search == "random" else 0.5)
 
 
+def cauchy_steps(settings: FlowSettings) -> NDArray[np.float32]:
+    """Scale of the Cauchy steps of Eq. 13 per dimension of a label: px, px, octaves, radians."""
+    step = settings.cauchy_step_px
+    return np.array([step, step, 0.1, np.deg2rad(5.0)], dtype=np.float32)
+
+
 def phase_runner(
     plan: Plan, settings: FlowSettings, reference: Reference, target: Side, tables: CostTables, state: SearchState,
     seed: int, threads: int, pool: ThreadPoolExecutor | None,
@@ -77,8 +83,7 @@ def phase_runner(
         return random_phase
     rules = plan.rules
     flames = rule_book.flame_counts(plan.population, plan.iterations, rules)
-    step = settings.cauchy_step_px
-    steps = np.array([step, step, 0.1, np.deg2rad(5.0)], dtype=np.float32)
+    steps = cauchy_steps(settings)
 
     def moth_flame(number: int, candidates: NDArray[np.float32]) -> None:
         run_stripes(

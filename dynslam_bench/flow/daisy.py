@@ -1,0 +1,140 @@
+"""DAISY on any torch device: the reference in floating point, and the quantised maps of the matching cost.
+
+`describe` follows the definition (Tola, Lepetit, Fua 2010) with DAISY Filter Flow's layout: rectified directional
+derivatives, blurred at full resolution with the Gaussian of each ring, sampled bilinearly around a point on a pattern
+that is scaled and rotated on demand, each histogram normalised on its own. `quantised_maps` computes what `maps`
+computes for the processor, in the same arrangement, so that both index it with the same tables.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from . import layout
+from .maps import NORM_FLOOR, MapGeometry, gaussian_weights, map_geometry
+
+PARTIAL_FLOOR = 0.01
+
+
+def directional_derivatives(images: Tensor, *, bins: int = layout.BINS) -> Tensor:
+    """Rectified derivatives along equally spaced directions.
+
+    Args:
+        images: float ``[B, H, W]``.
+        bins: Number of directions; bin k looks along ``k * 360 / bins`` degrees (x to the right, y down).
+
+    Returns:
+        ``[B, bins, H, W]``, central differences, at least 0.
+    """
+    padded = functional.pad(images[:, None], (1, 1, 1, 1), mode="replicate")
+    gx = 0.5 * (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2])
+    gy = 0.5 * (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1])
+    angle = torch.arange(bins, device=images.device, dtype=images.dtype) * (2 * np.pi / bins)
+    return torch.relu(gx * angle.cos()[:, None, None] + gy * angle.sin()[:, None, None])
+
+
+def blur(maps: Tensor, weights: Tensor) -> Tensor:
+    """Separable convolution of ``[B, C, H, W]`` with a symmetric kernel given by its half, edges repeated."""
+    radius = len(weights) - 1
+    kernel = torch.cat([weights.flip(0), weights[1:]])
+    flat = maps.reshape(-1, 1, *maps.shape[-2:])
+    flat = functional.conv2d(
+        functional.pad(flat, (0, 0, radius, radius), mode="replicate"), kernel[None, None, :, None]
+    )
+    flat = functional.conv2d(functional.pad(flat, (radius, radius, 0, 0), mode="replicate"), kernel[None, None, None])
+    return flat.reshape(maps.shape)
+
+
+def describe(images: Tensor, points: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
+    """DAISY descriptors of points at given scales and rotations.
+
+    Args:
+        images: float ``[B, H, W]``, grey levels in [0, 1].
+        points: float ``[B, N, 2]``, pixels (x, y).
+        scales: float ``[B, N]``; each distinct value costs one blur per ring.
+        rotations: float ``[B, N]``, radians; pattern and bins turn along.
+
+    Returns:
+        float ``[B, N, 17, 8]``; each histogram has norm at most one. Samples outside the image are zero.
+    """
+    batch, height, width = images.shape
+    derivatives = directional_derivatives(images)
+    pattern = torch.as_tensor(layout.unit_pattern(), dtype=images.dtype, device=images.device)
+    out = images.new_zeros((batch, points.shape[1], layout.HISTOGRAMS, layout.BINS))
+    c, s = rotations.cos(), rotations.sin()
+    turn = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
+    places = points[:, :, None] + scales[..., None, None] * torch.einsum("bnij,kj->bnki", turn, pattern)
+    size = torch.tensor([width, height], dtype=images.dtype, device=images.device)
+    grid = (2 * places + 1) / size - 1
+    for scale in torch.unique(scales):
+        rows, columns = torch.nonzero(scales == scale, as_tuple=True)
+        for ring, sigma in enumerate(layout.RING_SIGMAS):
+            chosen = slice(0, 9) if ring == 0 else slice(9, 17)
+            blurred = blur(derivatives, _weights(float(scale) * sigma, images))
+            for image in torch.unique(rows):
+                mine = columns[rows == image]
+                sampled = functional.grid_sample(
+                    blurred[image][None], grid[image, mine, chosen][None], align_corners=False, padding_mode="zeros"
+                )
+                out[image, mine, chosen] = sampled[0].permute(1, 2, 0)
+    out = _turn_bins(out, rotations)
+    return out / (out.norm(dim=-1, keepdim=True) + PARTIAL_FLOOR)
+
+
+def _turn_bins(histograms: Tensor, rotations: Tensor) -> Tensor:
+    """Histograms relative to a rotated frame: bin b is read at direction ``b + theta / 45 degrees``, interpolated."""
+    bins = histograms.shape[-1]
+    shift = rotations * (bins / (2 * np.pi))
+    whole = shift.floor()
+    fraction = (shift - whole)[..., None, None]
+    index = torch.arange(bins, device=histograms.device)
+    near = (index + whole.long()[..., None]) % bins
+    shape = histograms.shape
+    first = histograms.gather(-1, near[..., None, :].expand(shape))
+    second = histograms.gather(-1, ((near + 1) % bins)[..., None, :].expand(shape))
+    return (1 - fraction) * first + fraction * second
+
+
+def _weights(sigma: float, like: Tensor) -> Tensor:
+    return torch.as_tensor(gaussian_weights(sigma), dtype=like.dtype, device=like.device)
+
+
+def quantised_maps(gray: Tensor) -> tuple[Tensor, MapGeometry]:
+    """The orientation maps of `maps.orientation_maps` on any device.
+
+    Args:
+        gray: uint8 ``[H, W]``.
+
+    Returns:
+        uint8 ``[total, 8]`` histograms, equal to those of the processor's kernels up to rounding (one level), and
+        their arrangement.
+    """
+    height, width = int(gray.shape[0]), int(gray.shape[1])
+    geometry = map_geometry(height, width)
+    histograms = torch.zeros((geometry.total, layout.BINS), dtype=torch.uint8, device=gray.device)
+    maps = 0.5 * directional_derivatives(_halve(gray[None, None].float())[:, 0])  # per full-image pixel
+    sigma, step = 0.0, 2
+    for level, (wanted, level_step) in enumerate(zip(layout.LEVEL_SIGMAS, layout.LEVEL_STEPS, strict=True)):
+        if level_step != step:
+            maps = _halve(maps)
+            sigma, step = (sigma**2 + 0.25 * step**2) ** 0.5, level_step
+        maps = blur(maps, _weights((wanted**2 - sigma**2) ** 0.5 / step, maps))
+        sigma = wanted
+        gain = 255.0 / (maps.square().sum(dim=1, keepdim=True).sqrt() + NORM_FLOOR)
+        cells = (maps * gain + 0.5).to(torch.uint8)[0].permute(1, 2, 0)
+        margin = layout.MARGIN // step
+        base, stride = int(geometry.base[level]), int(geometry.stride[level])
+        rows, columns = cells.shape[:2]
+        area = histograms[base : base + (rows + 2 * margin) * stride].view(rows + 2 * margin, stride, layout.BINS)
+        area[margin : margin + rows, margin : margin + columns] = cells
+    return histograms, geometry
+
+
+def _halve(maps: Tensor) -> Tensor:
+    """Mean of 2 x 2 cells; an odd last row or column is dropped, as in `maps`."""
+    height, width = maps.shape[-2:]
+    maps = functional.pad(maps, (0, width < 2, 0, height < 2), mode="replicate")
+    return functional.avg_pool2d(maps, 2)
