@@ -149,13 +149,14 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
     seat = 0.485 + 0.085 * b
     pelvis_z = standing * (1 - sit) + sit * seat
     body = turn(how.facing)
-    sway = (1 - gait) * (1 - 0.6 * sit)
+    sway = (1 - gait) * (1 - 0.85 * sit)
+    supple = 1 - 0.8 * sit  # who sits leans back: arms and head go on, the trunk hardly moves
     root = np.array([how.x, how.y, pelvis_z]) + body @ np.array(
         [0.012 * sway * wave(0.31, 0.0), 0.012 * sway * wave(0.23, 2.0), 0.0]
     )
-    twist = gait * 0.1 * math.sin(phase) + lively * 0.12 * wave(0.27, 0.4)
-    lean = 0.05 * gait + sit * 0.06 + 0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2)
-    trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * wave(0.17, 0.7))
+    twist = gait * 0.1 * math.sin(phase) + supple * lively * 0.12 * wave(0.27, 0.4)
+    lean = 0.05 * gait + sit * 0.06 + supple * (0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2))
+    trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * supple * wave(0.17, 0.7))
     hipline = body @ _yaw(-twist)
     jeans: dict[str, Any] = {"instance": who.instance, "texture": "denim", "repeat": (2.0, 3.0), "tint": who.trousers}
     shirt: dict[str, Any] = {"instance": who.instance, "texture": who.shirt, "tint": who.shirt_tint}

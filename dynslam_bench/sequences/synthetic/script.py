@@ -64,14 +64,14 @@ def write_script(people: str, instance: int) -> Script:
         fa, fb = 180 + j(18, 35), 180 - j(22, 40)
         first = (
             Key(0, ax, ay, fa, 1, 0.39),
-            Key(4, ax, ay, fa + 8, 1, 0.55),
-            Key(8, ax, ay, fa - 6, 1, 0.28),
+            Key(4, ax, ay, fa + 1.5, 1, 0.55),
+            Key(8, ax, ay, fa - 1.5, 1, 0.28),
             Key(12, ax, ay, fa, 1, 0.39),
         )
         second = (
             Key(0, bx, by, fb, 1, 0.33),
-            Key(3, bx, by, fb - 6, 1, 0.22),
-            Key(7, bx, by, fb + 7, 1, 0.55),
+            Key(3, bx, by, fb - 1.5, 1, 0.22),
+            Key(7, bx, by, fb + 1.5, 1, 0.55),
             Key(12, bx, by, fb, 1, 0.33),
         )
         chairs = (

@@ -12,7 +12,7 @@ from dynslam_bench.core.errors import SequenceError, did_you_mean
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
 
-RENDERER_VERSION = 4
+RENDERER_VERSION = 5
 """Raised whenever any pixel, pose or mask of any sequence changes; part of every digest and cache folder."""
 
 CAMERA = Camera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6, depth_factor=5000.0)
