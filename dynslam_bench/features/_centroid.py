@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 
 
 def patch_half_widths(radius: int) -> NDArray[np.int64]:
-    """Half widths of the rows of a disc: row ``dy`` spans ``-w[|dy|] .. w[|dy|]``, int64 ``[radius + 1]``."""
+    """Half widths of the rows of a disc: row ``dy`` spans ``-w[|dy|] .. w[|dy|]``, int64 ``[radius + 1]``.
+
+    The disc holds the pixels with ``dx^2 + dy^2 <= radius^2``, so that it is the same after a quarter turn.
+    """
     rows = np.arange(radius + 1)
-    return np.asarray(np.rint(np.sqrt(radius * radius - rows * rows)), dtype=np.int64)
+    return np.asarray(np.floor(np.sqrt(radius * radius - rows * rows)), dtype=np.int64)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

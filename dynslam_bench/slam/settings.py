@@ -85,7 +85,7 @@ class MappingSettings(Settings):
         8, low=3, high=20, limits=(1, 100), meaning="covisible keyframes that new points are sought in and fused with"
     )
     triangulate_below: float = tunable(
-        0.8,
+        0.5,
         low=0.0,
         high=1.0,
         meaning="features without depth are triangulated where fewer than this share of all have a close depth; "

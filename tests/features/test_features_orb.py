@@ -1,0 +1,156 @@
+"""ORB features: spread, determinism, orientation and degenerate images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import PluginError, SettingsError
+from dynslam_bench.core.settings import apply_overrides, parameters
+from dynslam_bench.features.build import build_extractor
+from dynslam_bench.features.keypoints import FeatureExtractor
+from dynslam_bench.features.orb import OrbExtractor, level_quotas, spread
+from dynslam_bench.features.registry import FEATURES
+from dynslam_bench.features.settings import FeatureSettings
+
+
+def texture(height=480, width=640, seed=0):
+    rng = np.random.default_rng(seed)
+    image = np.zeros((height, width), np.float64)
+    for side in (4, 12, 40):  # structure at several scales, so that every level has corners
+        noise = rng.normal(size=(-(-height // side), -(-width // side)))
+        image += cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC) * np.log(side)
+    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def test_finds_what_was_asked_for_with_consistent_columns():
+    found = build_extractor(FeatureSettings(n_features=700)).extract(texture())
+    assert len(found) == 700
+    assert found.xy.dtype == np.float32 and found.xy.shape == (700, 2)
+    assert found.descriptors.dtype == np.uint8 and found.descriptors.shape == (700, 32)
+    assert found.octave.dtype == np.int32 and set(np.unique(found.octave)) == set(range(8))
+    assert ((found.angle >= 0) & (found.angle < 360)).all()
+    assert ((found.xy >= 0) & (found.xy < (640, 480))).all()
+
+
+def test_same_image_gives_same_bits_whatever_the_threads():
+    image = texture(seed=3)
+    before = cv2.getNumThreads()
+    try:
+        results = []
+        for threads in (1, 4):
+            cv2.setNumThreads(threads)
+            results.append(OrbExtractor().extract(image))
+    finally:
+        cv2.setNumThreads(before)
+    for name in ("xy", "octave", "angle", "response", "descriptors"):
+        assert np.array_equal(getattr(results[0], name), getattr(results[1], name))
+
+
+def test_features_cover_the_image_better_than_plain_orb():
+    image = texture(seed=1)
+    image[:, :320] = cv2.addWeighted(image[:, :320], 0.15, np.full((480, 320), 120, np.uint8), 0.85, 0)  # weak half
+    ours = OrbExtractor(FeatureSettings(n_features=500)).extract(image).xy
+    plain = np.array([k.pt for k in cv2.ORB_create(500).detect(image)])
+
+    def occupied(xy):
+        return len(set(map(tuple, (xy // 40).astype(int))))
+
+    assert occupied(ours) > 1.2 * occupied(plain)
+    assert np.count_nonzero(ours[:, 0] < 320) > 150
+
+
+def test_weak_corners_count_only_in_cells_without_strong_ones():
+    image = np.full((480, 640), 100, np.uint8)
+    image[100:110, 100:110] = 200  # strong square
+    image[112:116, 112:116] = 112  # weak square in the same cell
+    image[300:310, 300:310] = 112  # weak square alone
+    image = cv2.GaussianBlur(image, (3, 3), 0.8)
+    settings = FeatureSettings(levels=1, fast_threshold=30, fast_threshold_min=5, cell_px=40)
+    found = OrbExtractor(settings).extract(image)
+    near = [np.abs(found.xy - centre).max(axis=1) < 9 for centre in ((105, 105), (305, 305))]
+    assert near[0].any() and near[1].any()
+    assert (found.response[near[0]] >= 30).all()
+    assert (found.response[near[1]] < 30).all()
+
+
+def test_orientation_turns_with_the_image():
+    image = texture(481, 481, seed=5)
+    turned = np.ascontiguousarray(np.rot90(image))  # counter-clockwise on screen: angles fall by 90 degrees
+    a = OrbExtractor(FeatureSettings(levels=1, n_features=800)).extract(image)
+    b = OrbExtractor(FeatureSettings(levels=1, n_features=800)).extract(turned)
+    where = {tuple(p): i for i, p in enumerate(np.rint(b.xy).astype(int).tolist())}
+    places = enumerate(np.rint(a.xy).astype(int).tolist())
+    pairs = [(i, where[y, 480 - x]) for i, (x, y) in places if (y, 480 - x) in where]
+    assert len(pairs) > 200
+    i, j = np.array(pairs).T
+    turn = (b.angle[j] - a.angle[i] + 90 + 180) % 360 - 180
+    assert np.abs(turn).max() < 0.01
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_flat_images_have_no_features(value):
+    found = OrbExtractor().extract(np.full((480, 640), value, np.uint8))
+    assert len(found) == 0 and found.descriptors.shape == (0, 32)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (20, 30), (39, 640), (45, 45)])
+def test_small_images_are_no_error(shape):
+    rng = np.random.default_rng(0)
+    found = OrbExtractor().extract(rng.integers(0, 256, shape).astype(np.uint8))
+    assert ((found.xy >= 0) & (found.xy < shape[::-1])).all()
+
+
+def test_quotas_sum_up_and_fall():
+    quotas = level_quotas(1000, 8, 1.2)
+    assert sum(quotas) == 1000 and sorted(quotas, reverse=True) == quotas
+
+
+def test_spread_takes_every_cells_best_first():
+    cells = np.array([0, 0, 0, 1, 2, 2])
+    response = np.array([9, 8, 7, 1, 5, 6], np.int16)
+    allowed = np.ones(6, bool)
+    assert spread(cells, response, allowed, 3).tolist() == [0, 5, 3]
+    assert spread(cells, response, allowed, 4).tolist() == [0, 5, 3, 1]
+    allowed[0] = False
+    assert spread(cells, response, allowed, 2).tolist() == [1, 5]
+
+
+def test_thresholds_in_the_wrong_order_are_refused():
+    with pytest.raises(SettingsError, match="fast_threshold_min is 20"):
+        build_extractor(FeatureSettings(fast_threshold=10, fast_threshold_min=20))
+
+
+def test_unknown_extractor_names_the_known_ones():
+    with pytest.raises(PluginError, match="orb"):
+        build_extractor(FeatureSettings(extractor="orbb"))
+
+
+def test_settings_describe_a_search_space():
+    names = [parameter.name for parameter in parameters(FeatureSettings)]
+    assert "n_features" in names and "fast_threshold" in names
+    assert apply_overrides(FeatureSettings(), {"n_features": "1500"}).n_features == 1500
+
+
+def test_a_plugin_extractor_from_a_file(tmp_path, monkeypatch):
+    source = (
+        "import numpy as np\n"
+        "from dynslam_bench.features.keypoints import Keypoints\n"
+        "from dynslam_bench.features.registry import FeatureSpec\n"
+        "class Corner:\n"
+        "    def __init__(self, settings): self.n = settings.options.get('n', 1)\n"
+        "    def extract(self, gray):\n"
+        "        n = self.n\n"
+        "        return Keypoints(np.zeros((n, 2), np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32),\n"
+        "                         np.zeros(n, np.float32), np.zeros((n, 40), np.uint8))\n"
+        f"SPEC = FeatureSpec('corner', r'{tmp_path}/mine.py:Corner', descriptor_bytes=40)\n"
+    )
+    (tmp_path / "mine.py").write_text(source)
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"features={tmp_path}/mine.py:SPEC")
+    FEATURES.refresh()
+    try:
+        extractor = build_extractor(FeatureSettings(extractor="corner", options={"n": 3}))
+        assert isinstance(extractor, FeatureExtractor)
+        assert extractor.extract(texture()).descriptors.shape == (3, 40)
+    finally:
+        monkeypatch.delenv("DYNSLAM_BENCH_PLUGINS")
+        FEATURES.refresh()
