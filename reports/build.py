@@ -181,6 +181,14 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
     table = tables.common_frames_table(board, common, frames)
     if table is not None:
         section.blocks.append(draft.table(table, table.title))
+    final = tables.metric_table(
+        board, lambda row: row.final_ate_m, "final_trajectory", "Error of the final trajectory",
+        "Median ATE (RMSE, metres) of the trajectory after loop closing and final optimisation, of the trackers that "
+        "have "
+        f"one; all other tables show the {protocol.trajectory} one.",
+    )  # fmt: skip
+    if final is not None and protocol.trajectory == "online":
+        section.blocks.append(draft.table(final, final.title))
     rule = tables.failure_rule_table(board)
     if rule is not None:
         section.blocks.append(draft.table(rule, rule.title))

@@ -44,6 +44,7 @@ class RunRow(Record):
         protocol_id: Id of the protocol of `metrics`.
         protocol_digest: Its digest.
         metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
+        final_ate_m: ATE of the final trajectory (after loop closing); None if there is none.
         held_ate_m: The ATE with lost frames held at the last tracked pose; None if nothing was tracked.
         never_move_m: What a camera that does not move scores there; None without ground truth.
         n_frames: Input frames.
@@ -78,6 +79,7 @@ class RunRow(Record):
     protocol_id: str
     protocol_digest: str
     metrics: dict[str, float] = Field(default_factory=dict)
+    final_ate_m: float | None = None
     held_ate_m: float | None = None
     never_move_m: float | None = None
     n_frames: int = 0
@@ -195,6 +197,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         protocol_id=scored.protocol_id,
         protocol_digest=scored.protocol_digest,
         metrics=dict(scored.metrics),
+        final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
         held_ate_m=_held(store, record, protocol, evaluation),
         never_move_m=_never_move(store, record, protocol, evaluation),
         n_frames=record.n_frames,

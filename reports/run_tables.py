@@ -89,8 +89,18 @@ def all_runs(board: Board) -> Table:
     """Every run with every metric, for CSV."""
     metrics = sorted({name for row in board.rows for name in row.metrics})
     plain = ["run_id", "kind", "tracker", "sequence_key", "seed", "status", "protocol_id", "protocol_digest"]
-    numbers = ["coverage", "n_frames", "score_m", "held_ate_m", "never_move_m", "frame_ms", "real_time_factor",
-               "peak_memory_mb", "mask_iou"]  # fmt: skip
+    numbers = [
+        "coverage",
+        "n_frames",
+        "score_m",
+        "held_ate_m",
+        "final_ate_m",
+        "never_move_m",
+        "frame_ms",
+        "real_time_factor",
+        "peak_memory_mb",
+        "mask_iou",
+    ]
     columns = [Column(name, numeric=False) for name in ["label", *plain]] + [Column(name) for name in numbers + metrics]
     rows = []
     for row in sorted(board.rows, key=lambda row: (board.labels[row.variant_key], row.sequence_key, row.seed)):

@@ -56,6 +56,7 @@ def add_run(
     kind="run",
     reason="",
     command=("dynslam-bench", "bench", "dynamic"),
+    final_error=None,
 ):
     """Store one run whose trajectory is the truth with noise of the given size."""
     stamps, truth = stamps_of(n), truth_of(sequence, n)
@@ -87,6 +88,9 @@ def add_run(
     with store.work_folder(run_id) as work:
         if ok.any():
             (work / "trajectory_online.txt").write_text(format_tum(Trajectory(stamps[ok], poses[ok])))
+        if final_error is not None:
+            better = truth.T_world_cam[nearest] @ se3.exp(drift * final_error / error)
+            (work / "trajectory_final.txt").write_text(format_tum(Trajectory(stamps[ok], better[ok])))
         (work / "log.txt").write_text("a log\n")
         store.publish(work, record)
     return run_id

@@ -260,6 +260,18 @@ def test_what_cannot_be_reported_is_one_clear_line(tmp_path, case):
     assert not (tmp_path / "report").exists()
 
 
+def test_the_final_trajectory_has_its_own_table(tmp_path):
+    store = RunStore(tmp_path / "r")
+    run_id = add_run(store, "orb-slam2", "s/a", final_error=0.001)
+    add_run(store, "never-move", "s/a")
+    paths = build_report(store, tmp_path / "report")
+    (only,) = rows_of(paths.csv["final_trajectory"])
+    expected = evaluate(store.trajectory(run_id, "final"), truth_of("s/a")).metrics["ate_rmse_m"]
+    assert only["tracker"] == "orb-slam2"
+    assert float(only["high dynamic: s/a"]) == pytest.approx(expected, rel=1e-6)
+    assert expected < 0.5 * evaluate(store.trajectory(run_id), truth_of("s/a")).metrics["ate_rmse_m"]
+
+
 # -- compare
 
 
