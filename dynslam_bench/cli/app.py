@@ -11,7 +11,19 @@ import typer
 from dynslam_bench import __version__
 from dynslam_bench.core.errors import DynslamError
 
-from . import caches, environments, evaluating, imports, presentation, running, segmenters, sequences, stored, trackers
+from . import (
+    caches,
+    environments,
+    evaluating,
+    imports,
+    presentation,
+    running,
+    segmenters,
+    sequences,
+    stored,
+    studies,
+    trackers,
+)
 
 app = typer.Typer(
     name="dynslam-bench",
@@ -27,6 +39,7 @@ app.add_typer(trackers.app, name="trackers")
 running.add(app)
 app.add_typer(stored.app, name="runs")
 evaluating.add(app)
+app.add_typer(studies.app, name="tune")
 presentation.add_report(app)
 imports.add(app)
 app.add_typer(segmenters.app, name="segmenter")

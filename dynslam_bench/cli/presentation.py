@@ -104,14 +104,18 @@ def demo(
     results: Results = Path("results"),
     frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 150,
     jobs: Jobs = 2,
+    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 10,
 ) -> None:
-    """Run trackers on rendered sequences and report them: the whole way, with no download."""
+    """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
     from .demo import run_demo
 
-    outcome = run_demo(results, frames=frames, jobs=jobs)
+    outcome = run_demo(results, frames=frames, jobs=jobs, trials=trials)
     write()
     write(outcome.leaderboard)
     write()
+    write(f"study: {outcome.conclusion}")
+    write()
     write(f"report: {outcome.report}")
+    write(f"study:  {outcome.study}")
     if outcome.failed:
         raise typer.Exit(SOME_RUNS_FAILED)

@@ -313,6 +313,37 @@ def test_degradation(cli, walk):
     assert "blurr" in one_line(cli("run", "never-move", walk, "--degrade", "blurr=1")[2])
 
 
+STUDY = """
+name = "tiny"
+tracker = "orb-slam2"
+tune = ["synthetic/sitting_xyz@1?frames=12"]
+held_out = ["synthetic/sitting_xyz@101?frames=12"]
+seeds = [0]
+trials = 2
+top = 1
+[space]
+include = ["features.n_features"]
+"""
+
+
+def test_a_study(cli, tmp_path):
+    Path("study.toml").write_text(STUDY)
+    (parameter,) = json.loads(cli("tune", "space", "study.toml", "--json")[1])
+    assert parameter["name"] == "features.n_features"
+    assert "has no finished trial" in one_line(cli("tune", "best", "study.toml")[2])
+    code, out, err = cli("tune", "run", "study.toml", "--json")
+    found = json.loads(out)
+    assert code == 0 and err == "" and Path(found["page"]).is_file() and found["summary"]["trials"]["complete"] == 2
+    assert json.loads(cli("tune", "status", "study.toml", "--json")[1])["complete"] == 2
+    assert "has its 2 trials" in cli("tune", "worker", "study.toml")[1]
+    assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
+    code, out, _ = cli("run", "orb-slam2", "synthetic/sitting_xyz@1?frames=12", "--settings", "preset.toml", "--json")
+    assert code == 0 and json.loads(out)[0]["status"] == "ok"
+    assert cli("tune", "report", "study.toml")[1].splitlines()[0] == found["summary"]["conclusion"]
+    Path("study.toml").write_text(STUDY.replace("n_features", "n_featurs"))
+    assert "did you mean 'features.n_features'" in one_line(cli("tune", "space", "study.toml")[2])
+
+
 def test_settings_files(cli, walk, tmp_path):
     (tmp_path / "nested.toml").write_text("[features]\ncount = 1\n")
     assert "features.count" in one_line(cli("run", "orb-slam2", walk, "--settings", "nested.toml")[2])

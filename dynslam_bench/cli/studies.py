@@ -1,0 +1,188 @@
+"""``tune space|run|worker|status|best|report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from .options import AsJson, Jobs, Results
+from .output import note, progress, write, write_fields, write_json, write_table
+
+if TYPE_CHECKING:
+    from dynslam_bench.tuning import StudySpec, StudySummary, Tuner
+
+app = typer.Typer(help="Studies: tune a tracker's settings through its environment.", no_args_is_help=True)
+
+
+@app.callback()
+def _quiet() -> None:
+    """Studies: tune a tracker's settings through its environment."""
+    hush_optuna()
+
+
+Study = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.")]
+
+
+@app.command()
+def space(study: Study, as_json: AsJson = False) -> None:
+    """Show which settings a study tunes, and within which limits."""
+    from dataclasses import asdict
+
+    from dynslam_bench.trackers import TRACKERS
+    from dynslam_bench.tuning import read_study, search_space
+
+    spec = read_study(study)
+    found = search_space(TRACKERS.get(spec.tracker).settings, spec.space)
+    if as_json:
+        write_json([asdict(parameter) for parameter in found])
+        return
+    rows = []
+    for parameter in found:
+        limits = parameter.choices or (parameter.low, parameter.high)
+        span = ", ".join(map(str, limits)) if parameter.choices else f"{parameter.low:g} to {parameter.high:g}"
+        if parameter.scale == "log":
+            span += " (log)"
+        conditions = [f"{name} = {' or '.join(map(str, values))}" for name, values in parameter.when]
+        rows.append(
+            (parameter.name, span, parameter.default, parameter.unit, " and ".join(conditions), parameter.meaning)
+        )
+    write_table(("setting", "range", "default", "unit", "only if", "meaning"), rows)
+
+
+@app.command()
+def run(
+    study: Study,
+    results: Results = Path("results"),
+    jobs: Jobs = 1,
+    trials: Annotated[Optional[int], typer.Option(min=2, help="Finished trials, in place of the file's.")] = None,  # noqa: UP045
+    as_json: AsJson = False,
+) -> None:
+    """Run a study, or go on with it; then run the best again, check them on the held-out split, write the page."""
+    from dynslam_bench.tuning import finish, read_study, write_page
+
+    spec = read_study(study)
+    if trials is not None:
+        spec = spec.model_copy(update={"trials": trials})
+    tuner = run_trials(spec, results, jobs)
+    summary = finish(tuner, note)
+    show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
+
+
+@app.command()
+def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> None:
+    """Only run trials of a study, beside other workers on the same storage."""
+    from dynslam_bench.tuning import read_study
+
+    tuner = run_trials(read_study(study), results, jobs)
+    write(f"study '{tuner.spec.name}' has its {tuner.spec.trials} trials")
+
+
+@app.command()
+def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
+    """Show how far a study is."""
+    from dynslam_bench.tuning import Tuner, read_study
+    from dynslam_bench.tuning.final_runs import best_trials, count_states
+
+    tuner = Tuner(read_study(study), results)
+    facts: dict[str, Any] = {
+        "study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials,
+        **count_states(tuner.study),
+    }  # fmt: skip
+    best = best_trials(tuner.study, 1)
+    if best:
+        facts |= {"best_trial": best[0].number, "best_values": list(best[0].values), "best_settings": best[0].params}
+    if as_json:
+        write_json(facts)
+        return
+    settings = facts.pop("best_settings", {})
+    write_fields(facts)
+    if settings:
+        write()
+        write_table(("setting", "value"), list(settings.items()))
+
+
+@app.command()
+def best(
+    study: Study,
+    results: Results = Path("results"),
+    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
+) -> None:
+    """Write the best settings as a preset that `run --settings` takes."""
+    from dynslam_bench.core.errors import StudyError
+    from dynslam_bench.core.records import write_atomic
+    from dynslam_bench.tuning import Tuner, read_study
+    from dynslam_bench.tuning.final_runs import best_trials
+    from dynslam_bench.tuning.preset import preset_text
+    from dynslam_bench.tuning.storage import study_folder
+
+    spec = read_study(study)
+    chosen = study_folder(results, spec) / "best.toml"
+    if chosen.is_file():
+        text = chosen.read_text()
+    else:
+        tuner = Tuner(spec, results)
+        found = best_trials(tuner.study, 1)
+        if not found:
+            raise StudyError(f"study '{spec.name}' has no finished trial", f"dynslam-bench tune run {study}")
+        remark = f"trial {found[0].number}, the best so far; not checked on the held-out split"
+        text = preset_text(tuner.settings_of(found[0]), spec.tracker, remark)
+    if output is None:
+        write(text.rstrip())
+    else:
+        write_atomic(output, text)
+        write(str(output))
+
+
+@app.command()
+def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
+    """Write a study's page; the best are run again if that was not done yet."""
+    from dynslam_bench.tuning import StudySummary, Tuner, finish, read_study, write_page
+
+    tuner = Tuner(read_study(study), results)
+    stored = tuner.folder / "summary.json"
+    if stored.is_file():
+        summary = StudySummary.read(stored)
+    else:
+        tuner.reference()
+        summary = finish(tuner, note)
+    show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
+
+
+def run_trials(spec: StudySpec, results: Path, jobs: int) -> Tuner:
+    """`run_study` with a progress bar."""
+    from dynslam_bench.tuning import StudyEvent, run_study
+
+    with progress(f"study {spec.name}") as advance:
+
+        def told(event: StudyEvent) -> None:
+            if event.kind == "finished":
+                note(f"trial {event.number}: {event.text}")
+                advance(event.number + 1, event.total)
+
+        return run_study(spec, results=results, jobs=jobs, on_event=told)
+
+
+def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bool) -> None:
+    """Conclusion, chosen settings and where everything lies."""
+    preset = tuner.folder / "best.toml"
+    if as_json:
+        write_json({"summary": summary, "page": page, "preset": preset})
+        return
+    write(summary.conclusion)
+    write()
+    write_table(("setting", "value"), list(summary.candidates[0].params.items()))
+    write()
+    write(f"preset: {preset}")
+    write(f"page:   {page}")
+
+
+def hush_optuna() -> None:
+    """Keep Optuna's own log and its remarks on experimental features off the terminal."""
+    import warnings
+
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
