@@ -192,7 +192,15 @@ class _OneWay:
         seen = np.empty((n, most, 4), dtype=np.float32)
         extent = np.full((n, 4), 8.0, dtype=np.float32)
         transported_labels(
-            0, n, self.centres, labels, neighbours[:, :most], np.empty((0, 4), np.float32), -extent, extent, seen
+            0,
+            n,
+            self.centres,
+            labels,
+            np.ascontiguousarray(neighbours[:, :most]),
+            np.empty((0, 4), np.float32),
+            -extent,
+            extent,
+            seen,
         )
         return np.concatenate([labels[:, None], seen], axis=1)
 

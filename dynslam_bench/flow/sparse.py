@@ -166,7 +166,7 @@ class SparseDaisyFlow:
         run = self._runner(plan, described, reference, target, tables, state, seed)
         run(0, start)
         if settings.search in PROPAGATING:
-            neighbours = neighbours[:, : settings.neighbours]
+            neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
             motions = np.full((2, 4), np.nan, dtype=np.float32)
             candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
             for number in range(1, len(plan.ends)):
@@ -204,14 +204,35 @@ class SparseDaisyFlow:
         self, points: NDArray[np.float32], labels: NDArray[np.float32], correlation: NDArray[np.float32],
         neighbours: NDArray[np.int64], reference: OrientationMaps, target: OrientationMaps,
     ) -> None:  # fmt: skip
-        """Give points that contradict agreeing neighbours the neighbours' label, if that looks as good there."""
+        """Try what agreeing neighbours, then what most points say, where it contradicts a point's own label.
+
+        The other label is taken where, refined, it looks as good: repetitive textures look alike one period off.
+        """
         n = len(points)
-        predictions = np.empty((n, neighbours.shape[1], 4), dtype=np.float32)
         extent = np.full((n, 4), 8.0, dtype=np.float32)
+        predictions = np.empty((n, neighbours.shape[1], 4), dtype=np.float32)
         transported_labels(0, n, points, labels, neighbours, np.empty((0, 4), np.float32), -extent, extent, predictions)
         alternative = np.empty((n, 4), dtype=np.float32)
         dissents = np.empty(n, dtype=np.bool_)
         dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
+        self._reconsider(points, labels, correlation, alternative, dissents, reference, target)
+        if not self.settings.similarity_seeds:
+            return
+        motions = np.empty((2, 4), dtype=np.float32)
+        doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
+        common_motions(points, labels, doubt, MOTION_HYPOTHESES, np.float32(MOTION_TOLERANCE_PX), np.uint64(1), motions)
+        predictions = np.empty((n, 2, 4), dtype=np.float32)
+        transported_labels(0, n, points, labels, np.empty((n, 0), np.int64), motions, -extent, extent, predictions)
+        alternative = np.ascontiguousarray(predictions[:, 0])
+        with np.errstate(invalid="ignore"):
+            dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
+        self._reconsider(points, labels, correlation, alternative, dissents, reference, target)
+
+    def _reconsider(
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], correlation: NDArray[np.float32],
+        alternative: NDArray[np.float32], dissents: NDArray[np.bool_], reference: OrientationMaps,
+        target: OrientationMaps,
+    ) -> None:  # fmt: skip
         chosen = np.flatnonzero(dissents)
         if not len(chosen):
             return

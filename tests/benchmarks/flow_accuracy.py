@@ -1,0 +1,147 @@
+"""Error and cost evaluations of every flow and every label search, as Markdown tables.
+
+    python tests/benchmarks/flow_accuracy.py [--budgets 48 96 192 384] [--images 6] [--quick]
+
+Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by the length of the true motion. Dense: the
+KITTI pair. Every row uses the default settings but for what it names.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from flow_data import Pair, kitti, real, synthetic
+
+from dynslam_bench.flow.build import build_flow
+from dynslam_bench.flow.dense import DenseDaisyFlow
+from dynslam_bench.flow.dis import DisFlow
+from dynslam_bench.flow.settings import FlowSettings
+
+KINDS = ("translation", "scale", "rotation", "similarity", "homography", "foreground")
+SEARCHES = ("emfoa+propagation", "patchmatch", "emfoa", "mfo", "emfoa-literal", "random")
+CLASSES = ((0, 20), (20, 60), (60, np.inf))
+FEWEST = 100
+
+
+def kitti_pair() -> Pair:
+    """The KITTI pair at ORB-like points that have ground truth."""
+    first, second, flow, known = kitti()
+    gray = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second)]
+    found = cv2.goodFeaturesToTrack(gray[0], 3000, 0.003, 5, mask=known.astype(np.uint8) * 255)[:, 0]
+    xy = found[known[found[:, 1].astype(int), found[:, 0].astype(int)]].astype(np.float32)
+    truth = xy + flow[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+    inside = ((truth >= 0) & (truth < gray[0].shape[::-1])).all(axis=1)
+    return Pair("KITTI", *gray, xy[inside], truth[inside])
+
+
+def errors(settings: FlowSettings, pairs: Sequence[Pair], seeds: Sequence[int]) -> tuple[np.ndarray, np.ndarray, float]:
+    """End-point errors, true motions and mean evaluations a point."""
+    flow = build_flow(settings)
+    error, motion, spent, count = [], [], 0.0, 0
+    for pair in pairs:
+        reference, target = flow.prepare(pair.reference), flow.prepare(pair.target)
+        for seed in seeds:
+            result = flow.track(reference, target, pair.points, seed=seed)
+            error.append(np.hypot(*(result.xy - pair.truth).T))
+            motion.append(np.hypot(*(pair.truth - pair.points).T))
+            spent, count = spent + result.stats["evaluations"], count + len(pair.points)
+    return np.concatenate(error), np.concatenate(motion), spent / count
+
+
+def cells(error: np.ndarray, motion: np.ndarray) -> list[str]:
+    """``% < 1.5 px / % < 3 px / median`` for each class of motion."""
+    row = []
+    for low, high in CLASSES:
+        e = error[(motion >= low) & (motion < high)]
+        good = (
+            f"{100 * (e < 1.5).mean():.1f} / {100 * (e < 3).mean():.1f} / {np.median(e):.2f}"
+            if len(e) >= FEWEST
+            else "-"
+        )
+        row.append(good)
+    return row
+
+
+def sparse_table(sets: dict[str, list[Pair]], budgets: Sequence[int], seeds: Sequence[int]) -> None:
+    """One table a data set: all methods, all searches at all budgets."""
+    rows = [("Lucas-Kanade, 4 levels", FlowSettings(method="lucas-kanade")), ("DIS medium", FlowSettings(method="dis"))]
+    rows += [
+        (f"{search}, {budget}", FlowSettings(search=search, budget=budget)) for search in SEARCHES for budget in budgets
+    ]
+    for name, pairs in sets.items():
+        motion = np.concatenate([np.hypot(*(p.truth - p.points).T) for p in pairs])
+        sizes = ", ".join(str(int(((motion >= low) & (motion < high)).sum())) for low, high in CLASSES)
+        print(f"\n### {name}: {len(pairs)} pairs, tracks by class {sizes}\n")
+        print(
+            "| method, budget | < 20 px | 20-60 px | > 60 px | evaluations a point |\n| --- | --- | --- | --- | --- |"
+        )
+        for label, settings in rows:
+            error, moved, spent = errors(settings, pairs, seeds)
+            star = " (default)" if settings == FlowSettings() else ""
+            print(f"| {label}{star} | {' | '.join(cells(error, moved))} | {spent:.0f} |", flush=True)
+
+
+def kinds_table(pairs: list[Pair]) -> None:
+    """The default flow and Lucas-Kanade by kind of warp."""
+    print("\n### Warps by kind, % < 1.5 px\n\n| kind | default | Lucas-Kanade |\n| --- | --- | --- |")
+    for kind in KINDS:
+        mine = [pair for pair in pairs if pair.name == kind]
+        row = [
+            100 * (errors(s, mine, (0,))[0] < 1.5).mean() for s in (FlowSettings(), FlowSettings(method="lucas-kanade"))
+        ]
+        print(f"| {kind} | {row[0]:.1f} | {row[1]:.1f} |", flush=True)
+
+
+def dense_table(budgets: Sequence[int]) -> None:
+    """Dense flow of the KITTI pair."""
+    first, second, truth, known = kitti()
+    gray = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second)]
+    print("\n### Dense, KITTI pair\n\n| method | median px | % > 3 px | consistent % | median there | evaluations |")
+    print("| --- | --- | --- | --- | --- | --- |")
+
+    def row(name: str, flow: np.ndarray, valid: np.ndarray | None, spent: float) -> None:
+        e = np.linalg.norm(flow - truth, axis=2)
+        good = known if valid is None else known & valid
+        share = "-" if valid is None else f"{100 * valid[known].mean():.0f} | {np.median(e[good]):.2f}"
+        share = "- | -" if valid is None else share
+        print(
+            f"| {name} | {np.median(e[known]):.2f} | {100 * (e[known] > 3).mean():.1f} | {share} | {spent:.0f} |",
+            flush=True,
+        )
+
+    for preset in ("ultrafast", "fast", "medium"):
+        row(f"DIS {preset}", DisFlow(FlowSettings(method="dis", dis_preset=preset)).dense(*gray), None, 0)
+    settings = [FlowSettings(dense_budget=b, search=s) for s in ("emfoa+propagation", "patchmatch") for b in budgets]
+    for each in settings:
+        dense = DenseDaisyFlow(each)
+        result = dense.flow(dense.prepare(gray[0]), dense.prepare(gray[1]))
+        star = " (default)" if each == FlowSettings() else ""
+        name = f"DAISY Filter Flow, {each.search}, {each.dense_budget}{star}"
+        row(name, result.flow, result.valid, result.stats["evaluations"])
+
+
+def main() -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--budgets", type=int, nargs="+", default=[48, 96, 192, 384])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--images", type=int, default=6)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    warps = synthetic(KINDS, 2 if options.quick else options.images)
+    if options.quick:
+        frames = real("fr1_xyz", (1, 8), 16) + real("fr1_rpy", (1, 3), 8)
+        sets = {"Real frames (fr1_xyz, fr1_rpy)": frames}
+    else:
+        frames = real("fr1_xyz", (1, 3, 8, 14), 6) + real("fr1_rpy", (1, 2, 3, 5), 2)
+        sets = {"Real frames (fr1_xyz, fr1_rpy)": frames, "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12)}
+    sparse_table({**sets, "Synthetic warps": warps, "KITTI pair": [kitti_pair()]}, options.budgets, options.seeds)
+    kinds_table(warps)
+    dense_table(options.budgets)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,313 @@
+"""Sparse flow: accuracy, budgets, determinism, and input that says nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import PluginError, SettingsError
+from dynslam_bench.core.settings import apply_overrides, parameters
+from dynslam_bench.flow.build import build_flow
+from dynslam_bench.flow.estimator import FlowEstimator
+from dynslam_bench.flow.matching import tables_for
+from dynslam_bench.flow.searches.common import new_state
+from dynslam_bench.flow.searches.propagation import common_motions
+from dynslam_bench.flow.searches.schedule import make_plan
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.sparse import SparseDaisyFlow
+from dynslam_bench.flow.spec import FLOWS
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+SEARCHES = ["emfoa+propagation", "emfoa", "mfo", "emfoa-literal", "patchmatch", "random"]
+METHODS = ["daisy", "lucas-kanade", "dis"]
+
+
+def picture(seed=0, shape=(240, 320)):
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(rng.uniform(0, 1, (shape[0] // k, shape[1] // k)), shape[::-1], interpolation=cv2.INTER_CUBIC)
+        for k in (3, 8, 24)
+    ]
+    return np.clip(sum(layers) * 85, 0, 255).astype(np.uint8)
+
+
+def moved(image, scale=1.0, degrees=0.0, tx=0.0, ty=0.0):
+    height, width = image.shape
+    matrix = cv2.getRotationMatrix2D((width / 2, height / 2), -degrees, scale)
+    matrix[:, 2] += tx, ty
+    return cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REFLECT), matrix
+
+
+def grid(shape=(240, 320), margin=60, step=10):
+    x, y = np.arange(margin, shape[1] - margin, step), np.arange(margin, shape[0] - margin, step)
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(np.float32)
+
+
+def track(settings, first, second, points, *, threads=1, **arguments):
+    flow = build_flow(settings, threads=threads)
+    return flow.track(flow.prepare(first), flow.prepare(second), points, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("scale", "degrees", "tx", "ty"),
+    [(1, 0, 3.4, -2.3), (1, 0, 45, -30), (1.5, 0, 5, 5), (0.7, 0, 0, 9), (1, 40, 4, 2), (1.25, -20, 12, 8)],
+)
+def test_finds_similarities_to_a_fraction_of_a_pixel(scale, degrees, tx, ty):
+    image = picture(1)
+    target, matrix = moved(image, scale, degrees, tx, ty)
+    points = grid(margin=70)
+    truth = points @ matrix[:, :2].T + matrix[:, 2]
+    result = track(FlowSettings(), image, target, points, seed=3)
+    error = np.hypot(*(result.xy - truth).T)
+    assert (error < 1.5).mean() > 0.9 and np.median(error) < 0.2
+    assert (error[result.valid] < 1.5).mean() > 0.97 and result.valid.mean() > 0.85
+
+
+def test_beats_lucas_kanade_on_large_motion_of_a_photograph():
+    path = DATA / "tum/rgbd_dataset_freiburg1_xyz/rgb"
+    if not path.is_dir():
+        pytest.skip(f"no data at {path}")
+    image = cv2.imread(str(sorted(path.glob("*.png"))[0]), cv2.IMREAD_GRAYSCALE)
+    target, matrix = moved(image, 1.2, 15, 30, 10)
+    points = cv2.goodFeaturesToTrack(image, 500, 0.005, 8)[:, 0]
+    truth = points @ matrix[:, :2].T + matrix[:, 2]
+    inside = ((truth > 5) & (truth < (634, 474))).all(axis=1)
+    shares = [
+        (np.hypot(*(track(s, image, target, points[inside]).xy - truth[inside]).T) < 1.5).mean()
+        for s in (FlowSettings(), FlowSettings(method="lucas-kanade"))
+    ]
+    assert shares[0] > 0.9 and shares[0] > shares[1] + 0.15
+
+
+def test_a_guess_reaches_beyond_the_range():
+    image = picture(2, (240, 480))
+    target, matrix = moved(image, tx=150)
+    points = grid((240, 330), margin=50)
+    truth = points @ matrix[:, :2].T + matrix[:, 2]
+    settings = FlowSettings(range_px=16.0)
+    guess = (truth + 6).astype(np.float32)
+    guess[::3] = np.nan  # no guess there: the neighbours help
+    result = track(settings, image, target, points, guess=guess)
+    assert (np.hypot(*(result.xy - truth).T) < 1.5).mean() > 0.9
+    assert (np.hypot(*(track(settings, image, target, points).xy - truth).T) < 1.5).mean() < 0.5
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize("budget", [8, 48, 96, 131])
+def test_all_searches_spend_exactly_the_budget(search, budget):
+    image = picture(3)
+    target, _ = moved(image, tx=4)
+    points = grid()
+    settings = FlowSettings(search=search, budget=budget, refinement="none")
+    assert track(settings, image, target, points).stats["evaluations"] == budget * len(points)
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+def test_searches_are_anytime_and_monotone(search):
+    image = picture(4)
+    target, _ = moved(image, 1.2, 10, 8, 6)
+    settings = FlowSettings(search=search)
+    flow = SparseDaisyFlow(settings)
+    reference, prepared = flow.prepare(image), flow.prepare(target)
+    points = grid()
+    tables = tables_for(image.shape, settings)
+    described = flow.describe(reference, points, tables)
+    plan = make_plan(settings)
+    extent = np.tile(np.array([40, 40, 1, 0.7], np.float32), (len(points), 1))
+    state = new_state(len(points), plan.population, -extent, extent.copy(), tables.ceiling)
+    run = flow._runner(plan, described, reference, prepared, tables, state, 0)
+    candidates = np.zeros((len(points), 1, 4), np.float32)
+    last = state.costs[:, 0].copy()
+    for number, end in enumerate(plan.ends):
+        run(number, candidates)
+        assert (state.used == end).all()
+        assert (state.costs[:, 0] <= last).all()
+        assert (np.diff(state.costs, axis=1) >= 0).all()
+        last = state.costs[:, 0].copy()
+    assert plan.ends[-1] == settings.budget
+
+
+def test_lower_cost_with_more_budget_and_the_order_of_searches():
+    image = picture(5)
+    target, _ = moved(image, 1.3, 20, 20, -15)
+    points = grid()
+    cost = {}
+    for search in SEARCHES:
+        for budget in (48, 192):
+            settings = FlowSettings(search=search, budget=budget, refinement="none")
+            cost[search, budget] = track(settings, image, target, points, seed=1).cost.mean()
+        assert cost[search, 192] <= cost[search, 48]
+    for budget in (48, 192):  # as printed is worse than random; neighbours matter more than the metaheuristic
+        assert cost["emfoa-literal", budget] > cost["random", budget] - 0.01
+        assert cost["emfoa+propagation", budget] < cost["emfoa", budget]
+        assert cost["patchmatch", budget] < cost["emfoa", budget]
+    assert cost["emfoa", 192] < cost["random", 192]
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+def test_the_result_depends_on_the_seed_only(search):
+    image = picture(6)
+    target, _ = moved(image, 1.1, 5, 9, 3)
+    points = grid()
+    settings = FlowSettings(search=search)
+    first = track(settings, image, target, points, seed=7)
+    for threads in (1, 2, 3):
+        again = track(settings, image, target, points, seed=7, threads=threads)
+        np.testing.assert_array_equal(again.xy, first.xy)
+        np.testing.assert_array_equal(again.valid, first.valid)
+        np.testing.assert_array_equal(again.cost, first.cost)
+    assert (track(settings, image, target, points, seed=8).cost != first.cost).any()
+
+
+def test_without_propagation_points_are_independent():
+    image = picture(7)
+    target, _ = moved(image, tx=9)
+    points = grid()
+    settings = FlowSettings(search="emfoa")
+    everything, first = track(settings, image, target, points), track(settings, image, target, points[:10])
+    np.testing.assert_array_equal(everything.xy[:10], first.xy)
+
+
+def test_common_motions_finds_two_similarities_among_noise():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, (640, 480), (400, 2)).astype(np.float32)
+    labels = rng.uniform(-80, 80, (400, 4)).astype(np.float32)
+    motions = np.array([[1.1, 0.2, 15, -40], [0.9, -0.1, -30, 60]])
+    for k, part in enumerate((np.s_[:160], np.s_[160:260])):
+        a, b, tx, ty = motions[k]
+        moved_to = points[part] @ np.array([[a, b], [-b, a]]) + (tx, ty)
+        labels[part, :2] = moved_to - points[part] + rng.normal(0, 0.5, moved_to.shape)
+    costs = np.where(np.arange(400) < 260, rng.integers(0, 1000, 400), rng.integers(800, 3000, 400))
+    found = np.empty((2, 4), np.float32)
+    common_motions(points, labels, costs, 192, np.float32(5), np.uint64(1), found)
+    np.testing.assert_allclose(found[:, :2], motions[:, :2], atol=0.03)
+    common_motions(points[:3], labels[:3], costs[:3], 192, np.float32(5), np.uint64(1), found)
+    assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ["identical", "black", "textureless", "black target", "gradient"])
+def test_images_that_say_nothing_give_no_valid_rows(method, kind):
+    image = picture(8)
+    ramp = np.tile(np.linspace(0, 60, 320), (240, 1)).astype(np.uint8)
+    first, second = {
+        "identical": (image, image.copy()),
+        "black": (np.zeros_like(image), np.zeros_like(image)),
+        "textureless": (np.full_like(image, 100), np.full_like(image, 140)),
+        "black target": (image, np.zeros_like(image)),
+        "gradient": (ramp, np.full_like(image, 7)),
+    }[kind]
+    points = grid()
+    result = track(FlowSettings(method=method), first, second, points)
+    assert result.xy.shape == points.shape and np.isfinite(result.xy).all()
+    assert not result.valid.any() or (method == "dis" and kind in ("black target", "gradient"))
+    assert result.stats["valid"] == result.valid.sum()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_unusable_points_and_guesses_are_not_valid_and_disturb_nobody(method):
+    image = picture(9)
+    target, matrix = moved(image, tx=3, ty=2)
+    good = grid(margin=40)
+    bad = np.array([[np.nan, 3], [-5, 10], [1e9, 1e9], [319.9, 50], [np.inf, 0], [100, 240]], np.float32)
+    points = np.concatenate([bad, good])
+    guess = np.full_like(points, np.nan)
+    guess[-5:] = 1e20
+    guess[-10:-5] = np.inf
+    result = track(FlowSettings(method=method), image, target, points, guess=guess)
+    assert not result.valid[: len(bad)].any() and np.isfinite(result.xy[result.valid]).all()
+    truth = good @ matrix[:, :2].T + matrix[:, 2]
+    error = np.hypot(*(result.xy[len(bad) :] - truth).T)
+    assert (error < 1.5)[:-10].mean() > 0.95
+    corners = np.array([[0, 0], [319, 0], [0, 239], [319, 239]], np.float32)
+    at_border = track(FlowSettings(method=method), image, target, corners)
+    assert at_border.xy.shape == (4, 2) and np.isfinite(at_border.xy[at_border.valid]).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_few_points(method, count):
+    image = picture(10)
+    target, _ = moved(image, tx=2)
+    result = track(FlowSettings(method=method), image, target, grid()[:count])
+    assert result.xy.shape == (count, 2) and result.valid.shape == (count,) and result.cost.shape == (count,)
+    assert result.stats["points"] == count
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (9, 17), (33, 47)])
+@pytest.mark.parametrize("method", METHODS)
+def test_tiny_images(method, shape):
+    rng = np.random.default_rng(0)
+    first, second = (rng.integers(0, 255, shape, dtype=np.uint8) for _ in range(2))
+    points = rng.uniform(0, np.array(shape[::-1]) - 1, (7, 2)).astype(np.float32)
+    result = track(FlowSettings(method=method), first, second, points)
+    assert result.xy.shape == (7, 2) and np.isfinite(result.xy[result.valid]).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods_behind_the_interface(method):
+    flow = build_flow(FlowSettings(method=method))
+    assert isinstance(flow, FlowEstimator)
+    image = picture(11)
+    target, matrix = moved(image, 1.01, 1, 4, -3)
+    points = grid()
+    result = flow.track(flow.prepare(image), flow.prepare(target), points)
+    truth = points @ matrix[:, :2].T + matrix[:, 2]
+    error = np.hypot(*(result.xy - truth).T)
+    assert result.xy.dtype == np.float32 and result.valid.dtype == bool and result.cost.dtype == np.float32
+    assert (error[result.valid] < 1.0).mean() > 0.98 and result.valid.mean() > 0.9
+
+
+def test_the_way_back_rejects_what_is_covered():
+    image, cover = picture(12), picture(13)
+    target, _ = moved(image, tx=5)
+    target[80:160, 100:220] = cover[80:160, 100:220]
+    points = grid()
+    hidden = ((points > (112, 92)) & (points < (200, 148))).all(axis=1)
+    for method in ("daisy", "lucas-kanade"):
+        result = track(FlowSettings(method=method), image, target, points)
+        assert result.valid[hidden].mean() < 0.2 < 0.8 < result.valid[~hidden].mean()
+
+
+def test_images_of_different_size_are_refused():
+    flow = build_flow()
+    with pytest.raises(ValueError, match="differ in size"):
+        flow.track(flow.prepare(picture(0)), flow.prepare(picture(0, (120, 160))), grid())
+
+
+def test_settings_describe_the_search_space():
+    known = {p.name: p for p in parameters(FlowSettings)}
+    assert known["budget"].online and known["budget"].low == 24
+    assert set(known["search"].choices) == set(SEARCHES)
+    assert ("method", ("daisy",)) in known["population"].when
+    for parameter in known.values():
+        assert all(name in known for name, _ in parameter.when)
+    assert apply_overrides(FlowSettings(), {"budget": "120"}).budget == 120
+    with pytest.raises(SettingsError, match="did you mean"):
+        apply_overrides(FlowSettings(), {"budgte": 3})
+    with pytest.raises(SettingsError, match="search"):
+        apply_overrides(FlowSettings(), {"search": "annealing"})
+
+
+def test_plugins(tmp_path):
+    path = tmp_path / "my_flow.py"
+    path.write_text(
+        "from dynslam_bench.flow.spec import FlowSpec\n"
+        "from dynslam_bench.flow.lucas_kanade import LucasKanadeFlow\n"
+        f"SPEC = FlowSpec('mine', {str(path)!r} + ':make')\n"
+        f"BROKEN = FlowSpec('broken', {str(path)!r} + ':boom')\n"
+        f"WRONG = FlowSpec('wrong', {str(path)!r} + ':wrong')\n"
+        "def make(settings, *, device, threads):\n    return LucasKanadeFlow(settings)\n"
+        "def boom(settings, *, device, threads):\n    raise RuntimeError('no')\n"
+        "def wrong(settings, *, device, threads):\n    return 3\n"
+    )
+    assert {found.spec.id for found in FLOWS.all()} >= {"daisy", "lucas-kanade", "dis"}
+    assert isinstance(build_flow(FlowSettings(plugin=f"{path}:SPEC")), FlowEstimator)
+    for name in ("BROKEN", "WRONG"):
+        with pytest.raises(PluginError):
+            build_flow(FlowSettings(plugin=f"{path}:{name}"))
+    with pytest.raises(PluginError, match="unknown flow"):
+        build_flow(FlowSettings(plugin="raft"))
