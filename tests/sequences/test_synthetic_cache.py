@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.synthetic import compiled, open_synthetic, render_synthetic
 from dynslam_bench.sequences.synthetic.people import draw_person
 from dynslam_bench.sequences.synthetic.plan import plan_room
@@ -129,6 +130,18 @@ def test_damaged_files_are_rendered_again(tmp_path: Path, kind: str, damage: str
     assert np.array_equal(fresh.masks[1].instances, masks.instances)
     assert fresh.render() <= 2
     assert is_intact_png(path.read_bytes())
+
+
+def test_the_cache_is_a_folder_in_tum_layout(tmp_path: Path) -> None:
+    """The folder reader, which knows nothing of rendering, gives the same frames, poses and camera."""
+    sequence = open_synthetic("synthetic/walking_halfsphere?frames=3", tmp_path, threads=1)
+    sequence.render()
+    folder = open_sequence(sequence.store.folder)
+    assert len(folder) == 3 and folder.camera == sequence.camera
+    for index in range(3):
+        assert frame_hash(folder[index]) == frame_hash(sequence[index])
+    assert np.abs(folder.ground_truth.T_world_cam - sequence.ground_truth.T_world_cam).max() < 1e-8
+    assert np.array_equal(folder.timestamps, sequence.timestamps)
 
 
 def test_two_processes_may_render_the_same_sequence(tmp_path: Path) -> None:

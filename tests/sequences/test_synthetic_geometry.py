@@ -183,3 +183,17 @@ def test_lighting_options_change_colours_only(option: str, walking) -> None:
     assert np.abs(changed.rgb.astype(int) - plain.rgb).mean() > 3
     assert np.array_equal(sequence.exact_depth(45), walking.exact_depth(45))
     assert np.array_equal(sequence.masks[45].instances, walking.masks[45].instances)
+
+
+@pytest.mark.parametrize("instance", [0, 55, 100, 199])
+def test_people_fill_enough_of_walking_and_leave_enough_free(instance: int) -> None:
+    sequence = open_synthetic(f"synthetic/walking_xyz@{instance}", None, threads=1)
+    people, moving = [], []
+    for index in range(5, 600, 54):
+        masks = sequence.masks[index]
+        people.append(np.isin(masks.instances, (1, 2)).mean())
+        moving.append(np.isin(masks.instances, list(masks.moving)).mean())
+    assert 0.15 < np.mean(people) < 0.45
+    assert np.mean(moving) > 0.1
+    assert max(people) < 0.62
+    assert min(people) < 0.1, "both are out of view, or nearly, at some time"

@@ -22,6 +22,9 @@ from dynslam_bench.core.records import write_atomic
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.cameras import write_camera
+
+from .settings import FPS
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _KINDS = ("masks", "depth", "rgb")
@@ -148,12 +151,7 @@ class FrameStore:
                 f"{t:.6f} " + " ".join(f"{x:.9f}" for x in row) for t, row in zip(truth.timestamps, rows, strict=True)
             ]
             write_atomic(poses, "\n".join(lines) + "\n")
-        c = self.camera
-        write_atomic(
-            self.folder / "camera.toml",
-            f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
-            f"distortion = [0.0, 0.0, 0.0, 0.0, 0.0]\ndepth_factor = {c.depth_factor}\nbaseline_m = {c.baseline_m}\n",
-        )
+        write_camera(self.folder / "camera.toml", self.camera, fps=FPS)
 
     def _listed(self, kind: str) -> set[str]:
         path = self.folder / f"{kind}.txt"
