@@ -79,8 +79,9 @@ def train(
 ) -> TrainResult:
     """Train a network.
 
-    `output` receives ``best.pt`` (weights), ``last.pt`` (everything needed to go on), ``curve.csv``, ``curve.png`` and
-    ``settings.json``. A run that is started again with the same settings goes on where it stopped.
+    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging), ``last.pt``
+    (everything needed to go on), ``curve.csv``, ``curve.png`` and ``settings.json``. A run that is started again with
+    the same settings goes on where it stopped.
 
     Args:
         settings: Network, data and schedule.
@@ -262,6 +263,7 @@ class _Run:
         if row["iou"] > self.best["iou"]:
             self.best = {"iou": row["iou"], "step": float(self.step)}
             save_network(self.average, self.output / "best.pt")
+            save_network(self.average, self.output / "best-half.pt", half=True)
         curve.write_csv(self.rows, self.output / "curve.csv")
         title = f"{self.settings.network}, {'CFPN' if self.settings.cfpn else 'FPN'}: losses and validation scores"
         curve.draw(self.rows, self.output / "curve.png", title=title, losses=("loss", *LOSSES),

@@ -1,0 +1,101 @@
+"""Time of every segmenter on one 640x480 frame, and of carrying masks; prints a Markdown table.
+
+Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--threads 2] [--repeats 7]``. Wall times are
+medians; user CPU time stands beside them, because wall times of a busy machine mean little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from dynslam_bench.segmentation.build import build_segmenter
+from dynslam_bench.segmentation.carry import carry_dense, carry_sparse
+from dynslam_bench.segmentation.checkpoints import embedded_weights
+from dynslam_bench.segmentation.mask_rcnn import MaskRCNNSegmenter
+from dynslam_bench.segmentation.network import MaskRCNN
+from dynslam_bench.segmentation.network_config import NetworkConfig, resnet18_config
+from dynslam_bench.segmentation.postprocess import dynamic_mask
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.frame import Frame
+
+WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
+
+
+def measure(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median wall and CPU milliseconds after one warm-up."""
+    work()
+    wall, cpu = [], []
+    for _ in range(repeats):
+        start, used = time.perf_counter(), time.process_time()
+        work()
+        wall.append(1000 * (time.perf_counter() - start))
+        cpu.append(1000 * (time.process_time() - used))
+    return statistics.median(wall), statistics.median(cpu)
+
+
+def untrained(config: NetworkConfig, side: int, threads: int, objects: int) -> MaskRCNNSegmenter:
+    """A network with random weights that gives `objects` detections, so that the mask branch has its usual work."""
+    torch.manual_seed(0)
+    network = MaskRCNN(config.model_copy(update={"max_detections": objects, "classes": ("person",) * 90}))
+    network.roi_heads.config = network.config
+    network.set_input(side)
+    return MaskRCNNSegmenter(network, SegmentationSettings(), threads=threads, floor=0.0)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--objects", type=int, default=3)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(arguments.threads)
+    sequence = open_sequence("synthetic/walking_xyz@120?frames=60")
+    frames = [sequence[index] for index in (30, 31)]
+    grays = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY) for frame in frames]
+    rows: list[tuple[str, Callable[[], object]]] = []
+
+    def add(label: str, segmenter: object) -> None:
+        frame: Frame = frames[0]
+        rows.append((label, lambda: segmenter.segment(frame)))  # type: ignore[attr-defined]
+
+    for side in (480, 800):
+        network = untrained(NetworkConfig(), side, arguments.threads, arguments.objects)
+        add(f"Mask R-CNN, ResNet-50, CFPN, shorter side {side}", network)
+    network = untrained(resnet18_config(), 480, arguments.threads, arguments.objects)
+    add("Mask R-CNN, ResNet-18, CFPN, shorter side 480", network)
+    if embedded_weights() is not None:
+        add("embedded (half-width ResNet-18, CFPN, 320x240)",
+            build_segmenter(SegmentationSettings(source="embedded"), threads=arguments.threads))  # fmt: skip
+    for name in ("yolov8n-seg_480x640_fp32", "deeplabv3_mnv2_voc_481x641"):
+        if (WEIGHTS / f"{name}.onnx").is_file():
+            settings = SegmentationSettings(source=f"onnx:{WEIGHTS / name}.onnx")
+            add(name, build_segmenter(settings, threads=arguments.threads))
+    oracle = build_segmenter(SegmentationSettings(source="oracle"), masks=sequence.masks)
+    assert oracle is not None
+    found = oracle.segment(frames[0])
+    depth = np.ascontiguousarray(frames[0].depth)
+    rows.append((f"carry {len(found)} masks, dis", lambda: carry_dense(found, *grays)))
+    rows.append((f"carry {len(found)} masks, sparse", lambda: carry_sparse(found, *grays)))
+    rows.append(("dilation by 15 px", lambda: dynamic_mask(found, SegmentationSettings())))
+    rows.append(("depth repair and dilation", lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth)))
+    print(f"{os.cpu_count()} cores, {arguments.threads} threads, load {os.getloadavg()[0]:.1f}, "
+          f"torch {torch.__version__}, OpenCV {cv2.__version__}\n")  # fmt: skip
+    print("| stage | wall ms | CPU ms |\n| --- | --- | --- |")
+    for label, work in rows:
+        wall, cpu = measure(work, arguments.repeats)
+        print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
