@@ -3,8 +3,8 @@
     python tests/benchmarks/evaluation_agreement.py --scripts DIR ESTIMATE GROUNDTRUTH [ESTIMATE GROUNDTRUTH ...]
 
 DIR holds `associate.py`, `evaluate_ate.py` and `evaluate_rpe.py` of the benchmark (a Python 3 port comes with evo's
-source distribution, `test/tum_benchmark_tools`, trajectories in `test/data`). What keeps them from running on Python 3 and
-NumPy 2 (`numpy.linalg.linalg`, `keys.sort()` of a dictionary's keys) is mended in a temporary copy.
+source distribution, `test/tum_benchmark_tools`, trajectories in `test/data`). What keeps them from running on Python 3
+and NumPy 2 (`numpy.linalg.linalg`, `keys.sort()` of a dictionary's keys) is mended in a temporary copy.
 """
 
 import argparse
