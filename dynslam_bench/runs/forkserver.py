@@ -102,8 +102,11 @@ class ForkServer:
         if self._socket is not None and self._owner == os.getpid():
             self._socket.close()
             if self._process is not None:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(timeout=5)
+                try:
+                    self._process.wait(timeout=1)
+                except subprocess.TimeoutExpired:  # still importing
+                    self._process.kill()
+                    self._process.wait()
         self._socket, self._process = None, None
 
 
@@ -207,3 +210,4 @@ def _preload() -> None:
 
 if __name__ == "__main__":
     serve(int(sys.argv[1]))
+    os._exit(0)  # nothing is left to clean up, and the libraries take long to say goodbye

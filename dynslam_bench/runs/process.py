@@ -137,10 +137,10 @@ def start_child() -> Child:
 
 
 def resident_mb(pid: int) -> float:
-    """Resident memory of a process and its descendants in its process group, MB; 0 if it is gone."""
+    """Resident memory in MB of a process and (on Linux) its descendants; 0 if it is gone."""
     if _PROC.is_dir():
         return sum(_linux_rss_mb(member) for member in _group_members(pid))
-    result = subprocess.run(["ps", "-o", "rss=", "-g", str(pid)], capture_output=True, text=True, check=False)
+    result = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False)
     return sum(float(line) for line in result.stdout.split()) * 1024 / 1e6
 
 

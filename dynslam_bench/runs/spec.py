@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, field_validator
 
 from dynslam_bench.core.records import Record
+from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 
 
 class Limits(Record):
@@ -36,7 +37,7 @@ class RunSpec(Record):
         tracker: Id, ``id:value``, ``module:Attr`` or ``file.py:Attr``.
         sequence: Id or path of a folder in TUM layout.
         settings: Overrides of the tracker's settings, dotted name to value.
-        frames: Part of the sequence, ``(start, stop)``; None for all.
+        frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
         stride: Take every so many frames.
         seed: Seed of everything random.
         device: ``auto``, ``cpu`` or ``cuda:N``.
@@ -71,6 +72,14 @@ class RunSpec(Record):
     video: bool = False
     limits: Limits = Field(default_factory=Limits)
 
+    @field_validator("frames", mode="before")
+    @classmethod
+    def _read_frames(cls, value: object) -> object:
+        """``"A:B"`` is read as a pair; the whole sequence is None, however it is written."""
+        if isinstance(value, str):
+            value = parse_frames(value)
+        return None if value in ((0, None), [0, None]) else value
+
     def absolute(self) -> RunSpec:
         """The same run, named independently of the working folder."""
         return self.model_copy(
@@ -97,8 +106,6 @@ def absolute_target(tracker: str) -> str:
 def _absolute_folder(sequence: str) -> str:
     if sequence.startswith((".", "~", os.sep)):
         return str(Path(sequence).expanduser().absolute())
-    from dynslam_bench.sequences.catalogue import entry_of
-
     known = sequence.startswith("synthetic/") or entry_of(sequence) is not None
     return str(Path(sequence).absolute()) if not known and Path(sequence).is_dir() else sequence
 

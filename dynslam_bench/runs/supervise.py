@@ -82,6 +82,7 @@ class _Watch:
         self.final: Message = {}
         self.peak_mb = 0.0
         self.stop_sent: float | None = None
+        self.next_look = 0.0
 
     def run(self) -> Verdict:
         open_connection = True
@@ -155,6 +156,9 @@ class _Watch:
         patience = limits.start_s if self.frame < 0 else limits.frame_s
         if now - self.sign_of_life > patience:
             return self._verdict("timeout", f"no sign of life for {patience:g} s, {self._where()}")
+        if now < self.next_look:
+            return None
+        self.next_look = now + _POLL_S
         used = resident_mb(self.child.pid) if self.child.pid else 0.0
         self.peak_mb = max(self.peak_mb, used)
         if limits.memory_mb is not None and used > limits.memory_mb:
