@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -31,10 +32,12 @@ def build_sampler(spec: StudySpec) -> optuna.samplers.BaseSampler:
     if spec.sampler == "random":
         return optuna.samplers.RandomSampler(seed=spec.sampler_seed)
     if spec.sampler == "tpe":
-        return optuna.samplers.TPESampler(
-            n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2), multivariate=True, group=True,
-            constant_liar=True, **options,
-        )  # fmt: skip
+        with warnings.catch_warnings():  # `group` (for conditional spaces) counts as experimental
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            return optuna.samplers.TPESampler(
+                n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2), multivariate=True, group=True,
+                constant_liar=True, **options,
+            )  # fmt: skip
     if spec.sampler == "nsga2":
         return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), **options)
     if spec.sampler == "gp":

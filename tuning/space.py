@@ -43,7 +43,7 @@ def search_space(settings: type[Settings], spec: SpaceSpec) -> list[Parameter]:
     tuned = {parameter.name for parameter in chosen}
     chosen = [parameter for parameter in chosen if _possible(parameter, base, tuned)]
     if not chosen:
-        raise StudyError("the space is empty: every matching setting is excluded, fixed, or switched off by a fixed one")
+        raise StudyError("the space is empty: all that matches is excluded, fixed, or switched off by a fixed value")
     return sorted(chosen, key=lambda parameter: len(parameter.when) > 0)
 
 

@@ -1,0 +1,247 @@
+"""Studies on a toy tracker whose best setting is known."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+import toy_tracker
+from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
+from dynslam_bench.tuning.dominance import hopeless
+from dynslam_bench.tuning.final_runs import paired_ratio
+from dynslam_bench.tuning.objective import Instance, Outcome
+from dynslam_bench.tuning.space import distribution
+from dynslam_bench.tuning.study import CRASHED_WORKER
+from dynslam_bench.tuning.study_file import SpaceSpec
+from optuna.trial import TrialState
+
+from dynslam_bench.core.errors import DynslamError, StudyError
+from dynslam_bench.runs import RunStore
+
+TRACKER = f"{toy_tracker.__file__}:SPEC"
+
+
+@pytest.fixture(scope="module")
+def sequences(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    root = tmp_path_factory.mktemp("toys")
+    return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(4)]
+
+
+def make(sequences: list[str], **changes: object) -> StudySpec:
+    values: dict[str, object] = {
+        "name": "toy", "tracker": TRACKER, "tune": sequences[:2], "held_out": sequences[2:], "trials": 10,
+        "space": {"include": ["gain", "wobble"]}, "seeds": [0], "top": 2, "pruner": "none", "min_coverage": None,
+    }  # fmt: skip
+    return StudySpec.model_validate({**values, **changes})
+
+
+def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_path: Path) -> None:
+    tuner = run_study(make(sequences, trials=14), results=tmp_path)
+    trials = tuner.study.get_trials()
+    assert len(trials) == 14 and all(trial.state == TrialState.COMPLETE for trial in trials)
+    assert trials[0].params == {"gain": 1.5, "wobble": 2}, "trial 0 is the default"
+    assert trials[0].value == pytest.approx(0.0, abs=1e-12), "the default's ratio to itself is one"
+    best = tuner.study.best_trial
+    assert best.value < -0.5 and abs(math.log(best.params["gain"])) < math.log(1.3)
+    summary = finish(tuner)
+    assert summary.improves and summary.candidates[0].held_out.high < 1
+    assert summary.importances["gain"] > summary.importances["wobble"]
+    page = write_page(tuner, summary).read_text()
+    assert "better than the default" in page and "https://" not in page.split("<script>")[0]
+    from dynslam_bench.cli.options import read_settings
+
+    preset = read_settings(tuner.folder / "best.toml")
+    assert preset == {name: preset[name] for name in ("gain", "wobble")}
+    assert abs(math.log(preset["gain"])) < math.log(1.3)
+
+
+def test_an_untunable_study_says_that_it_did_not_help(sequences: list[str], tmp_path: Path) -> None:
+    spec = make(sequences, space={"include": ["wobble"], "fixed": {"gain": 1.0}}, trials=4, sampler="random")
+    tuner = run_study(spec, results=tmp_path)
+    summary = finish(tuner)
+    held = summary.candidates[0].held_out
+    assert summary.improves == (held.high < 1)
+    assert held.verdict in summary.conclusion
+
+
+def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> None:
+    tuner = run_study(make(sequences, trials=3), results=tmp_path)
+    stored = {record.run_id for record in RunStore(tmp_path).list()}
+    for trial in tuner.study.get_trials():
+        named = {run_id for _, _, run_id, *_ in trial.user_attrs["instances"]}
+        assert len(named) == 2 and named <= stored
+
+
+def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_path: Path) -> None:
+    spec = make(sequences, space={"include": ["mode", "anger"]}, trials=8, sampler="random")
+    tuner = run_study(spec, results=tmp_path)
+    failed = tuner.study.get_trials(states=(TrialState.FAIL,))
+    assert failed, "a random sampler draws 'crash' within eight trials"
+    for trial in failed:
+        assert trial.params["mode"] == "crash" and "anger" in trial.params
+        assert "the toy broke" in trial.user_attrs["reason"]
+    for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,)):
+        assert trial.params == {"mode": "fine"}, "a switched-off parameter is not drawn"
+
+
+@pytest.mark.parametrize("pruner", ["median", "hyperband", "wilcoxon"])
+def test_pruners_end_hopeless_trials(sequences: list[str], tmp_path: Path, pruner: str) -> None:
+    spec = make(sequences, tune=sequences, held_out=[], trials=16, sampler="random", pruner=pruner, seeds=[0, 1])
+    tuner = run_study(spec, results=tmp_path)
+    trials = tuner.study.get_trials()
+    assert trials[0].state == TrialState.COMPLETE
+    ended = [t for t in trials if t.state == TrialState.PRUNED or "early_stopped" in t.user_attrs]
+    runs = sum(len(trial.user_attrs.get("instances", [])) for trial in trials)
+    assert ended and runs < 16 * 8
+    assert tuner.study.best_trial not in ended
+
+
+def test_several_objectives_with_early_ends(sequences: list[str], tmp_path: Path) -> None:
+    spec = make(sequences, tune=sequences, held_out=[], objectives=["accuracy", "speed"], trials=10, sampler="nsga2")
+    tuner = run_study(spec, results=tmp_path)
+    assert all(len(trial.values) == 2 for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,)))
+    summary = finish(tuner)
+    assert "early" not in str(summary.candidates[0])
+    assert "front" in write_page(tuner, summary).read_text()
+
+
+def test_hopeless_needs_dominance_by_the_optimistic_bound() -> None:
+    done = optuna.trial.create_trial(values=[-1.0, 5.0], user_attrs={"constraints": {}})
+    names = ("accuracy", "speed")
+    assert hopeless([0.5, 0.4], 4.0, range(3), [done], names)
+    assert not hopeless([0.5, 0.4], 6.0, range(3), [done], names), "it is faster"
+    assert not hopeless([-2.0, -2.0], 4.0, range(3), [done], names), "it is more accurate"
+    broken = optuna.trial.create_trial(values=[-1.0, 5.0], user_attrs={"constraints": {"fps": 1.0}})
+    assert not hopeless([0.5, 0.4], 4.0, range(3), [broken], names), "what violates a constraint dominates nothing"
+
+
+def test_constraints_decide_who_is_a_candidate(sequences: list[str], tmp_path: Path) -> None:
+    tuner = run_study(make(sequences, trials=4, min_fps=1e9), results=tmp_path)
+    for trial in tuner.study.get_trials():
+        assert trial.user_attrs["constraints"]["fps"] > 0
+    assert not finish(tuner).candidates[0].feasible
+
+
+WORKER = """
+import sys
+from dynslam_bench.tuning import StudySpec, run_study
+if __name__ == "__main__":
+    run_study(StudySpec.model_validate_json(sys.argv[1]), results=sys.argv[2])
+"""
+
+
+def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_path: Path) -> None:
+    spec = make(sequences, trials=12)
+    script = tmp_path / "worker.py"
+    script.write_text(WORKER)
+    checkout = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": checkout}
+    child = subprocess.Popen(
+        [sys.executable, str(script), spec.model_dump_json(), str(tmp_path)], env=environment, start_new_session=True
+    )
+    journal = tmp_path / "studies" / "toy" / "journal.log"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not (journal.exists() and journal.read_text().count('"op_code":6') >= 3):
+        time.sleep(0.1)  # until three trials were told
+        assert child.poll() is None, "the worker ended before it could be killed"
+    os.killpg(child.pid, signal.SIGKILL)
+    child.wait()
+    before = {t.number: t.values for t in Tuner(spec, tmp_path).study.get_trials() if t.state == TrialState.COMPLETE}
+    tuner = run_study(spec, results=tmp_path)
+    after = tuner.study.get_trials()
+    assert len(before) >= 3
+    assert all(after[number].values == values for number, values in before.items()), "no finished trial was lost"
+    lost = [trial for trial in after if trial.user_attrs.get("reason") == CRASHED_WORKER]
+    assert len(lost) <= 1 and len(after) == 12 + len(lost), "none doubled"
+    assert [trial.number for trial in after] == list(range(len(after)))
+
+
+def test_jobs_share_a_study(sequences: list[str], tmp_path: Path) -> None:
+    tuner = run_study(make(sequences, trials=9), results=tmp_path, jobs=3)
+    assert len(tuner.study.get_trials()) == 9
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"space": {"include": ["gian"]}}, "'gian' matches no tunable setting.*'gain'"),
+        ({"space": {"include": ["plain"]}}, "it exists, but is not tunable"),
+        ({"space": {"include": ["gain"], "exclude": ["gain"]}}, "the space is empty"),
+        ({"space": {"include": ["anger"], "fixed": {"mode": "fine"}}}, "the space is empty"),
+        ({"space": {"include": ["gain"], "fixed": {"wobbel": 1}}}, "unknown setting 'wobbel'.*'wobble'"),
+        ({"space": {"include": ["gain"], "fixed": {"wobble": 99}}}, "wobble.*99"),
+        ({"tracker": "tyo-tracker"}, "unknown tracker"),
+        ({"tune": ["synthetic/wlaking_xyz"]}, "wlaking_xyz"),
+        ({"storage": "sqlite:////no/such/folder/x.db"}, "cannot open the storage"),
+        ({"space": {"include": ["gain"], "fixed": {"mode": "crash"}}}, "the default settings fail.*the toy broke"),
+    ],
+)
+def test_bad_studies_are_refused_before_any_trial(
+    sequences: list[str], tmp_path: Path, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(DynslamError, match=message):
+        run_study(make(sequences, **changes), results=tmp_path)
+    journal = tmp_path / "studies" / "toy" / "journal.log"
+    assert not journal.exists() or '"op_code":4' not in journal.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trails = 3\n", "unknown key 'trails'.*'trials'"),
+        ("[space]\ninclud = []\n", "unknown key 'space.includ'.*space.include"),
+        ('held_out = ["synthetic/walking_xyz@0?frames=50"]\n', "share 1 sequences.*walking_xyz"),
+        ("trials = 1\n", "trials.*greater than or equal to 2"),
+        ("trials = = 1\n", "is not TOML"),
+    ],
+)
+def test_bad_study_files_are_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text('tune = ["synthetic/walking_xyz@0"]\n' + text)
+    with pytest.raises(StudyError, match=message):
+        read_study(path)
+
+
+def test_resuming_something_else_is_refused_with_the_difference(sequences: list[str], tmp_path: Path) -> None:
+    run_study(make(sequences, trials=2), results=tmp_path)
+    with pytest.raises(StudyError, match=r"stored with other seeds: \[0\] there, \[0, 1\] here"):
+        run_study(make(sequences, trials=2, seeds=[0, 1]), results=tmp_path)
+    more = run_study(make(sequences, trials=3), results=tmp_path)
+    assert len(more.study.get_trials()) == 3, "more trials of the same study are welcome"
+
+
+def test_space_of_a_real_tracker_can_be_drawn() -> None:
+    from dynslam_bench.core.settings import apply_overrides, flatten
+    from dynslam_bench.trackers import TRACKERS
+
+    settings = TRACKERS.get("emfoa-oft").settings
+    space = search_space(settings, SpaceSpec(include=("flow.*", "epipolar.*", "segmentation.*"), fixed={}))
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(20):
+        values = suggest(study.ask(), space, flatten(settings()))
+        apply_overrides(settings(), values)  # every drawn configuration is valid
+    assert all(distribution(parameter) is not None for parameter in space)
+
+
+def test_paired_ratio_covers_the_truth() -> None:
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(60):
+        instances = [Instance(f"s{i}", seed) for i in range(8) for seed in range(2)]
+        effect = {f"s{i}": rng.normal(math.log(0.8), 0.2) for i in range(8)}
+        default = {i: Outcome(i, "", 0.02, 1.0, 0.03, 1.0) for i in instances}
+        tuned = {
+            i: Outcome(i, "", 0.02 * math.exp(effect[i.sequence] + rng.normal(0, 0.05)), 1.0, 0.03, 1.0)
+            for i in instances
+        }
+        found = paired_ratio(tuned, default, instances)
+        hits += found.low <= 0.8 <= found.high
+    assert hits >= 48
