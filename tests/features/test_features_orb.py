@@ -51,12 +51,8 @@ def test_features_cover_the_image_better_than_plain_orb():
     image[:, :320] = cv2.addWeighted(image[:, :320], 0.15, np.full((480, 320), 120, np.uint8), 0.85, 0)  # weak half
     ours = OrbExtractor(FeatureSettings(n_features=500)).extract(image).xy
     plain = np.array([k.pt for k in cv2.ORB_create(500).detect(image)])
-
-    def occupied(xy):
-        return len(set(map(tuple, (xy // 40).astype(int))))
-
-    assert occupied(ours) > 1.2 * occupied(plain)
-    assert np.count_nonzero(ours[:, 0] < 320) > 150
+    weak = [np.count_nonzero(xy[:, 0] < 320) for xy in (ours, plain)]
+    assert weak[0] > 100 and weak[0] > 5 * weak[1]
 
 
 def test_weak_corners_count_only_in_cells_without_strong_ones():
