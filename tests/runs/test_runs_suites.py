@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.runs import RunSpec
 from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
 from dynslam_bench.suites import load_suite, suite_names
 from dynslam_bench.trackers.registry import TRACKERS
@@ -88,3 +89,11 @@ def test_unknown_suites(tmp_path: Path) -> None:
         load_suite("dynamics")
     with pytest.raises(RunError, match="cannot read"):
         load_suite(tmp_path / "none.toml")
+
+
+def test_frames_of_a_run_are_read_however_they_are_written() -> None:
+    ways = [(0, 30), [0, 30], "0:30", ":30"]
+    assert {RunSpec(tracker="x", sequence="y", frames=way).frames for way in ways} == {(0, 30)}
+    assert {RunSpec(tracker="x", sequence="y", frames=way).frames for way in (None, ":", "0:", (0, None))} == {None}
+    with pytest.raises(DynslamError, match=r"5:2"):
+        RunSpec(tracker="x", sequence="y", frames="5:2")
