@@ -47,6 +47,7 @@ class Board:
         trackers: Variant keys in order of standing.
         labels: Variant key to the name in tables.
         sequences: Sequence keys with ground truth, grouped and sorted.
+        short: Sequence key to what is left of it without the parts that all share.
         groups: Sequence key to the name of its group.
         unscored: Sequence keys without ground truth.
         cells: Variant key to sequence key to its runs.
@@ -62,6 +63,7 @@ class Board:
     trackers: list[str] = field(default_factory=list)
     labels: dict[str, str] = field(default_factory=dict)
     sequences: list[str] = field(default_factory=list)
+    short: dict[str, str] = field(default_factory=dict)
     groups: dict[str, str] = field(default_factory=dict)
     unscored: list[str] = field(default_factory=list)
     cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
@@ -122,6 +124,7 @@ def make_board(rows: Sequence[RunRow], reference: str = "orb-slam2") -> Board:
         board.groups = dict.fromkeys(board.groups, "")
     order = {name: position for position, (_, name) in enumerate(_GROUPS)}
     board.sequences = sorted(board.never_move, key=lambda key: (order.get(board.groups[key], 9), key))
+    board.short = shortened(board.sequences)
     for key in board.labels:
         board.cells[key] = {
             sequence: _cell([row for row in rows if row.variant_key == key and row.sequence_key == sequence])
@@ -189,6 +192,25 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
         base = f"{row.label} <{row.tracker}>" if same_label else row.label
         labels[key] = base + (f" · {', '.join(parts)}" if parts else "")
     return labels
+
+
+def shortened(names: Sequence[str]) -> dict[str, str]:
+    """Names without the folders, and without the ``@...`` or ``?...`` behind them, that all of them share."""
+    if len(names) < 2:
+        return {name: name for name in names}
+    folders = [name.split("@")[0].split("?")[0].split("/")[:-1] for name in names]
+    shared = 0
+    while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
+        shared += 1
+    tails = {name[len(_stem(name)) :] for name in names}
+    short = {name: "/".join(_stem(name).split("/")[shared:]) + ("" if len(tails) == 1 else name[len(_stem(name)) :])
+             for name in names}  # fmt: skip
+    return short if len(set(short.values())) == len(names) else {name: name for name in names}
+
+
+def _stem(name: str) -> str:
+    """A sequence key up to its ``@``, ``?`` or `` [``."""
+    return min((name.partition(mark)[0] for mark in ("@", "?", " [")), key=len)
 
 
 def _cell(rows: list[RunRow]) -> Cell:

@@ -184,8 +184,7 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
     final = tables.metric_table(
         board, lambda row: row.final_ate_m, "final_trajectory", "Error of the final trajectory",
         "Median ATE (RMSE, metres) of the trajectory after loop closing and final optimisation, of the trackers that "
-        "have "
-        f"one; all other tables show the {protocol.trajectory} one.",
+        f"have one; all other tables show the {protocol.trajectory} one.",
     )  # fmt: skip
     if final is not None and protocol.trajectory == "online":
         section.blocks.append(draft.table(final, final.title))
@@ -214,8 +213,7 @@ def _details(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) ->
         draft.figures |= {f"path-{position}": paths, f"error-{position}": errors}
         caption = (
             f"The run with the median error of each tracker, aligned ({protocol.alignment}), seen along the three "
-            f"axes. "
-            "Lines are broken where a gap exceeds twice the median interval. Click a name to show or hide it."
+            "axes. Lines are broken where a gap exceeds twice the median interval. Click a name to show or hide it."
         )
         over_time = "Absolute translational error of the same runs, frame by frame."
         section.blocks.append(

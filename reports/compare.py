@@ -66,8 +66,7 @@ def compare(
     if not shared:
         raise ReportError(
             f"{_name(a)} ({len(rows_a)} runs) and {_name(b)} ({len(rows_b)} runs) have no tracker, settings and "
-            f"sequence "
-            "in common",
+            "sequence in common",
             "compare results of the same suite",
         )
     names = make_labels([row for key in shared for row in by_a[key].values()])
@@ -106,10 +105,8 @@ def compare(
     ]  # fmt: skip
     caption = (
         f"{protocol.describe() if not _is_report(a) else rows_a[0].protocol_id}. Median ATE (metres) over the seeds "
-        f"that both "
-        "have; failures count as a camera that never moves. B / A below 1: B is better. Brackets: 95 % bootstrap "
-        "interval "
-        "over runs and sequences."
+        "that both have; failures count as a camera that never moves. B / A below 1: B is better. Brackets: 95 % "
+        "bootstrap interval over runs and sequences."
     )
     table = Table("paired", f"{_name(a)} (A) against {_name(b)} (B)", caption, columns, rows, separators=separators)
     keys_a = {(key, seed) for key, found in by_a.items() for seed in found}

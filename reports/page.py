@@ -10,7 +10,7 @@ from importlib.resources import files
 from typing import Literal
 
 from jinja2 import Environment, select_autoescape
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from .figures import Figure
 from .table import Table
@@ -86,6 +86,7 @@ def render(
         footer: Last line.
     """
     environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True, lstrip_blocks=True)
+    environment.filters["breakable"] = _breakable
     template = environment.from_string(_resource("report.html.j2"))
     drawn = json.dumps(dict(figures), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return template.render(
@@ -99,6 +100,11 @@ def render(
         figures=Markup(drawn),
         javascript=Markup(_resource("report.js")),
     )
+
+
+def _breakable(name: str) -> Markup:
+    """A heading that may be broken behind its underlines and slashes."""
+    return Markup(str(escape(name)).replace("_", "_<wbr>").replace("/", "/<wbr>"))
 
 
 @cache

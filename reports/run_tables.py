@@ -70,8 +70,7 @@ def repeatability(board: Board) -> Table | None:
         return None
     caption = (
         "How far the runs of one tracker on one sequence lie apart when only the seed differs; 1.00 is a repetition "
-        "to the "
-        "digit. Differences between trackers that are smaller than this are noise."
+        "to the digit. Differences between trackers that are smaller than this are noise."
     )
     return Table("repeatability", "Repeatability", caption, columns, rows)
 

@@ -20,12 +20,14 @@ class Column:
         group: Heading above several neighbouring columns.
         numeric: Whether it holds numbers, aligned to the right.
         meaning: Shown when the pointer rests on the heading.
+        full: Name in CSV, where the heading is shortened; empty for the heading itself.
     """
 
     name: str
     group: str = ""
     numeric: bool = True
     meaning: str = ""
+    full: str = ""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def to_csv(table: Table) -> str:
     """The table as CSV; numbers stand with all their digits."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([f"{column.group}: {column.name}" if column.group else column.name for column in table.columns])
+    writer.writerow([_csv_name(column) for column in table.columns])
     for row in table.rows:
         writer.writerow([_csv_cell(cell) for cell in row])
     return out.getvalue()
@@ -167,6 +169,10 @@ def _markdown_cell(cell: TableCell) -> str:
         text = f"{mark}{text}{mark}"
     parts = [text, _escape_markdown(cell.small), f"({cell.tag})" if cell.tag else ""]
     return " ".join(part for part in parts if part)
+
+
+def _csv_name(column: Column) -> str:
+    return column.full or (f"{column.group}: {column.name}" if column.group else column.name)
 
 
 def _csv_cell(cell: TableCell) -> str | float:

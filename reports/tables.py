@@ -80,11 +80,10 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     total = sum(len(cell.rows) for cells in board.cells.values() for cell in cells.values())
     caption = (
         f"{protocol.describe()}. ATE ratio: geometric mean over {_count(len(board.sequences), 'sequence')} of the "
-        f"median "
-        f"ATE over that of {board.reference_name}; below 1 is better. Brackets: 95 % bootstrap intervals over runs and "
-        f"sequences. A run that failed or was lost counts as a camera that never moves ({imputed} of {total} runs; "
-        "their number stands in parentheses in the next table). Grey rows are shown but not ranked: controls, inspired "
-        "or assumed re-implementations, and trackers that lack sequences."
+        f"median ATE over that of {board.reference_name}; below 1 is better. Brackets: 95 % bootstrap intervals over "
+        f"runs and sequences. A run that failed or was lost counts as a camera that never moves ({imputed} of {total} "
+        "runs; their number stands in parentheses in the next table). Grey rows are shown but not ranked: controls, "
+        "inspired or assumed re-implementations, and trackers that lack sequences."
     )
     table = Table("leaderboard", "Leaderboard", caption, columns, rows, muted)
     if board.ranked and len(board.ranked) < len(rows):
@@ -95,6 +94,8 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
     """Median ATE of every tracker on every sequence, with spread, number of runs and imputed ones."""
     columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
+    sizes = Counter(len(cell.scores) for found in board.cells.values() for cell in found.values())
+    usual = sizes.most_common(1)[0][0]
     medians = {
         key: [_competing(board.cells[key].get(sequence)) for sequence in board.sequences] for key in board.trackers
     }
@@ -108,8 +109,10 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             muted.add(position)
         cells = [TableCell(board.labels[key], tag=_kind_tag(board, key))]
         for at, sequence in enumerate(board.sequences):
-            cells.append(_error_cell(board, board.cells[key].get(sequence), sequence, marks[key][at]))
+            cells.append(_error_cell(board, board.cells[key].get(sequence), sequence, marks[key][at], usual))
         rows.append(cells)
+    if 0 < len(board.ranked) < len(rows):
+        separators.add(len(board.ranked))
     separators.add(len(rows))
     rows.append([TableCell(NEVER_MOVE), *(_never_cell(board, sequence) for sequence in board.sequences)])
     muted.add(len(rows) - 1)
@@ -119,13 +122,10 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             muted.add(len(rows))
             rows.append([TableCell(name, tag="reported"), *_reported_cells(board, name, reported)])
     caption = (
-        "Median ATE (RMSE, metres) over the runs of a cell, behind it half the interquartile range (where there are "
-        "several "
-        "runs), their number n, and in parentheses how many failed and count as a camera that never moves. Colour: "
-        "ratio "
-        f"to {board.reference_name}, from green (a quarter or less) to red (four times or more). Bold best, italic "
-        f"second "
-        f"among ranked trackers. {protocol.describe()}."
+        f"Median ATE (RMSE, metres) over the runs of a cell ({usual} unless n says otherwise), behind it half the "
+        "interquartile range of several runs, and in parentheses how many failed and count as a camera that never "
+        f"moves. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four times or more). "
+        f"Bold best, italic second among ranked trackers. {_names_note(board)}{protocol.describe()}."
     )
     if reported:
         caption += (
@@ -231,8 +231,7 @@ def common_frames_table(
     rows.append([TableCell("common frames"), *(TableCell(frames.get(sequence, "")) for sequence in board.sequences)])
     caption = (
         "Median ATE (RMSE, metres) on those frames only that every successful run of the sequence tracked: a tracker "
-        "gains "
-        "nothing here by losing the hard frames. Failed runs take no part."
+        "gains nothing here by losing the hard frames. Failed runs take no part."
     )
     columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
     return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators)
@@ -264,9 +263,8 @@ def failure_rule_table(board: Board) -> Table | None:
         rows.append(cells)
     caption = (
         "The same runs under three rules. Failures never move: the report's rule. Lost frames held: every lost frame "
-        "counts "
-        "with the last tracked pose, a run without any pose as never moving. Failures left out: survivors only, which "
-        "flatters trackers that fail. A ranking that changes between the rules is decided by the rule."
+        "counts with the last tracked pose, a run without any pose as never moving. Failures left out: survivors "
+        "only, which flatters trackers that fail. A ranking that changes between the rules is decided by the rule."
     )
     return Table("failure_rules", "Sensitivity to the failure rule", caption, columns, rows)
 
@@ -326,16 +324,16 @@ def _interval_cell(interval: Interval, digits: str) -> TableCell:
     )
 
 
-def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis) -> TableCell:
+def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, usual: int) -> TableCell:
     if cell is None or cell.median is None:
         return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
     scores = cell.scores
-    small = f"n={len(scores)}"
+    small = "" if len(scores) == usual else f"n={len(scores)}"
     if len(scores) > 1:
         low, high = np.percentile(scores, [25, 75])
-        small = f"±{(high - low) / 2:.4f} {small}"
+        small = f"±{(high - low) / 2:.4f} {small}".strip()
     if cell.imputed:
-        small += f" ({cell.imputed})"
+        small = f"{small} ({cell.imputed})".strip()
     coverage = float(np.mean([row.coverage for row in cell.rows]))
     ratio = cell.median / max(board.reference_median(sequence), 1e-6)
     return TableCell(
@@ -366,11 +364,17 @@ def shade(ratio: float) -> float:
 
 
 def _sequence_columns(board: Board) -> list[Column]:
-    return [Column(sequence, group=board.groups[sequence]) for sequence in board.sequences]
+    return [Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences]
 
 
 def _kind_tag(board: Board, key: str) -> str:
     return "imported" if board.first(key).kind == "imported" else ""
+
+
+def _names_note(board: Board) -> str:
+    """What the shortened headings stand for; empty where they are whole."""
+    first = board.sequences[0]
+    return "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
 
 
 def _competing(cell: Cell | None) -> float | None:
