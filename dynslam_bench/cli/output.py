@@ -32,11 +32,14 @@ def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, tit
     """Write a table: framed and fitted on a terminal, aligned plain text in a pipe."""
     cells = [[_text(value) for value in row] for row in rows]
     if sys.stdout.isatty():
+        from rich import box
         from rich.console import Console
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(*columns, title=title or None)
+        table = Table(title=title or None, box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in columns:
+            table.add_column(column, overflow="fold")  # nothing is cut off on a narrow terminal
         for row in cells:
             table.add_row(*(Text(cell) for cell in row))
         Console().print(table)
