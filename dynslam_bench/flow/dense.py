@@ -184,24 +184,17 @@ class _OneWay:
         height, width = self._reference.gray.shape
         y = np.minimum(np.arange(height) // 2, self.half.shape[0] - 1)
         x = np.minimum(np.arange(width) // 2, self.half.shape[1] - 1)
-        return np.asarray(self._best[np.ix_(y, x)] / np.float32(self._tables.ceiling), dtype=np.float32)
+        share = self._best[np.ix_(y, x)] / np.float32(self._tables.ceiling)
+        return np.clip(share, 0, 1).astype(np.float32)  # the filter may overshoot
 
     def _candidates(self, labels: NDArray[np.float32], neighbours: NDArray[np.int64]) -> NDArray[np.float32]:
         """Each region's own label first, then its neighbours' as seen from its centre: float32 ``[K, C, 4]``."""
         n, most = len(labels), min(self.settings.dense_candidates - 1, neighbours.shape[1])
         seen = np.empty((n, most, 4), dtype=np.float32)
         extent = np.full((n, 4), 8.0, dtype=np.float32)
-        transported_labels(
-            0,
-            n,
-            self.centres,
-            labels,
-            np.ascontiguousarray(neighbours[:, :most]),
-            np.empty((0, 4), np.float32),
-            -extent,
-            extent,
-            seen,
-        )
+        near = np.ascontiguousarray(neighbours[:, :most])
+        no_motion = np.empty((0, 4), dtype=np.float32)
+        transported_labels(0, n, self.centres, labels, near, no_motion, -extent, extent, seen)
         return np.concatenate([labels[:, None], seen], axis=1)
 
 

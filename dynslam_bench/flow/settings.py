@@ -109,6 +109,10 @@ class FlowSettings(Settings):
         0.75, low=0.3, high=1.0, limits=(0.0, 1.0), online=True, when=_DAISY,
         meaning="matching cost, as a share of its largest value, above which a point is not found",
     )  # fmt: skip
+    min_correlation: float = tunable(
+        0.85, low=0.5, high=0.97, limits=(-1.0, 1.0), online=True, when=_REFINED,
+        meaning="zero-mean normalised correlation of the refined windows below which a point is not found",
+    )  # fmt: skip
     dense_superpixel_px: int = tunable(
         12, low=8, high=32, limits=(4, 128), unit="px", when=_DAISY, meaning="dense mode: side of a superpixel"
     )

@@ -33,7 +33,6 @@ PARABOLA_STEP_PX = 2.0
 COARSE_RADIUS, COARSE_MARGIN, COARSE_WARPS = 7, 3, 2
 FINE_MARGIN, FINE_WARPS, BACK_MARGIN = 2, 2, 3
 TOLERANCE_PX = 0.03
-MIN_CORRELATION = 0.5
 MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
 
 
@@ -101,7 +100,7 @@ class SparseDaisyFlow:
             correlation = self.refine(points, labels, reference, target)
             if settings.search in PROPAGATING and n > 2:
                 self.second_opinion(points, labels, correlation, neighbours, reference, target)
-            valid &= correlation > MIN_CORRELATION
+            valid &= correlation > settings.min_correlation
         xy = points + labels[:, :2]
         height, width = target.gray.shape
         valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)

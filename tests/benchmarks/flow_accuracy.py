@@ -1,9 +1,9 @@
 """Error and cost evaluations of every flow and every label search, as Markdown tables.
 
-    python tests/benchmarks/flow_accuracy.py [--budgets 48 96 192 384] [--images 6] [--quick]
+    PYTHONPATH=. python tests/benchmarks/flow_accuracy.py [--budgets 48 96 192 384] [--quick]
 
-Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by the length of the true motion. Dense: the
-KITTI pair. Every row uses the default settings but for what it names.
+Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by the length of the true motion. Dense:
+the KITTI pair. Every row uses the default settings but for what it names.
 """
 
 from __future__ import annotations

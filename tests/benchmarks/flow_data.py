@@ -1,4 +1,4 @@
-"""Image pairs with known correspondences, for the flow measurements: exact warps, and real frames with depth and pose."""
+"""Image pairs with known correspondences for the flow measurements: exact warps, real frames with depth and pose."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def _exp(w: np.ndarray) -> np.ndarray:
 def _refine_pose(
     motion: np.ndarray, points: np.ndarray, observed: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, float]:
-    """Robust Gauss-Newton on the reprojection error, from the ground truth on; returns the median residual in pixels."""
+    """Robust Gauss-Newton on the reprojection error, from the ground truth on; returns the median residual."""
     for scale in (6.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0):
         p = points @ motion[:3, :3].T + motion[:3, 3]
         z = np.maximum(p[:, 2], 0.1)

@@ -102,7 +102,7 @@ def test_scaled_and_rotated_sampling_undoes_a_similarity(scale, degrees):
     reference = ours(image, points)
     matched = np.abs(ours(warped, there, scale, np.deg2rad(degrees)) - reference).sum((1, 2))
     ignored = np.abs(ours(warped, there) - reference).sum((1, 2))
-    assert np.median(matched) < 0.4 * np.median(ignored)
+    assert np.median(matched) < 0.5 * np.median(ignored)
 
 
 def compiled_cost(first, second, points, labels, **settings):

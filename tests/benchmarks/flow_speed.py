@@ -1,0 +1,98 @@
+"""Time of the sparse flow by stage, budget and thread count; of the dense flow; and time against iterations.
+
+    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40]
+
+1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the yardstick
+for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from flow_data import corners, synthetic
+
+from dynslam_bench.flow.build import build_flow
+from dynslam_bench.flow.dense import DenseDaisyFlow
+from dynslam_bench.flow.estimator import FlowEstimator
+from dynslam_bench.flow.settings import FlowSettings
+
+
+def timed(function: Callable[[], object], repeats: int) -> tuple[float, float, float]:
+    """Minimum and median wall time, and minimum processor time of the calling thread, in milliseconds."""
+    wall, processor = [], []
+    function()
+    for _ in range(repeats):
+        start, used = time.perf_counter(), time.thread_time()
+        function()
+        wall.append(time.perf_counter() - start)
+        processor.append(time.thread_time() - used)
+    return 1e3 * min(wall), 1e3 * float(np.median(wall)), 1e3 * min(processor)
+
+
+def one_frame(flow: FlowEstimator, first: np.ndarray, second: np.ndarray, points: np.ndarray) -> Callable[[], object]:
+    """What a tracker does each frame: prepare the new image, track from the old one."""
+    reference = flow.prepare(first)
+    return lambda: flow.track(reference, flow.prepare(second), points)
+
+
+def main() -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--repeats", type=int, default=40)
+    repeats = parser.parse_args().repeats
+    pair = synthetic(("similarity",), 3)[-1]
+    first, second = pair.reference, pair.target
+    points = corners(first, 4000)
+    points = np.concatenate([points] * (1 + 1000 // len(points)))[:1000]
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points\n")
+    cv2.setNumThreads(1)
+    lucas_kanade = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
+    yardstick = timed(one_frame(build_flow(lucas_kanade), first, second, points), repeats)
+    print("| method, budget | threads | min ms | median ms | processor ms | ratio to LK | % < 1.5 px |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print(
+        f"| Lucas-Kanade, 4 levels, one way | 1 | {yardstick[0]:.1f} | {yardstick[1]:.1f} | {yardstick[2]:.1f} | 1 | |"
+    )
+    rows = [FlowSettings(budget=budget) for budget in (24, 48, 96, 144, 192, 384)]
+    rows += [FlowSettings(search="patchmatch"), FlowSettings(forward_backward_px=0.0), FlowSettings(refinement="none")]
+    for settings in rows:
+        for threads in (1, 2):
+            flow = build_flow(settings, threads=threads)
+            took = timed(one_frame(flow, first, second, points), repeats)
+            result = flow.track(flow.prepare(first), flow.prepare(second), pair.points)
+            good = 100 * (np.hypot(*(result.xy - pair.truth).T) < 1.5).mean()
+            note = "default" if settings == FlowSettings() else ", ".join(
+                f"{k}={v}" for k, v in settings.model_dump().items() if v != getattr(FlowSettings(), k)
+            )  # fmt: skip
+            cost = f"{took[2]:.1f} | {took[2] / yardstick[2]:.2f}" if threads == 1 else "- | -"
+            print(f"| {note} | {threads} | {took[0]:.1f} | {took[1]:.1f} | {cost} | {good:.1f} |", flush=True)
+    maps = timed(lambda: build_flow(FlowSettings()).prepare(second), repeats)
+    print(f"\norientation maps alone, 1 thread: {maps[0]:.1f} / {maps[1]:.1f} ms (processor {maps[2]:.1f})")
+    for threads in (1, 2):
+        dense = DenseDaisyFlow(FlowSettings(), threads=threads)
+        took = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)
+        print(
+            f"dense 640x480 both ways, {threads} thread(s): {took[0]:.0f} / {took[1]:.0f} ms (processor {took[2]:.0f})"
+        )
+    print(
+        "\n| evaluations a point n | search ms | per n | per n log2 n (the paper's claim) |\n| --- | --- | --- | --- |"
+    )
+    flow = build_flow(FlowSettings())
+    for budget in (48, 96, 192, 384, 768, 1536):
+        settings = FlowSettings(budget=budget, refinement="none", search="emfoa")
+        flow = build_flow(settings)
+        reference, target = flow.prepare(first), flow.prepare(second)
+        took = timed(lambda f=flow, r=reference, t=target: f.track(r, t, points), max(3, repeats // 4))[2]
+        print(
+            f"| {budget} | {took:.1f} | {1e3 * took / budget:.1f} us | {1e3 * took / budget / np.log2(budget):.1f} us |"
+        )
+
+
+if __name__ == "__main__":
+    main()
