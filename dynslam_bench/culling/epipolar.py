@@ -54,16 +54,13 @@ def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points
     return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
 
 
-def parallax(first: Points, second: Points, camera: Camera) -> tuple[float, float]:
-    """How much of the flow a pure rotation leaves unexplained, and how much one homography explains.
+def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
+    """How much of the flow a pure rotation of the camera leaves unexplained: median residual in pixels.
 
     Args:
         first: Undistorted pixels ``[N, 2]``.
         second: Undistorted pixels ``[N, 2]``.
         camera: Intrinsics.
-
-    Returns:
-        Median residual in pixels after the best rotation, and the share of points within 1 px of the best homography.
     """
     rays = [np.column_stack([(xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(xy))])
             for xy in (first, second)]  # fmt: skip
@@ -75,17 +72,21 @@ def parallax(first: Points, second: Points, camera: Camera) -> tuple[float, floa
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
         weight = 1.0 / np.maximum(residual, 0.5)
+    return float(np.median(residual))
+
+
+def homography_share(first: Points, second: Points) -> float:
+    """Share of the matches ``[N, 2]`` that one homography explains within 1 px: 1 for a plane or a pure rotation."""
     matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=300, confidence=0.99)
-    share = 0.0 if matrix is None else float(np.mean(mask))
-    return float(np.median(residual)), share
+    return 0.0 if matrix is None else float(np.mean(mask))
 
 
 class EpipolarFilter(DynamicFilter):
     """Drops points, or objects, whose flow leaves the epipolar line.
 
     F comes from the flow of the points that earlier filters kept; the test covers all points with a valid flow.
-    Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``, ``homography_share``, ``degenerate`` (1 where
-    the guard skipped the test), ``moving_objects``.
+    Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``, ``homography_share`` (0 where
+    the parallax had decided already), ``degenerate`` (1 where the guard skipped the test), ``moving_objects``.
     """
 
     name = "epipolar"
@@ -112,11 +113,11 @@ class EpipolarFilter(DynamicFilter):
         stats["matches"] = float(np.count_nonzero(fit))
         if stats["matches"] < MIN_MATCHES:
             return FilterResult.of(keep, {**stats, "degenerate": 1.0})
-        stats["parallax_px"], stats["homography_share"] = parallax(before[fit], frame.xy[fit], state.camera)
-        degenerate = (
-            stats["parallax_px"] < self.settings.min_parallax_px
-            or stats["homography_share"] >= self.settings.homography_share
-        )
+        stats["parallax_px"] = rotation_residual(before[fit], frame.xy[fit], state.camera)
+        degenerate = stats["parallax_px"] < self.settings.min_parallax_px
+        if not degenerate:
+            stats["homography_share"] = homography_share(before[fit], frame.xy[fit])
+            degenerate = stats["homography_share"] >= self.settings.homography_share
         matrix = None if degenerate else fundamental_matrix(before[fit], frame.xy[fit], self.settings)
         if matrix is None:
             return FilterResult.of(keep, {**stats, "degenerate": 1.0})
