@@ -28,23 +28,12 @@ def write_json(value: Any) -> None:
     sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
 
 
-def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, title: str = "") -> None:
-    """Write a table: framed and fitted on a terminal, aligned plain text in a pipe."""
-    cells = [[_text(value) for value in row] for row in rows]
-    if sys.stdout.isatty():
-        from rich import box
-        from rich.console import Console
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table(title=title or None, box=box.SIMPLE_HEAD, pad_edge=False)
-        for column in columns:
-            table.add_column(column, overflow="fold")  # nothing is cut off on a narrow terminal
-        for row in cells:
-            table.add_row(*(Text(cell) for cell in row))
-        Console().print(table)
-        return
-    write(aligned([list(columns), *cells]))
+def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write a table as aligned text; nothing is cut off, whatever the terminal's width."""
+    head, *body = aligned([list(columns), *([_text(value) for value in row] for row in rows)]).split("\n")
+    write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
+    for line in body:
+        write(line)
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:

@@ -249,6 +249,9 @@ def show_runs(records: Sequence[RunRecord], store: Any, protocol: str, *, as_jso
     if as_json:
         write_json(rows)
         return
-    shown = ["run", "tracker", "sequence", "seed", "status", "ate_rmse_m", "never_move_m", "coverage", "frame_ms"]
-    shown += [name for name in ("masks", "reason") if any(row[name] for row in rows)]
-    write_table(shown, [[row[name] for name in shown] for row in rows])
+    names = {
+        "run": "run", "tracker": "tracker", "sequence": "sequence", "seed": "seed", "status": "status",
+        "ate_rmse_m": "ATE (m)", "never_move_m": "not moving (m)", "coverage": "coverage", "frame_ms": "ms/frame",
+    }  # fmt: skip
+    names |= {name: name for name in ("masks", "reason") if any(row[name] for row in rows)}
+    write_table(list(names.values()), [[row[name] for name in names] for row in rows])
