@@ -10,6 +10,8 @@ from importlib.resources import files
 
 from .tables import ReportedCell
 
+CLAIMED = "claimed by the paper"
+
 
 @dataclass(frozen=True)
 class Published:
@@ -91,16 +93,23 @@ def reported_for(sequences: Sequence[str], alignment: str = "se3") -> list[Repor
         alignment: Alignment of the report's protocol; numbers known to be aligned otherwise are left out.
 
     Returns:
-        One cell for every system, source and sequence.
+        One cell for every system, source and sequence, and those that the implemented paper claims, tagged so.
     """
     if alignment not in ("se3", "sim3"):
         return []
     wanted = set(sequences)
-    return [
+    from_papers = [
         ReportedCell(f"{p.system} ({p.source})", p.sequence, p.value, "; ".join(filter(None, (p.alignment, p.remarks))))
         for p in published()
         if p.metric == "ate_rmse_m" and p.sequence in wanted and (p.alignment == "Sim(3)") == (alignment == "sim3")
     ]
+    remark = "contradicts itself and what the systems' authors published; see the audit"
+    claims = [
+        ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED)
+        for c in claimed()
+        if c.kind == "value" and c.quantity == "ape_rmse" and c.sequence in wanted and alignment == "se3"
+    ]
+    return from_papers + claims
 
 
 def _lines(name: str) -> list[dict[str, str]]:

@@ -26,12 +26,14 @@ class ReportedCell:
         sequence: Sequence key of the board.
         value: ATE in metres.
         source: Where it was read.
+        tag: What kind of number it is.
     """
 
     system: str
     sequence: str
     value: float
     source: str
+    tag: str = "reported"
 
 
 _PROVENANCE = {
@@ -118,9 +120,10 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     muted.add(len(rows) - 1)
     if reported:
         separators.add(len(rows))
-        for name in dict.fromkeys(cell.system for cell in reported):
+        for name, tag in dict.fromkeys((cell.system, cell.tag) for cell in reported):
             muted.add(len(rows))
-            rows.append([TableCell(name, tag="reported"), *_reported_cells(board, name, reported)])
+            found = [cell for cell in reported if (cell.system, cell.tag) == (name, tag)]
+            rows.append([TableCell(name, tag=tag), *_reported_cells(board, found)])
     caption = (
         f"Median ATE (RMSE, metres) over the runs of a cell ({usual} unless n says otherwise), behind it half the "
         "interquartile range of several runs, and in parentheses how many failed and count as a camera that never "
@@ -129,7 +132,9 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     )
     if reported:
         caption += (
-            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only."
+            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only. "
+            "Rows marked 'claimed by the paper' are the implemented paper's own, which contradict themselves (see "
+            "the audit)."
         )
     return Table("per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators)
 
@@ -348,10 +353,10 @@ def _never_cell(board: Board, sequence: str) -> TableCell:
     return TableCell(f"{value:.4f}", value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
 
 
-def _reported_cells(board: Board, system: str, reported: Sequence[ReportedCell]) -> list[TableCell]:
+def _reported_cells(board: Board, reported: Sequence[ReportedCell]) -> list[TableCell]:
     cells = []
     for sequence in board.sequences:
-        found = [cell for cell in reported if cell.system == system and cell.sequence == sequence]
+        found = [cell for cell in reported if cell.sequence == sequence]
         cells.append(
             TableCell(f"{found[0].value:.4f}", value=found[0].value, tip=found[0].source) if found else TableCell()
         )

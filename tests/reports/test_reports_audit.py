@@ -171,5 +171,8 @@ def test_reported_rows_do_not_mix_alignments():
     assert se3
     assert sim3
     assert not {c.system for c in se3} & {c.system for c in sim3}
+    claims = {c.system: c.value for c in se3 if c.tag == "claimed by the paper"}
+    assert len(claims) == 7
+    assert claims[OURS] == 0.2724
     assert reported_for(sequences, "none") == []
     assert reported_for(["tum/fr3/walking_xyz [0:100]"]) == []  # a part of a sequence is not what was published
