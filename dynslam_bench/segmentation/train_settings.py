@@ -18,7 +18,7 @@ class TrainSettings(Settings):
     classes: str = Field("person", description="classes to learn: comma-separated COCO names or presets")
     cfpn: bool = Field(True, description="cross-layer feature pyramid in the mask branch; false is plain Mask R-CNN")
     data: tuple[str, ...] = Field(
-        ("synthetic:instances=0-99,frames=2,options=0.3,seed=1",), description="sets of labelled images to learn from"
+        ("synthetic:instances=0-89,frames=2,options=0.3,seed=1",), description="sets of labelled images to learn from"
     )
     validation: str = Field(
         "synthetic:instances=90-99,frames=1,seed=2", description="set that chooses the best checkpoint"
