@@ -1,0 +1,40 @@
+"""The network in the package: it is found, small, runs offline, and sees rendered people."""
+
+import numpy as np
+import pytest
+
+from dynslam_bench.segmentation.build import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation.checkpoints import embedded_weights
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.frame import Frame
+
+AUTO = SegmentationSettings()
+
+
+def test_auto_means_embedded_on_rendered_sequences():
+    assert embedded_weights().stat().st_size < 15e6
+    assert resolve_source(AUTO, "synthetic/walking_xyz@0?frames=60") == "embedded"
+    assert len(weights_digest(AUTO, "synthetic/walking_xyz")) == 12
+    json = embedded_weights().with_suffix(".json").read_text()
+    assert f'"sha256_prefix": "{weights_digest(AUTO, "synthetic/walking_xyz")}"' in json
+
+
+def test_it_finds_people_of_a_held_out_instance(tmp_path):
+    segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz", threads=1)
+    sequence = open_sequence("synthetic/sitting_xyz@120?frames=30", data_root=tmp_path)
+    frame, masks = sequence[5], sequence.masks[5]
+    people = np.isin(masks.instances, [k for k, name in masks.class_names.items() if name == "person"])
+    found = segmenter.segment(frame)
+    union = found.union()
+    assert set(found.class_names) == {"person"} and len(found) == 2
+    assert (union & people).sum() / (union | people).sum() > 0.85
+    again = segmenter.segment(frame)
+    assert np.array_equal(found.masks, again.masks) and np.array_equal(found.scores, again.scores)
+
+
+@pytest.mark.parametrize("shape", [(480, 640, 3), (97, 211, 4), (300, 50)])
+def test_nobody_there(shape):
+    segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz")
+    found = segmenter.segment(Frame(0, 0.0, np.full(shape, 128, np.uint8), np.zeros(shape[:2], np.float32)))
+    assert found.masks.shape == (0, *shape[:2])
