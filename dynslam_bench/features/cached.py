@@ -29,9 +29,22 @@ class CachedExtractor:
     def __init__(self, extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int) -> None:
         self._extractor = extractor
         self._cache = cache
-        self._prefix = digest([VERSION, settings.model_dump(mode="json"), machine_digest(), threads])
+        self._threads = threads
+        self.settings = settings
         self.hit = False
         self.saved_s = 0.0
+
+    @property
+    def settings(self) -> Settings:
+        """The settings in force; replacing them replaces the extractor's."""
+        return self._settings
+
+    @settings.setter
+    def settings(self, settings: Settings) -> None:
+        self._settings = settings
+        if hasattr(self._extractor, "settings"):
+            self._extractor.settings = settings
+        self._prefix = digest([VERSION, settings.model_dump(mode="json"), machine_digest(), self._threads])
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image."""

@@ -182,12 +182,14 @@ class SlamPipeline:
     def update_settings(self, settings: Settings) -> None:
         """Put new values of online settings into force from the next frame on.
 
-        Each part takes the group of the settings that bears its name: filters their own, ``flow``, ``backend``,
-        ``guard`` and ``segmentation``.
+        Each part takes the group of the settings that bears its name: filters their own, ``features``, ``flow``,
+        ``backend``, ``guard`` and ``segmentation``.
         """
         self._guard = getattr(settings, "guard", self._guard)
         parts: list[tuple[str, Any]] = [(getattr(each, "group", each.name), each) for each in self._filters]
-        parts += [("flow", self._flow), ("backend", self._backend), ("segmentation", self._masks)]
+        parts += [
+            ("features", self._extractor), ("flow", self._flow), ("backend", self._backend), ("segmentation", self._masks),
+        ]  # fmt: skip
         for group, part in parts:
             if part is not None and hasattr(part, "settings") and hasattr(settings, group):
                 part.settings = getattr(settings, group)
