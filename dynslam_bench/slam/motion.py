@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from dynslam_bench.geometry import se3
-
+from .pose import apply_twist
 from .settings import MotionSettings
 
 Array = NDArray[np.float64]
@@ -92,15 +92,16 @@ class MotionState:
     def difference(self, T_cam_world: Array) -> Array:
         """(position, rotation) ``[6]`` that leads from this state's pose to another."""
         r = T_cam_world[:3, :3]
-        step = np.eye(4)
-        step[:3, :3] = r @ self.rotation.T
-        return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, se3.log(step)[3:]])
+        turn = Rotation.from_matrix(r @ self.rotation.T).as_rotvec()
+        return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, turn])
 
     def moved(self, correction: Array, covariance: Array) -> MotionState:
         """The state after a correction ``[12]``."""
-        turn = se3.exp(np.concatenate([np.zeros(3), correction[3:6]]))[:3, :3]
-        u, _, vt = np.linalg.svd(turn @ self.rotation)
-        return MotionState(self.position + correction[:3], u @ vt, self.speed + correction[6:], covariance)
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation
+        twist = np.concatenate([np.zeros(3), correction[3:6]])
+        rotation = apply_twist(pose, twist)[:3, :3]  # keeps it orthonormal
+        return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
     def relocated(self, T_cam_world: Array) -> MotionState:
         """The same motion at another pose, e.g. after bundle adjustment."""
