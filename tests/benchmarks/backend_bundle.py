@@ -1,0 +1,81 @@
+"""The two solvers of local bundle adjustment on the same problems, in turn: time, cost reached, poses.
+
+python tests/benchmarks/backend_bundle.py [--repeats 5] [--observations 6000] [--iterations 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np  # noqa: E402
+
+from dynslam_bench.geometry import se3  # noqa: E402
+from dynslam_bench.geometry.camera import Camera  # noqa: E402
+from dynslam_bench.slam.bundle import BundleProblem, adjust_bundle  # noqa: E402
+from dynslam_bench.slam.bundle_gtsam import adjust_bundle_gtsam  # noqa: E402
+
+
+def problem(observations: int, seed: int, poses: int = 14, variable: int = 8) -> tuple[BundleProblem, np.ndarray]:
+    """A room seen from `poses` cameras, disturbed; and the true poses."""
+    rng = np.random.default_rng(seed)
+    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+    truth = se3.exp(rng.normal(0, 0.06, (poses, 6)))
+    each = 5
+    points = rng.uniform([-1.5, -1, 1.5], [1.5, 1, 4], (observations // each, 3))
+    at = np.sort(np.argsort(rng.random((len(points), poses)), axis=1)[:, :each], axis=1)
+    obs_pose, obs_point = at.ravel(), np.repeat(np.arange(len(points)), each)
+    local = np.einsum("nij,nj->ni", truth[obs_pose, :3, :3], points[obs_point]) + truth[obs_pose, :3, 3]
+    uv = camera.project(local)
+    right = uv[:, 0] - camera.fx * camera.baseline_m / local[:, 2]
+    uv = uv + rng.normal(0, 0.7, uv.shape)
+    right = right + rng.normal(0, 0.7, right.shape)
+    start = truth.copy()
+    start[:variable] = se3.exp(rng.normal(0, 0.01, (variable, 6))) @ truth[:variable]
+    info = np.ones(len(uv))
+    info_right = np.where(rng.random(len(uv)) < 0.8, 1.0, 0.0)
+    noisy = points + rng.normal(0, 0.02, points.shape)
+    return BundleProblem(start, variable, noisy, obs_pose, obs_point, uv, right, info, info_right, camera), truth
+
+
+def main() -> int:
+    """Print one row a solver."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--observations", type=int, default=6000)
+    parser.add_argument("--iterations", type=int, default=3)
+    options = parser.parse_args()
+    solvers = {"schur": adjust_bundle, "gtsam": adjust_bundle_gtsam}
+    spent: dict[str, list[float]] = {name: [] for name in solvers}
+    cost: dict[str, list[float]] = {name: [] for name in solvers}
+    error: dict[str, list[float]] = {name: [] for name in solvers}
+    adjust_bundle(problem(200, 0)[0], 1)  # compiles
+    for seed in range(options.repeats):
+        each, truth = problem(options.observations, seed)
+        for name, solve in solvers.items():
+            begin = time.process_time()
+            result = solve(each, options.iterations)
+            spent[name].append(1e3 * (time.process_time() - begin))
+            cost[name].append(result.cost_after)
+            gap = se3.inverse(result.poses[: each.variable]) @ truth[: each.variable]
+            error[name].append(1e3 * float(np.linalg.norm(gap[:, :3, 3], axis=1).mean()))
+    print(f"{options.observations} observations, 8 + 6 poses, {options.iterations} iterations, processor time")
+    print("| solver | ms median | ms min | Huber cost | camera error mm |")
+    print("| --- | --- | --- | --- | --- |")
+    for name in solvers:
+        print(
+            f"| {name} | {np.median(spent[name]):.1f} | {min(spent[name]):.1f} | {np.mean(cost[name]):.0f} "
+            f"| {np.mean(error[name]):.2f} |"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
