@@ -20,12 +20,13 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.store import RunStore
 
-from . import figures, run_tables, tables
+from . import fairness_tables, figures, run_tables, tables
 from .board import Board, make_board
-from .figures import Figure
+from .figure_style import Figure
 from .page import Block, Section, render
 from .reported import reported_for
 from .rows import Loaded, LoadedRun, RunRow, load_runs, open_stores
+from .sequence_figures import sequence_figures
 from .statistics import power_note
 from .table import Table, to_csv, to_latex, to_markdown
 
@@ -178,7 +179,7 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
     published = reported_for(board.sequences, protocol.alignment)
     section.blocks.append(draft.table(tables.per_sequence(board, protocol, published), "Absolute trajectory error"))
     common, frames = _common_errors(board, protocol, loaded)
-    table = tables.common_frames_table(board, common, frames)
+    table = fairness_tables.common_frames_table(board, common, frames)
     if table is not None:
         section.blocks.append(draft.table(table, table.title))
     final = tables.metric_table(
@@ -188,7 +189,7 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
     )  # fmt: skip
     if final is not None and protocol.trajectory == "online":
         section.blocks.append(draft.table(final, final.title))
-    rule = tables.failure_rule_table(board)
+    rule = fairness_tables.failure_rule_table(board)
     if rule is not None:
         section.blocks.append(draft.table(rule, rule.title))
     for table in tables.relative_errors(board, protocol):
@@ -209,7 +210,7 @@ def _details(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) ->
                 estimates[key] = trajectory
         if truth is None or not estimates:
             continue
-        paths, errors = figures.sequence_figures(board, truth, estimates, protocol)
+        paths, errors = sequence_figures(board, truth, estimates, protocol)
         draft.figures |= {f"path-{position}": paths, f"error-{position}": errors}
         caption = (
             f"The run with the median error of each tracker, aligned ({protocol.alignment}), seen along the three "

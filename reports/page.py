@@ -12,7 +12,7 @@ from typing import Literal
 from jinja2 import Environment, select_autoescape
 from markupsafe import Markup, escape
 
-from .figures import Figure
+from .figure_style import Figure
 from .table import Table
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from dynslam_bench.evaluation.protocol import Protocol
 
-from .board import NEVER_MOVE, Board, Cell, rank
+from .board import NEVER_MOVE, Board, Cell
 from .rows import RunRow
 from .statistics import Interval, Standing
 from .table import Column, Emphasis, Table, TableCell, emphasise
@@ -95,7 +95,7 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
 
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
     """Median ATE of every tracker on every sequence, with spread, number of runs and imputed ones."""
-    columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
+    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
     sizes = Counter(len(cell.scores) for found in board.cells.values() for cell in found.values())
     usual = sizes.most_common(1)[0][0]
     medians = {
@@ -199,95 +199,26 @@ def metric_table(
                 TableCell() if number is None else TableCell(f"{number:.{digits}f}", value=number, emphasis=mark)
             )
         rows.append(cells)
-    columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
+    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
     competing = sum(key in board.ranked for key in present)
     separators = {competing} if 0 < competing < len(rows) else set()
     return Table(name, title, caption, columns, rows, muted, separators)
-
-
-def common_frames_table(
-    board: Board, common: Mapping[tuple[str, str], float], frames: Mapping[str, str]
-) -> Table | None:
-    """ATE on the frames that all evaluated runs of a sequence tracked.
-
-    Args:
-        board: The board.
-        common: ``(variant, sequence)`` to the median ATE there.
-        frames: Sequence to how many frames are common, in words.
-    """
-    if not common:
-        return None
-    marks: dict[tuple[str, str], Emphasis] = {}
-    for sequence in board.sequences:
-        values = [common.get((key, sequence)) for key in board.ranked]
-        marks |= {(key, sequence): mark for key, mark in zip(board.ranked, emphasise(values), strict=True)}
-    rows, muted = [], set()
-    for position, key in enumerate(board.trackers):
-        if key not in board.ranked:
-            muted.add(position)
-        cells = [TableCell(board.labels[key])]
-        for sequence in board.sequences:
-            number = common.get((key, sequence))
-            mark = marks.get((key, sequence), "")
-            cells.append(TableCell() if number is None else TableCell(f"{number:.4f}", value=number, emphasis=mark))
-        rows.append(cells)
-    separators = {len(rows)}
-    muted.add(len(rows))
-    rows.append([TableCell("common frames"), *(TableCell(frames.get(sequence, "")) for sequence in board.sequences)])
-    caption = (
-        "Median ATE (RMSE, metres) on those frames only that every successful run of the sequence tracked: a tracker "
-        "gains nothing here by losing the hard frames. Failed runs take no part."
-    )
-    columns = [Column("tracker", numeric=False), *_sequence_columns(board)]
-    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators)
-
-
-def failure_rule_table(board: Board) -> Table | None:
-    """How much the ranking depends on how failures and lost frames are counted; None if nothing was lost."""
-    if not board.ranked or all(row.coverage >= 1 and not row.failed for row in board.rows):
-        return None
-    rules: list[tuple[str, Callable[[RunRow], float | None] | None]] = [
-        ("failures never move", None),
-        ("lost frames held", lambda row: row.held_ate_m if row.held_ate_m is not None else row.never_move_m),
-        ("failures left out", lambda row: None if row.failed else row.metrics.get("ate_rmse_m")),
-    ]
-    by_rule = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for _, rule in rules]
-    columns = [Column("tracker", numeric=False)]
-    for name, _ in rules:
-        columns += [Column("#", name), Column("ATE ratio", name)]
-    rows = []
-    for key in board.ranked_order():
-        cells = [TableCell(board.labels[key])]
-        for found in by_rule:
-            standing = found.get(key)
-            cells += (
-                [TableCell(), TableCell()]
-                if standing is None
-                else [_rank_cell(standing), _interval_cell(standing.ratio, ".2f")]
-            )
-        rows.append(cells)
-    caption = (
-        "The same runs under three rules. Failures never move: the report's rule. Lost frames held: every lost frame "
-        "counts with the last tracked pose, a run without any pose as never moving. Failures left out: survivors "
-        "only, which flatters trackers that fail. A ranking that changes between the rules is decided by the rule."
-    )
-    return Table("failure_rules", "Sensitivity to the failure rule", caption, columns, rows)
 
 
 def _standing_cells(board: Board, key: str, standing: Standing | None, mark: Emphasis) -> list[TableCell]:
     name = TableCell(board.labels[key], tip=board.first(key).tracker)
     if standing is None:
         return [TableCell("–"), name, *[TableCell() for _ in range(4)]]
-    ratio = _interval_cell(standing.ratio, ".2f")
+    ratio = interval_cell(standing.ratio, ".2f")
     partial = f" on {standing.sequences} of {len(board.sequences)}" if key in board.incomplete else ""
     ratio = TableCell(ratio.text, ratio.small + partial, ratio.value, mark)
     is_reference = key == board.reference
     return [
-        _rank_cell(standing),
+        rank_cell(standing),
         name,
         ratio,
         number_cell(standing.mean_rank, ".2f"),
-        TableCell("reference") if is_reference else _interval_cell(standing.improvement, ".2f"),
+        TableCell("reference") if is_reference else interval_cell(standing.improvement, ".2f"),
         TableCell() if is_reference else number_cell(standing.p_value, ".3f"),
     ]
 
@@ -316,14 +247,16 @@ def _speed_cell(factor: float | None, frame_ms: float | None) -> TableCell:
     return TableCell(f"{factor:.2f}" if factor < 100 else f"{factor:.0f}", small, factor)
 
 
-def _rank_cell(standing: Standing) -> TableCell:
+def rank_cell(standing: Standing) -> TableCell:
+    """A rank with its interval."""
     if standing.rank is None:
         return TableCell("–")
     low, high = standing.rank.low, standing.rank.high
     return TableCell(f"{standing.rank.value:.0f}", f"[{low:.0f}–{high:.0f}]", standing.rank.value)
 
 
-def _interval_cell(interval: Interval, digits: str) -> TableCell:
+def interval_cell(interval: Interval, digits: str) -> TableCell:
+    """A value with its interval."""
     return TableCell(
         f"{interval.value:{digits}}", f"[{interval.low:{digits}}, {interval.high:{digits}}]", interval.value
     )
@@ -368,7 +301,8 @@ def shade(ratio: float) -> float:
     return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
 
 
-def _sequence_columns(board: Board) -> list[Column]:
+def sequence_columns(board: Board) -> list[Column]:
+    """One column for every sequence, grouped."""
     return [Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences]
 
 
