@@ -1,13 +1,13 @@
 """Accuracy and frame time of the shared back end on the excerpts and on rendered sitting twins.
 
-    python tests/benchmarks/backend_accuracy.py [--offsets 0 1 2 3] [--sequences xyz rpy crowd synthetic/sitting_rpy?frames=200]
-        [--set tracking.min_inliers=30] [--masks FILE.npz]
+    python tests/benchmarks/backend_accuracy.py [--offsets 0 1 2 3] [--set tracking.min_inliers=30]
+        [--sequences xyz rpy crowd "synthetic/sitting_rpy?frames=200"] [--masks FILE.npz]
 
-Each row is the mean over start offsets: ATE RMSE in mm after SE(3) alignment (protocol tum-rgbd/v1) of the online and of
-the final trajectory, coverage, keyframes, and the times of a frame in ms (features + back end, one thread, wall clock and
-processor time; decoding and masks excluded). On `crowd` people are masked by the YOLO network at ../shared/weights
-through cv2.dnn, dilated by 15 px; the masks are kept in --masks so that later calls start at once. A repeated run with
-another number of OpenCV threads must give the same bits: the last column says so.
+Each row is the mean over start offsets: ATE RMSE in mm after SE(3) alignment (protocol tum-rgbd/v1) of the online and
+of the final trajectory, coverage, keyframes, and the times of a frame in ms (features + back end, one thread, wall
+clock and processor time; decoding and masks excluded). On `crowd` people are masked by the YOLO network at
+../shared/weights through cv2.dnn, dilated by 15 px; the masks are kept in --masks so that later calls start at once.
+A repeated run with another number of OpenCV threads must give the same bits: the last column says so.
 """
 
 from __future__ import annotations
@@ -123,7 +123,8 @@ def main() -> int:
     extractor = build_extractor()
     cv2.setNumThreads(1)
     print(
-        "| sequence | ATE online mm | ATE final mm | coverage | keyframes | wall ms p50 / p95 | cpu ms p50 / p95 | same bits |"
+        "| sequence | ATE online mm | ATE final mm | coverage | keyframes | wall ms p50 / p95 | cpu ms p50 / p95 "
+        "| same bits |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for name in options.sequences:
@@ -155,8 +156,9 @@ def main() -> int:
         mean, spread = np.mean(rows, axis=0), np.std(rows, axis=0)
         (wall, cpu), (wall95, cpu95) = (np.percentile(np.concatenate(times), q, axis=0) for q in (50, 95))
         print(
-            f"| {name} | {mean[0]:.2f} +- {spread[0]:.2f} | {mean[1]:.2f} +- {spread[1]:.2f} | {mean[2]:.3f} | {mean[3]:.1f} "
-            f"| {wall:.1f} / {wall95:.1f} | {cpu:.1f} / {cpu95:.1f} | {'yes' if np.array_equal(first_run, repeated) else 'NO'} |",
+            f"| {name} | {mean[0]:.2f} +- {spread[0]:.2f} | {mean[1]:.2f} +- {spread[1]:.2f} | {mean[2]:.3f} "
+            f"| {mean[3]:.1f} | {wall:.1f} / {wall95:.1f} | {cpu:.1f} / {cpu95:.1f} "
+            f"| {'yes' if np.array_equal(first_run, repeated) else 'NO'} |",
             flush=True,
         )
     return 0
