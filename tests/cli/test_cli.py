@@ -257,6 +257,26 @@ def test_failed_runs_exit_with_3_and_the_others_go_on(cli, walk, tmp_path):
     assert code == 0 and out.strip() == row["run"]
 
 
+def test_damaged_sequences_never_become_runs(cli, walk, tmp_path):
+    """One line, exit code 1, and nothing half written."""
+    import shutil
+
+    code, _, err = cli("run", "never-move", walk, "--frames", "0:1")
+    assert code == 1 and "1 frames" in one_line(err)
+    for damage, words in (
+        (lambda folder: (folder / "rgb.txt").write_text(""), "lists no image"),
+        (lambda folder: (folder / "depth.txt").write_text("9.0 depth/0.png"), "has a depth image within"),
+        (lambda folder: shutil.copy(folder / "rgb" / "0.png", folder / "depth" / "0.png"), "8 bits"),
+        (lambda folder: (folder / "groundtruth.txt").write_text(""), "holds no poses"),
+    ):
+        copy = shutil.copytree(walk, tmp_path / "copy")
+        damage(copy)
+        code, _, err = cli("run", "never-move", copy)
+        assert code == 1 and words in one_line(err)
+        shutil.rmtree(copy)
+    assert not list(tmp_path.glob("results/runs/*"))
+
+
 def test_eval_and_protocols(cli, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
