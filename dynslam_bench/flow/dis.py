@@ -32,9 +32,9 @@ class DisFlow:
 
     def dense(self, reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Flow of every pixel, float32 ``[H, W, 2]``."""
-        return np.asarray(
-            self._dis.calc(reference, target, np.zeros((*reference.shape, 2), np.float32)), dtype=np.float32
-        )
+        # None, not zeros: given a flow, DIS starts from it instead of from its coarsest level
+        found = self._dis.calc(reference, target, None)  # type: ignore[call-overload]
+        return np.asarray(found, dtype=np.float32)
 
     def track(
         self,
