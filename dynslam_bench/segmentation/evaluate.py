@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ConfigDict
 
+from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.records import Record, write_atomic
 from dynslam_bench.sequences.frame import Frame
 
@@ -82,11 +83,10 @@ def evaluate_segmenter(
         SegmentationError: The segmenter or the data are not available.
     """
     images = open_labelled(data) if isinstance(data, str) else data
-    segmenter = build_segmenter(settings, sequence_id="synthetic/", device=device, threads=threads)
+    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP wants weak detections too
+    segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
-        raise ValueError("source 'none' has nothing to evaluate")
-    low = settings.model_copy(update={"confidence": 0.05})
-    segmenter.settings = low
+        raise SegmentationError("segmentation.source=none has no masks to evaluate")
     quality, seconds = measure(segmenter, images, settings, min_area=min_area, limit=limit, progress=progress)
     classes = {name: {key: _finite(value) for key, value in asdict(one).items()}
                for name, one in quality.classes.items() if one.truths or one.detections}  # fmt: skip
