@@ -80,8 +80,9 @@ def describe(images: Tensor, points: Tensor, scales: Tensor, rotations: Tensor) 
                     blurred[image][None], grid[image, mine, chosen][None], align_corners=False, padding_mode="zeros"
                 )
                 out[image, mine, chosen] = sampled[0].permute(1, 2, 0)
-    out = _turn_bins(out, rotations)
-    return out / (out.norm(dim=-1, keepdim=True) + PARTIAL_FLOOR)
+    turned = _turn_bins(out, rotations)
+    norm: Tensor = torch.linalg.vector_norm(turned, dim=-1, keepdim=True)
+    return turned / (norm + PARTIAL_FLOOR)
 
 
 def _turn_bins(histograms: Tensor, rotations: Tensor) -> Tensor:

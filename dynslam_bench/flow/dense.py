@@ -185,7 +185,7 @@ class _OneWay:
         y = np.minimum(np.arange(height) // 2, self.half.shape[0] - 1)
         x = np.minimum(np.arange(width) // 2, self.half.shape[1] - 1)
         share = self._best[np.ix_(y, x)] / np.float32(self._tables.ceiling)
-        return np.clip(share, 0, 1).astype(np.float32)  # the filter may overshoot
+        return np.asarray(np.clip(share, 0, 1), dtype=np.float32)  # the filter may overshoot
 
     def _candidates(self, labels: NDArray[np.float32], neighbours: NDArray[np.int64]) -> NDArray[np.float32]:
         """Each region's own label first, then its neighbours' as seen from its centre: float32 ``[K, C, 4]``."""

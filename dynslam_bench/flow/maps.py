@@ -115,7 +115,7 @@ def orientation_maps(
 
 def half_image(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Rounded mean over 2 x 2 pixels of a uint8 ``[H, W]`` image."""
-    rows, columns = _level_shape(*gray.shape, 2)
+    rows, columns = _level_shape(gray.shape[0], gray.shape[1], 2)
     half, exact = np.empty((rows, columns), dtype=np.uint8), np.empty((rows, columns), dtype=np.float32)
     _halve(0, rows, gray, exact, half)
     return half
