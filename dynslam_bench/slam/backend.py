@@ -69,6 +69,8 @@ class RgbdBackend:
         self._frame = -1
         self._next_stamp: float | None = None
         self._depth_images: dict[int, NDArray[np.float32]] = {}
+        self._views: dict[int, tuple[KeyframeView, ...]] = {}
+        self._cloud: tuple[NDArray[np.int64], Array] | None = None
         self._ready = True
 
     # ------------------------------------------------------------------ prediction
@@ -263,6 +265,8 @@ class RgbdBackend:
         self._reference = slot
         self._last_keyframe_frame = frame.index
         self._peak = 0
+        self._views.clear()  # only keyframes change the map
+        self._cloud = None
         for dropped, heir, relative in self.mapper.dropped:
             self.history.inherit(dropped, heir, relative)
             self._depth_images.pop(dropped, None)
@@ -283,7 +287,7 @@ class RgbdBackend:
             "culled": float(len(frame) - np.count_nonzero(keep)),
             "matches": stats["matches"],
             "inliers": stats["inliers"],
-            "map_points": float(len(self.world.points)),
+            "map_points": float(len(self.map_points()[0])),
             "keyframes": float(self.world.keyframe_count),
             "keyframe": stats["keyframe"],
             "residual_px": stats["residual_px"],
@@ -293,6 +297,11 @@ class RgbdBackend:
 
     def keyframe_views(self, limit: int) -> tuple[KeyframeView, ...]:
         """The newest keyframes, newest first, at most `limit`."""
+        if limit not in self._views:
+            self._views[limit] = self._make_views(limit)
+        return self._views[limit]
+
+    def _make_views(self, limit: int) -> tuple[KeyframeView, ...]:
         world = self.world
         views = []
         for slot in world.keyframes[::-1][: max(limit, 0)].tolist():
@@ -318,8 +327,10 @@ class RgbdBackend:
 
     def map_points(self) -> tuple[NDArray[np.int64], Array]:
         """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points."""
-        points = self.world.points
-        return self.world.id[points], self.world.position[points]
+        if self._cloud is None:
+            points = self.world.points
+            self._cloud = self.world.id[points], self.world.position[points]
+        return self._cloud
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes."""

@@ -188,8 +188,11 @@ class SlamPipeline:
         self._guard = getattr(settings, "guard", self._guard)
         parts: list[tuple[str, Any]] = [(getattr(each, "group", each.name), each) for each in self._filters]
         parts += [
-            ("features", self._extractor), ("flow", self._flow), ("backend", self._backend), ("segmentation", self._masks),
-        ]  # fmt: skip
+            ("features", self._extractor),
+            ("segmentation", self._masks),
+            ("flow", self._flow),
+            ("backend", self._backend),
+        ]
         for group, part in parts:
             if part is not None and hasattr(part, "settings") and hasattr(settings, group):
                 part.settings = getattr(settings, group)
