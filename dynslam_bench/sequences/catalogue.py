@@ -15,7 +15,7 @@ from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry.camera import Camera
 
 from ._toml import read_toml
-from .cameras import CAMERAS, find_camera
+from .cameras import CAMERAS, MARKER_TO_CAMERA, find_camera
 from .datasets import DATASETS, DatasetSpec
 from .frame import Sequence, SequenceView
 from .roots import find_data_root, is_writable, user_cache
@@ -220,12 +220,14 @@ def open_folder(
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
     intrinsics, fps = find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
+    body = MARKER_TO_CAMERA.get(camera or "" if entry is None else entry.camera)
     if entry is None:
-        description = Description(f"folder/{folder.resolve().name}", intrinsics, fps)
+        description = Description(f"folder/{folder.resolve().name}", intrinsics, fps, R_body_cam=body)
     else:
         description = Description(
-            entry.id, intrinsics, fps or entry.fps, entry.license, entry.citation, frozenset(entry.tags), entry.split
-        )
+            entry.id, intrinsics, fps or entry.fps, entry.license, entry.citation, frozenset(entry.tags), entry.split,
+            body,
+        )  # fmt: skip
     return TumSequence(
         folder,
         description,

@@ -40,6 +40,8 @@ class Description:
         citation: What to cite.
         tags: For example ``high-dynamic``.
         split: ``tune``, ``held-out`` or empty.
+        R_body_cam: Rotation from the camera's axes to those of the body that the ground truth tracks, rows of a 3x3
+            matrix; None where the ground truth is the camera's.
     """
 
     id: str
@@ -49,6 +51,7 @@ class Description:
     citation: str = ""
     tags: frozenset[str] = frozenset()
     split: str = ""
+    R_body_cam: tuple[tuple[float, float, float], ...] | None = None
 
 
 class TumSequence:
@@ -109,7 +112,9 @@ class TumSequence:
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
         self._sizes = [sizes[0][i] for i in index[0]] + [sizes[1][i] for i in index[1]]
-        self._ground_truth, ground_truth_dropped = _read_ground_truth(folder / "groundtruth.txt")
+        self._ground_truth, ground_truth_dropped = _read_ground_truth(
+            folder / "groundtruth.txt", description.R_body_cam
+        )
         self.dropped = _count(
             colour,
             depth,
@@ -281,12 +286,20 @@ def _refuse(folder: Path, files: list[str], listed: int, kind: str, state: str) 
     )
 
 
-def _read_ground_truth(path: Path) -> tuple[Trajectory | None, str]:
+def _read_ground_truth(
+    path: Path, R_body_cam: tuple[tuple[float, float, float], ...] | None
+) -> tuple[Trajectory | None, str]:
     """The ground truth, None if there is no file, and one phrase on the lines that were not taken as they stand."""
     if not path.is_file():
         return None, ""
     file = load_tum(path)
-    return file.trajectory, ", ".join(f"ground truth: {phrase}" for phrase in file.notes.describe())
+    truth = file.trajectory
+    if R_body_cam is not None:
+        left, _, right = np.linalg.svd(np.array(R_body_cam))
+        poses = truth.T_world_cam.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ (left @ right)
+        truth = Trajectory(truth.timestamps, poses)
+    return truth, ", ".join(f"ground truth: {phrase}" for phrase in file.notes.describe())
 
 
 def _count(

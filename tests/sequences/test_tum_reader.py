@@ -292,3 +292,17 @@ def test_few_missing_files_are_tolerated_and_counted(tmp_path):
     (folder / "depth" / "18.png").unlink()
     with pytest.raises(SequenceError, match="2 of 60 depth images"):
         open_sequence(folder)
+
+
+@needs_shared
+def test_bonn_poses_are_the_camera_s_and_positions_stay_those_of_the_file():
+    from dynslam_bench.geometry import se3
+    from dynslam_bench.geometry.tum_file import read_tum
+    from dynslam_bench.sequences.catalogue import open_sequence
+
+    folder = SHARED / "data" / "bonn" / "rgbd_bonn_crowd"
+    raw, truth = read_tum(folder / "groundtruth.txt"), open_sequence(folder).ground_truth
+    np.testing.assert_array_equal(truth.positions, raw.positions)
+    relative = se3.inverse(raw.T_world_cam) @ truth.T_world_cam
+    assert np.ptp(relative[:, :3, :3], axis=0).max() < 1e-9, "one fixed rotation between markers and camera"
+    assert se3.is_pose(truth.T_world_cam[0], 1e-9)

@@ -1,0 +1,113 @@
+"""Every system on rendered walking: it runs, says what it culls, culls where it should, and refuses what it must."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.settings import Parameter, parameters, settings_table
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.slam.result import TrackResult
+from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
+from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
+
+FRAMES = 9
+SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)]
+IDENTITY = {"orb-slam2"}
+SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
+"""Need five keyframes, or a window of frames, before they judge."""
+
+
+@pytest.fixture(scope="module")
+def walking():
+    return open_sequence(f"synthetic/walking_xyz?frames={FRAMES}")
+
+
+def run(spec: TrackerSpec, sequence, seed: int = 0, **settings: object) -> list[TrackResult]:
+    semantic = issubclass(spec.settings, SemanticSystemSettings)
+    if semantic and spec.settings().segmentation.source == "auto":
+        settings.setdefault("segmentation.source", "oracle")
+    tracker = build_tracker(spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
+    tracker.reset(sequence.camera, rng=np.random.default_rng(seed))
+    return [tracker.track(sequence[index]) for index in range(FRAMES)]
+
+
+@pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
+def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) -> None:
+    results = run(spec, walking)
+    assert [result.state for result in results] == ["ok"] * FRAMES
+    keys = [set(result.stats) for result in results[2:]]
+    assert all(each == keys[0] for each in keys), "the same stats on every frame"
+    assert all(np.isfinite(list(result.stats.values())).all() for result in results)
+    culled = sum(result.stats["culled"] for result in results)
+    if spec.id in IDENTITY:
+        assert culled == 0
+    elif spec.id not in SLOW_STARTERS:
+        assert culled > 0
+    for result in results:
+        assert np.count_nonzero(~result.keypoints_keep) == result.stats["culled"]
+
+
+@pytest.mark.parametrize("name", ["emfoa-oft", "yolo-slam"])
+def test_one_seed_gives_the_same_bits(name: str, walking) -> None:
+    first, second = run(TRACKERS.get(name), walking), run(TRACKERS.get(name), walking)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
+        assert a.stats == b.stats
+
+
+def test_masks_cull_the_people_and_little_else(walking) -> None:
+    result = run(TRACKERS.get("mask-rcnn"), walking, **{"segmentation.dilation_px": 0})[-1]
+    masks = walking.masks[FRAMES - 1]
+    people = np.isin(masks.instances, [k for k, name in masks.class_names.items() if name == "person"])
+    column, row = np.rint(result.keypoints_xy).astype(int).T
+    on_person = people[row.clip(0, 479), column.clip(0, 639)]
+    assert not result.keypoints_keep[on_person].any()
+    moving = np.isin(masks.instances, list(masks.moving))[row.clip(0, 479), column.clip(0, 639)]
+    np.testing.assert_array_equal(~result.keypoints_keep, on_person | moving)
+
+
+@pytest.mark.parametrize("name", ["mask-rcnn", "yolo-slam", "seg-slam"])
+def test_no_masks_where_a_system_needs_them_is_a_clear_error(name: str, walking) -> None:
+    with pytest.raises(SegmentationError, match=r"needs masks.*none.*oracle.*onnx:PATH"):
+        run(TRACKERS.get(name), walking, **{"segmentation.source": "none"})
+
+
+def test_online_settings_come_into_force_at_once(walking) -> None:
+    spec = TRACKERS.get("mask-rcnn")
+    tracker = build_tracker(
+        spec, {"segmentation.source": "oracle"}, TrackerContext(sequence_id=walking.id, masks=walking.masks)
+    )
+    assert isinstance(tracker, SlamPipeline)
+    tracker.reset(walking.camera, rng=np.random.default_rng(0))
+    before = tracker.track(walking[0]).stats["mask_fraction"]
+    wider = spec.settings.model_validate({"segmentation": {"source": "oracle", "dilation_px": 60}})
+    tracker.update_settings(wider)
+    assert tracker.track(walking[1]).stats["mask_fraction"] > 1.2 * before
+
+
+@pytest.mark.parametrize("spec", all_specs(), ids=lambda spec: spec.id)
+def test_specs_are_complete(spec: TrackerSpec) -> None:
+    assert spec.label and spec.summary and spec.provenance
+    described = parameters(spec.settings)
+    assert all(isinstance(each, Parameter) and each.meaning for each in described)
+    assert settings_table(spec.settings).count("\n") >= 2
+    if spec.provenance in ("inspired", "assumed"):
+        assert not spec.ranked and spec.assumptions
+    if issubclass(spec.settings, SystemSettings):
+        assert spec.citation and ("our back end" in spec.label or "ablation" in spec.label)
+
+
+def test_listing_trackers_loads_nothing_heavy() -> None:
+    code = (
+        "import sys; from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30; "
+        "heavy = {'torch', 'cv2', 'gtsam', 'numba'} & set(sys.modules); assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[2])
