@@ -39,7 +39,7 @@ class TrackingSettings(Settings):
         meaning="points nearer than this many stereo baselines are close: their depth is trusted at once",
     )  # fmt: skip
     right_sigma_px: float = tunable(
-        1.0, low=0.3, high=3.0, limits=(0.05, 50.0), scale="log", unit="px",
+        1.5, low=0.3, high=3.0, limits=(0.05, 50.0), scale="log", unit="px",
         meaning="standard deviation of the right coordinate at octave 0, beside the depth sensor's noise",
     )  # fmt: skip
     depth_noise: float = tunable(
@@ -163,7 +163,7 @@ class MotionSettings(Settings):
         meaning="standard deviation of the camera's angular acceleration",
     )
     inflation: float = tunable(
-        50.0,
+        100.0,
         low=1.0,
         high=300.0,
         limits=(0.01, 10000.0),
