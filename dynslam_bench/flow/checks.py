@@ -8,18 +8,33 @@ from numpy.typing import NDArray
 from .estimator import FlowResult
 
 
+def flow_stats(points: int, valid: int = 0, evaluations: int = 0, *, degenerate: bool = False) -> dict[str, float]:
+    """The stats of all our flows, the same keys in every result.
+
+    Args:
+        points: How many were asked for.
+        valid: How many were found.
+        evaluations: Matching costs computed.
+        degenerate: Whether the images allow no flow: identical, without texture, too small.
+    """
+    return {
+        "points": float(points), "valid": float(valid), "evaluations": float(evaluations),
+        "degenerate": float(degenerate),
+    }  # fmt: skip
+
+
 def empty_result() -> FlowResult:
     """The result for no points."""
     return FlowResult(
         np.empty((0, 2), np.float32), np.empty(0, np.bool_), np.empty(0, np.float32),
-        {"points": 0.0, "valid": 0.0, "evaluations": 0.0},
+        flow_stats(0),
     )  # fmt: skip
 
 
-def unseen_result(points: NDArray[np.float32], **reasons: float) -> FlowResult:
-    """No point is valid; each stays where it is, or at 0 where it is not finite."""
+def unseen_result(points: NDArray[np.float32]) -> FlowResult:
+    """The result for images that allow no flow: each point stays where it is, or at 0 where it is not finite."""
     n = len(points)
-    stats = {"points": float(n), "valid": 0.0, "evaluations": 0.0, **reasons}
+    stats = flow_stats(n, degenerate=True)
     xy = np.where(np.isfinite(points), points, 0).astype(np.float32)
     return FlowResult(xy, np.zeros(n, np.bool_), np.ones(n, np.float32), stats)
 

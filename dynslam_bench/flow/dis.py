@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import empty_result, same_image, unseen_result, usable_points
+from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
 from .estimator import FlowResult
 from .settings import FlowSettings
 
@@ -51,11 +51,11 @@ class DisFlow:
         if not n:
             return empty_result()
         if same_image(reference, target):
-            return unseen_result(points, identical=1.0)
+            return unseen_result(points)
         if min(reference.shape) < SMALLEST_SIDE:
-            return unseen_result(points, too_small=1.0)
+            return unseen_result(points)
         if reference.max() == reference.min() or target.max() == target.min():
-            return unseen_result(points, textureless=1.0)
+            return unseen_result(points)
         usable = usable_points(points, reference.shape)
         clean = np.where(usable[:, None], points, 0).astype(np.float32)
         xy = clean + _read(self.dense(reference, target), clean)
@@ -67,7 +67,7 @@ class DisFlow:
             cost = np.hypot(*(back - clean).T).astype(np.float32)
             valid &= cost <= self.settings.forward_backward_px
         xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
-        return FlowResult(xy, valid, cost, {"points": float(n), "valid": float(valid.sum()), "evaluations": 0.0})
+        return FlowResult(xy, valid, cost, flow_stats(n, int(valid.sum())))
 
 
 def _read(flow: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:

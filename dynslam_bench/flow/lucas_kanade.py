@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import empty_result, same_image, unseen_result, usable_points
+from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
 from .estimator import FlowResult
 from .settings import FlowSettings
 
@@ -41,7 +41,7 @@ class LucasKanadeFlow:
         if not n:
             return empty_result()
         if same_image(reference, target):
-            return unseen_result(points, identical=1.0)
+            return unseen_result(points)
         usable = usable_points(points, reference.shape)
         clean = np.where(usable[:, None], points, 0).astype(np.float32)
         initial = clean.copy()
@@ -54,7 +54,7 @@ class LucasKanadeFlow:
             back, returned, _ = self._follow(target, reference, np.where(valid[:, None], xy, clean), clean)
             valid &= returned & (np.hypot(*(back - clean).T) <= self.settings.forward_backward_px)
         xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
-        stats = {"points": float(n), "valid": float(valid.sum()), "evaluations": 0.0}
+        stats = flow_stats(n, int(valid.sum()))
         return FlowResult(xy, valid, error, stats)
 
     def _follow(

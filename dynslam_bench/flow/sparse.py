@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
-from .checks import empty_result, same_image, unseen_result, usable_points
+from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
 from .consensus import dissenting_labels
 from .estimator import FlowResult
 from .maps import OrientationMaps, orientation_maps
@@ -69,7 +69,7 @@ class SparseDaisyFlow:
         if not len(points):
             return empty_result()
         if same_image(reference.gray, target.gray):
-            return unseen_result(points, identical=1.0)
+            return unseen_result(points)
         usable = usable_points(points, reference.gray.shape)
         if not usable.all():
             inner = self.track(
@@ -106,12 +106,7 @@ class SparseDaisyFlow:
         valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
         if settings.forward_backward_px > 0 and settings.refinement == "lucas-kanade":
             valid &= self._way_back(points, xy, labels, reference, target) <= settings.forward_backward_px
-        stats = {
-            "points": float(n),
-            "valid": float(valid.sum()),
-            "evaluations": float(evaluations.sum()),
-            "evaluations_per_point": float(evaluations.sum()) / n,
-        }
+        stats = flow_stats(n, int(valid.sum()), int(evaluations.sum()))
         return FlowResult(xy, valid, np.asarray(cost / tables.ceiling, dtype=np.float32), stats)
 
     def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:

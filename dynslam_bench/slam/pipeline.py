@@ -95,6 +95,7 @@ class SlamPipeline:
         self._camera = camera
         self._seed = derive_seed(rng)
         self._backend.reset(camera, seed=self._seed)
+        self._no_flow_stats = {} if self._flow is None else _keys_of(self._flow, camera)
         for each in (*self._filters, self._masks):
             if each is not None and hasattr(each, "reset"):
                 each.reset(camera)
@@ -155,10 +156,9 @@ class SlamPipeline:
             "guard_undone": float(undone),
             "mask_fraction": 0.0 if mask is None else float(mask.mean()),
         }
-        if state.flow is not None:
-            stats |= {f"flow_{key}": value for key, value in state.flow.stats.items()}
-        elif self._flow is not None:
-            stats["flow_valid"] = 0.0
+        if self._flow is not None:
+            found = self._no_flow_stats if state.flow is None else state.flow.stats
+            stats |= {f"flow_{key}": value for key, value in found.items()}
         if self._cached:
             stats["cached_stages"] = float(sum(stage.hit for stage in self._cached.values()))
         self._remember(bundle, keep, image, result)
@@ -264,6 +264,12 @@ def predicted_flow(bundle: FrameBundle, state: FilterState) -> NDArray[np.float3
     pixels[ahead] = state.camera.distort_points(state.camera.project(points[ahead]))
     guess[known] = pixels
     return guess
+
+
+def _keys_of(flow: FlowEstimator, camera: Camera) -> dict[str, float]:
+    """The flow's stats at zero, for frames without a previous one."""
+    blank = flow.prepare(np.zeros((camera.height, camera.width), np.uint8))
+    return dict.fromkeys(flow.track(blank, blank, np.full((1, 2), 100.0, np.float32)).stats, 0.0)
 
 
 def _union(masks: list[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:

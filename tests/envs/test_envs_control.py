@@ -101,5 +101,5 @@ def test_our_own_tracker_can_be_steered(real_data: str) -> None:
         settings={"segmentation.source": "none"}, frames=(0, 4),
     )  # fmt: skip
     env.reset(seed=0)
-    spent = [env.step(np.array([action]))[4]["stats"]["flow_evaluations_per_point"] for action in (-1.0, 1.0, -1.0)]
+    spent = [env.step(np.array([action]))[4]["stats"]["flow_evaluations"] for action in (-1.0, 1.0, -1.0)]
     assert spent[1] > 2 * spent[0] and spent[1] > 2 * spent[2]

@@ -7,17 +7,17 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from reports_fake_store import add_run, fill, truth_of
+
+from dynslam_bench.core.errors import ReportError
+from dynslam_bench.evaluation import evaluate
+from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.board import make_board, shortened
 from dynslam_bench.reports.rows import RunRow, check_one_protocol, load_runs
 from dynslam_bench.reports.sequence_figures import broken
 from dynslam_bench.reports.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown
 from dynslam_bench.reports.tables import leaderboard, per_sequence
-from reports_fake_store import add_run, fill, truth_of
-
-from dynslam_bench.core.errors import ReportError
-from dynslam_bench.evaluation import evaluate
-from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs.store import RunStore
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from dynslam_bench.reports.statistics import critical_difference, holm, paired_p_value, power_note, standings
 from scipy import stats
+
+from dynslam_bench.reports.statistics import critical_difference, holm, paired_p_value, power_note, standings
 
 
 def cells(rng, trackers, sequences=6, runs=4, spread=0.1):

@@ -50,7 +50,8 @@ def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) 
     if spec.id in IDENTITY:
         assert culled == 0
     elif spec.id not in SLOW_STARTERS:
-        assert culled > 0
+        degenerate = [result.stats.get("epipolar_degenerate") for result in results[1:]]
+        assert culled > 0 or set(degenerate) == {1.0}, "it culls, or says that the camera shows too little parallax"
     for result in results:
         assert np.count_nonzero(~result.keypoints_keep) == result.stats["culled"]
 

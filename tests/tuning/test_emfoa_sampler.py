@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
-from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
 from optuna.samplers import BaseSampler
+
+from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
 
 suites = pytest.importorskip("optuna.testing.pytest_samplers", reason="Optuna < 5 ships no sampler suite")
 

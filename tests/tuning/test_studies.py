@@ -14,6 +14,10 @@ import numpy as np
 import optuna
 import pytest
 import toy_tracker
+from optuna.trial import TrialState
+
+from dynslam_bench.core.errors import DynslamError, StudyError
+from dynslam_bench.runs import RunStore
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
 from dynslam_bench.tuning.dominance import hopeless
 from dynslam_bench.tuning.final_runs import paired_ratio
@@ -21,10 +25,6 @@ from dynslam_bench.tuning.objective import Instance, Outcome
 from dynslam_bench.tuning.space import distribution
 from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
-from optuna.trial import TrialState
-
-from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.runs import RunStore
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
