@@ -39,7 +39,7 @@ from .observation import (
     stats_space,
 )
 from .reward import RewardKind, reward_named
-from .source import Frames, open_frames
+from .source import Frames, open_frames, preprocessing_of
 
 FrameTransform = Callable[[Frame], Frame]
 Array = NDArray[np.float64]
@@ -141,7 +141,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._threads = threads
         self._cache = str(default_folder()) if cache else None
         self._open: Callable[[str | FrameSequence], FrameSequence] = lambda name: open_frames(
-            name, data_root, camera, frames, stride
+            name, data_root, camera, frames, stride, preprocessing_of(self.settings)
         )
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
@@ -318,6 +318,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if len(opened) < 2:
             raise SequenceError(f"'{opened.id}' has {len(opened)} frames here, an episode needs 2 or more")
         self.sequence = opened
+        self._source = sequence
 
     def _apply_options(self, options: Mapping[str, Any]) -> None:
         unknown = sorted(set(options) - {"sequence", "settings"})
@@ -325,9 +326,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
         if "settings" in options:
             changes = options["settings"]
+            before_settings = preprocessing_of(self.settings)
             self._use_settings(
                 changes if isinstance(changes, Settings) else apply_overrides(self.settings, changes or {})
             )  # fmt: skip
+            if preprocessing_of(self.settings) != before_settings:
+                options = {"sequence": self._source, **options}
         if "sequence" in options:
             before = self.sequence
             self._use_sequence(options["sequence"])

@@ -7,29 +7,49 @@ from pathlib import Path
 from typing import cast
 
 from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.settings import Settings
 from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
 from dynslam_bench.sequences.frame import Sequence, SequenceView
+from dynslam_bench.sequences.settings import PreprocessingSettings
 
 Frames = PySequence[int | None] | str | None
 """Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
 
 
 def open_frames(
-    sequence: str | Sequence, data_root: str | Path | None, camera: str | Path | None, frames: Frames, stride: int
+    sequence: str | Sequence,
+    data_root: str | Path | None,
+    camera: str | Path | None,
+    frames: Frames,
+    stride: int,
+    preprocessing: PreprocessingSettings | None = None,
 ) -> Sequence:
-    """The sequence, cut to the frames asked for.
+    """The sequence, preprocessed and cut to the frames asked for.
 
     Raises:
         SequenceError: Unknown, missing or damaged sequence, or no frames are left.
     """
     start, stop = parse_frames(frames if frames is None or isinstance(frames, str) else _pair(frames))
     if isinstance(sequence, str | Path):
-        return open_sequence(sequence, data_root=data_root, camera=camera, frames=(start, stop), stride=stride)
+        return open_sequence(
+            sequence, data_root=data_root, camera=camera, frames=(start, stop), stride=stride,
+            preprocessing=preprocessing,
+        )  # fmt: skip
     if stride < 1:
         raise SequenceError(f"stride is {stride}, expected at least 1")
+    if preprocessing is not None and preprocessing.changes_images:
+        from dynslam_bench.sequences.preprocessing import Preprocessed
+
+        sequence = cast("Sequence", Preprocessed(sequence, preprocessing))
     if (start, stop, stride) == (0, None, 1):
         return sequence
     return cast("Sequence", SequenceView(sequence, start, stop, stride))
+
+
+def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
+    """The group ``preprocessing`` of a tracker's settings; None for trackers without one."""
+    found = getattr(settings, "preprocessing", None)
+    return found if isinstance(found, PreprocessingSettings) else None
 
 
 def _pair(frames: PySequence[int | None]) -> tuple[int, int | None]:

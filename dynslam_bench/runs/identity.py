@@ -17,7 +17,7 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
-from dynslam_bench.envs.source import open_frames
+from dynslam_bench.envs.source import open_frames, preprocessing_of
 from dynslam_bench.segmentation.build import resolve_source
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.frame import Sequence
@@ -73,7 +73,9 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     if missing:
         raise RunError(f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing))
     settings = resolve_settings(tracker, spec.settings)
-    sequence = open_frames(spec.sequence, spec.data_root, spec.camera, spec.frames, spec.stride)
+    sequence = open_frames(
+        spec.sequence, spec.data_root, spec.camera, spec.frames, spec.stride, preprocessing_of(settings)
+    )
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
     _check_degradation(spec.degrade)

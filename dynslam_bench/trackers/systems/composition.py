@@ -12,6 +12,7 @@ from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings
 
 from ..protocol import TrackerContext
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 class SystemSettings(Settings):
     """What every system on our back end has."""
 
+    preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
     backend: BackendSettings = BackendSettings()
     guard: GuardSettings = GuardSettings()

@@ -1,0 +1,35 @@
+"""The paper's preprocessing is a group of the tracker's settings; the environment's frames follow it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynslam_bench.envs import SlamEnv
+from dynslam_bench.runs import RunSpec, resolve
+
+SEQUENCE = "synthetic/sitting_xyz?frames=4"
+HALF = {"preprocessing.width": 320, "preprocessing.height": 240}
+
+
+def test_frames_are_resized_and_the_intrinsics_with_them() -> None:
+    env = SlamEnv(SEQUENCE, "orb-slam2", settings=HALF)
+    assert (env.sequence.camera.width, env.sequence.camera.height) == (320, 240)
+    assert env.sequence.camera.fx == 535.4 / 2
+    _, info = env.reset(seed=0)
+    while info["tracking_state"] == "ok" and env.episode.next_index < 4:
+        *_, info = env.step(0)
+    assert info["tracking_state"] == "ok" and info["pose_error_trans_m"] < 0.05
+
+
+def test_a_reset_may_change_it() -> None:
+    env = SlamEnv(SEQUENCE, "orb-slam2")
+    plain = env.sequence[1].rgb
+    env.reset(seed=0, options={"settings": {"preprocessing.normalisation": "equalise"}})
+    changed = env.sequence[1].rgb
+    assert changed.shape == plain.shape and np.abs(changed.astype(int) - plain).mean() > 2
+
+
+def test_it_is_part_of_a_run_s_identity() -> None:
+    plain = resolve(RunSpec(tracker="orb-slam2", sequence=SEQUENCE))
+    half = resolve(RunSpec(tracker="orb-slam2", sequence=SEQUENCE, settings=HALF))
+    assert plain.run_id != half.run_id and half.sequence.camera.width == 320
