@@ -82,7 +82,7 @@ def test_culled_features_enter_neither_tracking_nor_map(room, tracked):
         keeps.append(~moving)
     backend = make(room)
     results = tracked(backend, frames, keeps)
-    assert errors(results, truth).max() < 0.015
+    assert errors(results, truth).max() < 0.025
     assert all(r.stats["culled"] == np.count_nonzero(~keep) for r, keep in zip(results, keeps, strict=True))
     views = backend.keyframe_views(100)
     by_frame = {k.frame: view for k, view in zip(backend.outputs().keyframes[::-1], views, strict=True)}
