@@ -200,11 +200,13 @@ def paired_ratio(
         by_sequence.setdefault(instance.sequence, []).append(ratio)
     groups = [np.array(values) for values in by_sequence.values()]
     rng = stream(0, "bootstrap", *sorted(by_sequence))
-    means = np.empty(RESAMPLES)
-    for index in range(RESAMPLES):
-        drawn = [groups[i] for i in rng.integers(len(groups), size=len(groups))]
-        means[index] = np.mean([rng.choice(values, len(values)).mean() for values in drawn])
-    low, high = np.quantile(means, [0.025, 0.975])
+    size = np.array([len(values) for values in groups])
+    padded = np.stack([np.pad(values, (0, size.max() - len(values))) for values in groups])
+    drawn = rng.integers(len(groups), size=(RESAMPLES, len(groups)))  # sequences, then seeds within each of them
+    member = (rng.random((*drawn.shape, size.max())) * size[drawn][..., None]).astype(np.intp)
+    counts = np.arange(size.max()) < size[drawn][..., None]
+    means = (padded[drawn[..., None], member] * counts).sum(axis=2) / size[drawn]
+    low, high = np.quantile(means.mean(axis=1), [0.025, 0.975])
     centre = float(np.mean([values.mean() for values in groups]))
     return Ratio(
         ratio=math.exp(centre), low=math.exp(low), high=math.exp(high), n=len(instances), sequences=len(groups)

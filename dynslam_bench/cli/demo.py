@@ -45,12 +45,12 @@ class DemoOutcome:
     failed: int
 
 
-def run_demo(results: Path | str = "results", *, frames: int = 150, jobs: int = 2, trials: int = 10) -> DemoOutcome:
+def run_demo(results: Path | str = "results", *, frames: int = 300, jobs: int = 2, trials: int = 10) -> DemoOutcome:
     """Render walking and sitting people, run the suite ``demo`` on them, report it, and tune the paper's system.
 
     Args:
         results: Results folder; the report is ``report/index.html`` in it, the study lies in ``study``.
-        frames: Frames of each sequence; the study takes 40 % of them.
+        frames: Frames of each sequence; the study takes a fifth of them.
         jobs: Runs at a time.
         trials: Trials of the study.
 
@@ -71,7 +71,7 @@ def run_demo(results: Path | str = "results", *, frames: int = 150, jobs: int = 
     records = make_runs(specs, store, jobs=jobs)
     note("making the report")
     paths = build_report(store, store.root / "report", title="Demo: walking and sitting people, rendered")
-    summary, page = tune_a_little(store.root / "study", frames=max(20, 2 * frames // 5), jobs=jobs, trials=trials)
+    summary, page = tune_a_little(store.root / "study", frames=max(20, frames // 5), jobs=jobs, trials=trials)
     failed = sum(record.failed for record in records)
     return DemoOutcome(leaderboard_text(store), paths.html, summary, page, len(records), failed)
 

@@ -94,7 +94,9 @@ def compose(
         masks=masks,
         filters=filters,
         flow=estimator,
-        backend=RgbdBackend(settings.backend),
+        backend=RgbdBackend(
+            settings.backend, scale_factor=settings.features.scale_factor, levels=settings.features.levels
+        ),
         guard=settings.guard,
         cached=cached,
     )
