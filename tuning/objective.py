@@ -148,9 +148,10 @@ class Evaluator:
         """ATE RMSE in metres of a stored run's first frames; None where they have no error."""
         record = self.store.get(run_id)
         trajectory = self.store.trajectory(run_id, "online")
-        if record is None or trajectory is None:
+        truth = None if record is None else self.store.ground_truth(record.sequence.part)
+        if record is None or trajectory is None or truth is None:
             return None
-        truth, stamps = self.store.ground_truth(record.sequence.part), self.store.timestamps(record.sequence.part)
+        stamps = self.store.timestamps(record.sequence.part)
         seen = trajectory.select(trajectory.timestamps <= stamps[min(frames, len(stamps)) - 1])
         try:
             evaluation = evaluate(seen, truth, self.protocol, input_timestamps=stamps[:frames])

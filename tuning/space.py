@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, cast
 
 import optuna
 
@@ -84,7 +84,7 @@ def default_configuration(space: list[Parameter], base: Mapping[str, Any]) -> di
 
 def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
     if parameter.kind in ("bool", "categorical"):
-        return trial.suggest_categorical(parameter.name, parameter.choices)
+        return cast("Scalar", trial.suggest_categorical(parameter.name, parameter.choices))
     assert parameter.low is not None and parameter.high is not None
     log = parameter.scale == "log"
     if parameter.kind == "int":

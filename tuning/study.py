@@ -144,7 +144,7 @@ class Tuner:
     def _evaluate(self, trial: optuna.Trial, values: dict[str, Any]) -> tuple[TrialState, list[float] | None, str]:
         settings = {**self.spec.space.fixed, **values}
         order = list(self.tune_instances)
-        stream(self.spec.sampler_seed, "order", trial.number).shuffle(order)  # type: ignore[arg-type]
+        stream(self.spec.sampler_seed, "order", trial.number).shuffle(order)
         found = Configuration()
         started = time.perf_counter()
         try:
@@ -256,7 +256,9 @@ class Tuner:
                 self.study.tell(trial.number, state=TrialState.FAIL)
 
     def _open(self, sampler: optuna.samplers.BaseSampler, pruner: optuna.pruners.BasePruner) -> optuna.Study:
-        directions = ["minimize" if objective == "accuracy" else "maximize" for objective in self.spec.objectives]
+        directions: list[Literal["minimize", "maximize"]] = [
+            "minimize" if objective == "accuracy" else "maximize" for objective in self.spec.objectives
+        ]
         storage = open_storage(self.results, self.spec)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.geometry.camera import Camera
 
+from .coherence import coherent
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from .semantic import inside
 from .settings import EpipolarSettings
@@ -114,7 +115,9 @@ class EpipolarFilter(DynamicFilter):
         if stats["matches"] < MIN_MATCHES:
             return FilterResult.of(keep, {**stats, "degenerate": 1.0})
         stats["parallax_px"] = rotation_residual(before[fit], frame.xy[fit], state.camera)
-        degenerate = stats["parallax_px"] < self.settings.min_parallax_px
+        flow_px = float(np.median(np.linalg.norm(before[fit] - frame.xy[fit], axis=1)))
+        needed = max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px)
+        degenerate = stats["parallax_px"] < needed
         if not degenerate:
             stats["homography_share"] = homography_share(before[fit], frame.xy[fit])
             degenerate = stats["homography_share"] >= self.settings.homography_share
@@ -126,7 +129,8 @@ class EpipolarFilter(DynamicFilter):
         failing[flow.valid] = distance > self.settings.threshold_px
         stats["inliers"] = float(np.count_nonzero(fit & ~failing))
         if self.settings.mode == "point":
-            return FilterResult.of(~failing, stats)
+            moving = coherent(failing, flow.valid, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
+            return FilterResult.of(~moving, stats)
         keep, stats["moving_objects"] = vote_on_objects(frame, failing, flow.valid, self.settings.vote_share)
         return FilterResult.of(keep, stats)
 

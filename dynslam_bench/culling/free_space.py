@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
+from .coherence import coherent
 from .ego_motion import depth_sigma
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
 from .settings import FreeSpaceSettings
@@ -53,7 +54,10 @@ class FreeSpaceFilter(DynamicFilter):
             votes += violated
             seen |= observed
         self._forget({view.timestamp for view in keyframes})
-        keep[known] = votes < min(self.settings.min_votes, len(keyframes))
+        violating, tested = np.zeros(len(frame), dtype=bool), np.zeros(len(frame), dtype=bool)
+        violating[known] = votes >= min(self.settings.min_votes, len(keyframes))
+        tested[known] = seen
+        keep = ~coherent(violating, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
         return FilterResult.of(keep, {"asked": float(len(keyframes)), "tested": float(np.count_nonzero(seen))})
 
     def _saw_past(

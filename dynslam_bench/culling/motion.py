@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
+from .coherence import coherent
 from .ego_motion import CELL, depth_sigma
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from .settings import MotionSettings
@@ -43,6 +44,7 @@ class MotionFilter(DynamicFilter):
         tested = flow.valid & (frame.z > 0)
         failed = np.zeros(len(frame), dtype=bool)
         failed[tested] = self._fails(frame, state, tested)
+        failed = coherent(failed, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
         evidence = failed.astype(np.float64)
         evidence[flow.valid] += self.settings.memory * self._recall(frame, flow.xy[flow.valid])
         evidence = evidence.clip(0, 1)
@@ -57,11 +59,14 @@ class MotionFilter(DynamicFilter):
         T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
         moved = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[tested], frame.z[tested]))
         before = state.camera.undistort_points(state.flow.xy[tested])
-        distance = np.linalg.norm(state.camera.project(moved) - before, axis=1)
+        expected = state.camera.project(moved)
+        distance = np.linalg.norm(expected - before, axis=1)
+        explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
+        limit_px = self.settings.threshold_px + self.settings.threshold_share * explained
         seen = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
         limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
         off_depth = (seen > 0) & (np.abs(seen - moved[:, 2]) > limit)
-        return np.asarray(~(distance <= self.settings.threshold_px) | off_depth)
+        return np.asarray(~(distance <= limit_px) | off_depth)
 
     def _recall(self, frame: FrameBundle, before: NDArray[np.floating]) -> NDArray[np.float64]:
         if self._evidence is None:

@@ -37,9 +37,17 @@ class EpipolarSettings(Settings):
         1.0, low=0.0, high=5.0, limits=(0.0, 50.0), unit="px", online=True,
         meaning="median parallax (flow beyond a pure rotation) below which the test is skipped as degenerate",
     )  # fmt: skip
+    parallax_share: float = tunable(
+        0.05, low=0.0, high=0.2, limits=(0.0, 1.0),
+        meaning="the same, as a share of the median flow: rolling shutter bends a fast rotation's flow",
+    )  # fmt: skip
     homography_share: float = tunable(
         0.8, low=0.5, high=1.0, limits=(0.0, 1.0),
         meaning="share of the matches explained by one homography above which the test is skipped as degenerate",
+    )  # fmt: skip
+    min_share: float = tunable(
+        0.4, low=0.0, high=0.8, limits=(0.0, 1.0), online=True, when={"mode": ["point"]},
+        meaning="share of the tested points around a failing one that must fail too; 0 drops every failing point",
     )  # fmt: skip
     mode: Literal["point", "object"] = tunable(
         "point", meaning="drop the failing point, or vote on the object that it lies on (paper, step 3)"
@@ -62,9 +70,17 @@ class MotionSettings(Settings):
         2.5, low=0.5, high=10.0, scale="log", limits=(0.05, 100.0), unit="px", online=True, when={"enabled": [True]},
         meaning="reprojection distance after the camera's motion above which a point is dynamic",
     )  # fmt: skip
+    threshold_share: float = tunable(
+        0.05, low=0.0, high=0.2, limits=(0.0, 1.0), when={"enabled": [True]},
+        meaning="added to it, as a share of the flow that the camera's motion explains (rolling shutter)",
+    )  # fmt: skip
     threshold_sigma: float = tunable(
         4.0, low=1.0, high=12.0, scale="log", limits=(0.1, 100.0), online=True, when={"enabled": [True]},
         meaning="depth difference, in standard deviations of the sensor, above which a point is dynamic",
+    )  # fmt: skip
+    min_share: float = tunable(
+        0.4, low=0.0, high=0.8, limits=(0.0, 1.0), online=True, when={"enabled": [True]},
+        meaning="share of the tested points around a failing one that must fail too; 0 takes every failure for motion",
     )  # fmt: skip
     memory: float = tunable(
         0.6, low=0.0, high=0.95, limits=(0.0, 0.99), when={"enabled": [True]},
@@ -94,6 +110,10 @@ class FreeSpaceSettings(Settings):
     min_votes: int = tunable(
         2, low=1, high=5, online=True, when={"enabled": [True]}, meaning="keyframes that must have seen past the point"
     )
+    min_share: float = tunable(
+        0.4, low=0.0, high=0.8, limits=(0.0, 1.0), online=True, when={"enabled": [True]},
+        meaning="share of the tested points around a failing one that must fail too; 0 takes every failure for motion",
+    )  # fmt: skip
     max_age_s: float = tunable(
         10.0, low=2.0, high=60.0, scale="log", limits=(0.1, 1e4), unit="s", when={"enabled": [True]},
         meaning="keyframes older than this are not asked: what they saw may have been moved for good",

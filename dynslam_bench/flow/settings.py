@@ -36,8 +36,8 @@ class FlowSettings(Settings):
         "equations as printed, PatchMatch, or uniform random",
     )
     budget: int = tunable(
-        96, low=24, high=384, limits=(8, 4096), scale="log", online=True, when=_DAISY,
-        meaning="cost evaluations a point (sparse) or superpixel (dense)",
+        64, low=24, high=384, limits=(8, 4096), scale="log", online=True, when=_DAISY,
+        meaning="cost evaluations a point in the label search (sparse mode)",
     )  # fmt: skip
     population: int = tunable(6, low=4, high=16, limits=(2, 32), when=_EMFOA, meaning="moths (and flames) a point")
     sweeps: int = tunable(

@@ -220,7 +220,7 @@ def open_folder(
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
     intrinsics, fps = find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
-    body = MARKER_TO_CAMERA.get(camera or "" if entry is None else entry.camera)
+    body = MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera)
     if entry is None:
         description = Description(f"folder/{folder.resolve().name}", intrinsics, fps, R_body_cam=body)
     else:

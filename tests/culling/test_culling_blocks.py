@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, box_instance, bundle, keyframe, scene
 
+from dynslam_bench.culling.coherence import coherent
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.filter import DynamicFilter, FilterState
@@ -50,7 +51,7 @@ def test_fundamental_matrix_is_that_of_the_true_motion(estimator: str) -> None:
 
 def test_epipolar_culls_exactly_the_moving_points() -> None:
     made = scene(SIDEWAYS, motion=ACROSS)
-    verdict = EpipolarFilter(EpipolarSettings()).apply(made.frame, made.state)
+    verdict = EpipolarFilter(EpipolarSettings(min_share=0.0)).apply(made.frame, made.state)
     np.testing.assert_array_equal(verdict.keep, ~made.moving)
     assert verdict.stats["degenerate"] == 0
 
@@ -83,7 +84,7 @@ def test_motion_sees_what_moves_along_epipolar_lines_and_under_rotation() -> Non
     forward = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
     for camera_motion, motion in ((forward, np.array([0, 0, -0.1])), (ROTATION, ACROSS), (np.eye(4), ACROSS)):
         made = scene(camera_motion, motion=motion)
-        verdict = MotionFilter(MotionSettings()).apply(made.frame, made.state)
+        verdict = MotionFilter(MotionSettings(min_share=0.0)).apply(made.frame, made.state)
         np.testing.assert_array_equal(verdict.keep, ~made.moving)
         assert MotionFilter(MotionSettings()).apply((still := scene(camera_motion)).frame, still.state).keep.all()
 
@@ -101,7 +102,7 @@ def test_free_space_culls_what_stands_where_a_keyframe_saw_through() -> None:
     made = scene(SIDEWAYS)
     empty_room = np.full((CAMERA.height, CAMERA.width), 4.5, np.float32)
     static_room = made.state.previous.depth  # what is here now was there before
-    settings = FreeSpaceSettings(min_votes=1)
+    settings = FreeSpaceSettings(min_votes=1, min_share=0.0)
     seen_through = FilterState(
         camera=CAMERA, keep=made.state.keep, T_world_pred=SIDEWAYS, keyframes=(keyframe(np.eye(4), empty_room, 0.5),)
     )
@@ -157,6 +158,20 @@ def test_degenerate_input_culls_nothing_and_never_raises(block: DynamicFilter, c
     verdict = block.apply(frame, state)
     assert verdict.keep.shape == (len(frame),) and verdict.keep.all()
     assert all(np.isfinite(value) for value in verdict.stats.values())
+
+
+def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((0, 0), (640, 480), (1000, 2))
+    region = (np.abs(xy - (320, 240)) < 60).all(axis=1)
+    noise = rng.random(1000) < 0.05
+    tested = np.ones(1000, bool)
+    kept = coherent(region | noise, tested, xy, 0.4, (480, 640))
+    inner = (np.abs(xy - (320, 240)) < 40).all(axis=1)
+    assert kept[inner].all(), "the whole region moves"
+    far = (np.abs(xy - (320, 240)) > 120).any(axis=1)
+    assert kept[far & noise].mean() < 0.05, "lone failures do not"
+    np.testing.assert_array_equal(coherent(noise, tested, xy, 0.0, (480, 640)), noise)
 
 
 def test_guard_undoes_the_most_speculative_verdict_first() -> None:

@@ -102,14 +102,15 @@ def _variant(name: str, defaults: dict[str, Any]) -> type[EmfoaOftSettings]:
 
 
 NO_DEPTH_TEST = {"motion.enabled": False, "free_space.enabled": False}
+AS_PRINTED = {**NO_DEPTH_TEST, "epipolar.min_share": 0.0, "epipolar.parallax_share": 0.0}
 
 SPECS = [
     _spec("emfoa-oft", "the paper's system: masks, EMFOA-optimised DAISY Filter Flow, epipolar culling", {}),
-    _spec("emfoa-oft-paper", "as printed: no depth-consistency test beyond the paper", NO_DEPTH_TEST),
+    _spec("emfoa-oft-paper", "as printed: no depth-consistency test, every failing point goes", AS_PRINTED),
     _spec("emfoa-oft-no-masks", "ablation: geometry alone", {"segmentation.source": "none"}),
     _spec(
         "emfoa-oft-paper-no-masks", "ablation: the paper's epipolar test alone",
-        {"segmentation.source": "none", **NO_DEPTH_TEST},
+        {"segmentation.source": "none", **AS_PRINTED},
     ),
     _spec("emfoa-oft-no-flow", "ablation: masks alone", {}, "build_without_flow"),
     _spec("emfoa-oft-lk", "ablation: Lucas-Kanade instead of DAISY Filter Flow", {"flow.method": "lucas-kanade"}),

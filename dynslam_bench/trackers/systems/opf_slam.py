@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 class OpfSlamSettings(SystemSettings):
     """Lucas-Kanade and the epipolar test."""
 
-    epipolar: EpipolarSettings = EpipolarSettings(min_parallax_px=0.0, homography_share=1.0)
+    epipolar: EpipolarSettings = EpipolarSettings(
+        min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0
+    )
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 
