@@ -23,6 +23,8 @@ from .study import Tuner
 FRESH_SEEDS = 1000
 """Seeds of the final runs: none that a trial has used."""
 RESAMPLES = 4000
+FEWEST_SEQUENCES = 3
+"""With fewer sequences an interval over sequences means nothing."""
 
 
 class Ratio(Record):
@@ -43,8 +45,17 @@ class Ratio(Record):
     sequences: int
 
     @property
+    def shows_gain(self) -> bool:
+        """Whether the whole interval lies below 1, over enough sequences for an interval."""
+        return self.high < 1 and self.sequences >= FEWEST_SEQUENCES
+
+    @property
     def verdict(self) -> str:
-        """One sentence."""
+        """What may be concluded."""
+        if self.sequences < FEWEST_SEQUENCES:
+            return (
+                f"on {self.sequences} sequence{'s' * (self.sequences > 1)} only, from which nothing follows for others"
+            )
         if self.high < 1:
             return f"better than the default by {100 * (1 - self.ratio):.1f} %"
         if self.low > 1:
@@ -159,7 +170,7 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None) -> StudyS
     summary = StudySummary(
         name=spec.name, tracker=spec.tracker, protocol=tuner.evaluator.protocol.describe(),
         trials=count_states(tuner.study), candidates=candidates, chosen=chosen.trial,
-        improves=chosen.held_out is not None and chosen.held_out.high < 1, conclusion=_conclude(chosen),
+        improves=chosen.held_out is not None and chosen.held_out.shows_gain, conclusion=_conclude(chosen),
         importances=importances(tuner.study), held_out=list(spec.held_out), tune=list(spec.tune),
     )  # fmt: skip
     settings = {**spec.space.fixed, **chosen.params}
@@ -252,7 +263,7 @@ def _conclude(chosen: Candidate) -> str:
     if chosen.held_out is None:
         return text + "; no held-out split was given, so nothing is known about other sequences"
     held = f"; on the held-out split {_show(chosen.held_out)} ({chosen.held_out.verdict})"
-    few = "; fewer than five held-out sequences: the interval is rough" if chosen.held_out.sequences < 5 else ""
+    few = "; fewer than five held-out sequences: the interval is rough" if 3 <= chosen.held_out.sequences < 5 else ""
     return text + held + few
 
 

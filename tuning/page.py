@@ -20,6 +20,7 @@ from .preset import preset_text
 from .samplers import is_feasible
 from .study import Tuner
 
+_MODEBAR = {"bgcolor": "rgba(0,0,0,0)", "color": "#c4c9d1", "activecolor": "#1f6fb4"}
 _NAMES = {"accuracy": "log ATE ratio to the default (less is better)", "speed": "real-time factor (more is better)"}
 
 
@@ -111,6 +112,11 @@ def _plain(figure: Any) -> dict[str, Any]:
     specification = json.loads(figure.to_json())
     layout = specification["layout"]
     layout.pop("template", None)
+    layout.pop("title", None)
+    for name, axis in layout.items():
+        if name.startswith(("xaxis", "yaxis")):
+            axis |= {"automargin": True, "gridcolor": "#e5e7eb", "zeroline": False}
+    layout["modebar"] = _MODEBAR
     layout |= {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)"}
     layout.setdefault("height", 420)
     layout.pop("width", None)
@@ -146,7 +152,7 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
             "line": {"color": "#9ca3af", "dash": "dash"}}  # fmt: skip
     layout = {
         "height": 160 + 50 * len(summary.candidates), "shapes": [line], "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)", "margin": {"l": 90, "r": 20, "t": 30, "b": 60},
+        "plot_bgcolor": "rgba(0,0,0,0)", "modebar": _MODEBAR, "margin": {"l": 90, "r": 20, "t": 30, "b": 60},
         "xaxis": {"title": {"text": "ATE ratio to the default settings (left is better)"}, "gridcolor": "#e5e7eb"},
         "yaxis": {"autorange": "reversed", "gridcolor": "#e5e7eb"},
     }  # fmt: skip

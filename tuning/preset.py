@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +16,7 @@ def preset_text(settings: Mapping[str, Any], tracker: str, remark: str) -> str:
         tracker: For which tracker.
         remark: A line on where they come from.
     """
-    lines = [f"# settings of {tracker}", f"# {' '.join(remark.split())}", ""]
+    lines = [f"# settings of {tracker}", *(f"# {line}" for line in textwrap.wrap(remark, 100)), ""]
     groups: dict[str, list[tuple[str, Any]]] = {}
     for name, value in sorted(settings.items()):
         group, _, leaf = name.rpartition(".")

@@ -41,4 +41,4 @@ def coherent(
         ).ravel()
 
     bad, all_ = around(failing & tested), around(tested)
-    return failing & (bad[index] >= MIN_FAILING) & (bad[index] >= share * all_[index])
+    return np.asarray(failing & (bad[index] >= MIN_FAILING) & (bad[index] >= share * all_[index]))
