@@ -9,13 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from ._jit import inlined, kernel
+from ._lanes import load, load_bytes, sample, spread, store, total
 
 BORDER = 48
 """Pixels repeated around the images that are refined on."""
-FLAT_VARIANCE = 256.0
-"""Below a variance of one squared grey level a window is flat (in squared sixteenths)."""
-FLAT_GRADIENT = 1024.0 * 0.05
-"""Smallest mean squared gradient along the worse direction (0.05 squared levels a pixel)."""
+FLAT_VARIANCE = 1.0
+"""Below this variance, in squared grey levels, a window is flat."""
+FLAT_GRADIENT = 4.0 * 0.05
+"""Smallest mean squared gradient along the worse direction: 0.05 squared levels a pixel, differences over two."""
 SIMILARITY_DAMPING = 0.1
 """Prior on the change of scale and rotation, relative to the translation's information at the window's edge."""
 
@@ -34,75 +35,33 @@ def pad_image(image, margin, out):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def read_window(image, x, y, side, out):  # type: ignore[no-untyped-def]
-    """Bilinear samples, one pixel apart, from position (x, y) on: ``side * side`` values in sixteenths of a level."""
+def read_frame(image, x, y, rows, pitch, out):  # type: ignore[no-untyped-def]
+    """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on."""
+    flat, stride = image.reshape(-1), np.int64(image.shape[1])
     column, row = np.int64(x), np.int64(y)
-    fx, fy = np.int32((x - np.float32(column)) * np.float32(64)), np.int32((y - np.float32(row)) * np.float32(64))
-    w11 = fx * fy
-    w01, w10 = fx * np.int32(64) - w11, fy * np.int32(64) - w11
-    w00 = np.int32(4096) - w01 - w10 - w11
-    for r in range(side):
-        upper = image[row + r, column : column + side + 1]
-        lower = image[row + r + 1, column : column + side + 1]
-        line = out[r * side : (r + 1) * side]
-        for c in range(side):
-            line[c] = np.int32(
-                w00 * np.int32(upper[c]) + w01 * np.int32(upper[c + 1]) + w10 * np.int32(lower[c])
-                + w11 * np.int32(lower[c + 1]) + np.int32(128)
-            ) >> np.int32(8)  # fmt: skip
+    right, lower = spread(x - np.float32(column)), spread(y - np.float32(row))
+    for block in range((pitch + 15) // 16):
+        first = min(16 * block, max(pitch - 16, 0))
+        at = row * stride + column + first
+        before = load_bytes(flat, at)
+        before = before + right * (load_bytes(flat, at + 1) - before)
+        for r in range(rows):
+            at += stride
+            after = load_bytes(flat, at)
+            after = after + right * (load_bytes(flat, at + 1) - after)
+            store(out, r * pitch + first, before + lower * (after - before))
+            before = after
 
 
 @inlined
-def warp_window(image, x, y, a, b, reach, out):  # type: ignore[no-untyped-def]
-    """Samples of a window of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
-    flat, stride = image.reshape(-1), np.uint64(image.shape[1])
-    one = np.float32(65536)
-    step_x, step_y = np.int64(a * one), np.int64(b * one)
-    far = np.float32(reach)
-    column0, row0 = np.int64((x - a * far + b * far) * one), np.int64((y - b * far - a * far) * one)
-    bottom, eight, sixteen, low = np.uint64(1), np.uint64(8), np.uint64(16), np.uint64(255)
-    k = 0
-    for r in range(2 * reach + 1):
-        column, row = column0 - r * step_y, row0 + r * step_x
-        for _ in range(2 * reach + 1):
-            ux, uy = np.uint64(column), np.uint64(row)
-            at = (uy >> sixteen) * stride + (ux >> sixteen)
-            fx, fy = np.int32((ux >> eight) & low), np.int32((uy >> eight) & low)
-            p, q = np.int32(flat[at]), np.int32(flat[at + bottom])
-            s, t = np.int32(flat[at + stride]), np.int32(flat[at + stride + bottom])
-            upper, lower = p * 256 + fx * (q - p), s * 256 + fx * (t - s)
-            out[k] = np.int32((upper * 256 + fy * (lower - upper) + 2048) >> 12)
-            k += 1
-            column += step_x
-            row += step_y
-
-
-@inlined
-def shift_window(patch, width, x, y, side, out):  # type: ignore[no-untyped-def]
-    """Bilinear samples of a patch of `width` columns from (x, y) on."""
-    column, row = np.int64(x), np.int64(y)
-    fx, fy = np.int32((x - np.float32(column)) * np.float32(128)), np.int32((y - np.float32(row)) * np.float32(128))
-    w11 = fx * fy
-    w01, w10 = fx * np.int32(128) - w11, fy * np.int32(128) - w11
-    w00 = np.int32(16384) - w01 - w10 - w11
-    for r in range(side):
-        first = (row + r) * width + column
-        upper = patch[first : first + side + 1]
-        lower = patch[first + width : first + width + side + 1]
-        line = out[r * side : (r + 1) * side]
-        for c in range(side):
-            line[c] = np.int32(
-                w00 * upper[c] + w01 * upper[c + 1] + w10 * lower[c] + w11 * lower[c + 1] + np.int32(8192)
-            ) >> np.int32(14)
-
-
-@inlined
-def dot(first, second):  # type: ignore[no-untyped-def]
-    """Exact inner product of two int32 vectors."""
-    total = np.int64(0)
-    for k in range(len(first)):
-        total += np.int64(first[k]) * np.int64(second[k])
-    return total
+def warp_patch(image, x, y, a, b, reach, columns, rows, out):  # type: ignore[no-untyped-def]
+    """Samples of a square patch of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
+    one, far = np.float32(65536), np.float32(reach)
+    column, row = np.int32((x - a * far + b * far) * one), np.int32((y - b * far - a * far) * one)
+    step_x, step_y = np.int32(a * one), np.int32(b * one)
+    flat, stride = image.reshape(-1), np.int32(image.shape[1])
+    for k in range(0, len(columns), 16):
+        store(out, k, sample(flat, stride, columns, rows, k, column, row, step_x, step_y))
 
 
 @kernel
@@ -113,8 +72,11 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
     """Refine labels by photometric alignment of a square window.
 
     The target is warped by the label into the template's frame; within that patch only the translation moves (cheap),
-    between two warps scale and rotation are corrected as well. Sums are of whole numbers, hence exact in any order. A
-    label changes only if the windows' correlation grows.
+    between two warps scale and rotation are corrected as well, unless they stand. A label changes only if the windows'
+    correlation grows.
+
+    All windows lie flat at the patch's pitch, so that a shift by whole pixels is an offset; what is not of the window
+    has zero gradients and mask.
 
     Args:
         start: First point.
@@ -126,64 +88,69 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
         border: Pixels repeated around the images.
         step: Full-image pixels a pixel of these images.
         radius: Window radius in their pixels.
-        margin: Largest translation within one warp, in their pixels.
-        warps: Times the target is warped.
+        margin: Largest translation within one warp, in their pixels, at least 1.
+        warps: Times the target is warped, at most.
         iterations: Translations a warp, at most.
         tolerance: Stop below this change, in their pixels.
         correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1 if flat or not seen.
     """
     side, reach = 2 * radius + 1, radius + margin
-    area, width = side * side, 2 * (radius + margin) + 1
-    frame = np.empty((side + 2) * (side + 2), dtype=np.int32)
-    template = np.empty(area, dtype=np.int32)
-    gradient_x, gradient_y = np.empty(area, dtype=np.int32), np.empty(area, dtype=np.int32)
-    swell, turn = np.empty(area, dtype=np.int32), np.empty(area, dtype=np.int32)
-    patch = np.empty(width * width, dtype=np.int32)
-    window = np.empty(area, dtype=np.int32)
+    pitch = 2 * reach + 1
+    length = 16 * ((side * pitch + 15) // 16)
+    slack = 2 * pitch + 32
+    patch = np.zeros(16 * ((pitch * pitch + 15) // 16) + slack, dtype=np.float32)
+    grid_columns, grid_rows = np.zeros(len(patch) - slack, dtype=np.int32), np.zeros(len(patch) - slack, dtype=np.int32)
+    for k in range(pitch * pitch):
+        grid_columns[k], grid_rows[k] = k % pitch, k // pitch
+    frame = np.zeros((side + 2) * pitch + slack, dtype=np.float32)
+    template, mask = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    gradient_x, gradient_y = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    right, down = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    for y in range(side):
+        for x in range(side):
+            k = y * pitch + x
+            mask[k], right[k], down[k] = np.float32(1), np.float32(x - radius), np.float32(y - radius)
     h = np.empty((4, 4), dtype=np.float64)
     rows, columns = target_image.shape
-    n = np.float64(area)
-    half = np.float32(0.5)
+    n = np.float64(side * side)
+    half, zero = np.float32(0.5), spread(np.float32(0))
     scale_down = np.float32(1) / np.float32(step)
+    limit = np.float32(margin) - np.float32(0.01)
+    room = np.float32(radius + 2)
     for i in range(start, stop):
         correlation[i] = np.float32(-1)
         px = (points[i, 0] + half) * scale_down - half + border
         py = (points[i, 1] + half) * scale_down - half + border
-        room = np.float32(radius + 2)
-        if not (px >= room and py >= room and px < columns - room - 1 and py < rows - room - 1):
+        if not (px >= room and py >= room and px < columns - room - 17 and py < rows - room - 2):
             continue
-        read_window(template_image, px - np.float32(radius + 1), py - np.float32(radius + 1), side + 2, frame)
-        for y in range(side):
-            base, line = (y + 1) * (side + 2) + 1, y * side
-            dy = np.int32(y - radius)
-            for x in range(side):
-                template[line + x] = frame[base + x]
-                gx = np.int32(frame[base + x + 1] - frame[base + x - 1])
-                gy = np.int32(frame[base + x + side + 2] - frame[base + x - side - 2])
-                gradient_x[line + x], gradient_y[line + x] = gx, gy
-                dx = np.int32(x - radius)
-                swell[line + x] = gx * dx + gy * dy
-                turn[line + x] = gy * dx - gx * dy
-        ones = np.int64(0)
-        j0 = j1 = j2 = j3 = np.int64(0)
-        for k in range(area):
-            ones += template[k]
-            j0 += gradient_x[k]
-            j1 += gradient_y[k]
-            j2 += swell[k]
-            j3 += turn[k]
-        # gradients are in sixteenths of a level over two pixels
-        energy = dot(template, template) - np.float64(ones) * ones / n
-        h00 = dot(gradient_x, gradient_x) - np.float64(j0) * j0 / n
-        h01 = dot(gradient_x, gradient_y) - np.float64(j0) * j1 / n
-        h11 = dot(gradient_y, gradient_y) - np.float64(j1) * j1 / n
+        read_frame(template_image, px - np.float32(radius + 1), py - np.float32(radius + 1), side + 2, pitch, frame)
+        sum_t, sum_x, sum_y, xx, xy, yy = zero, zero, zero, zero, zero, zero
+        for k in range(0, length, 16):
+            inside = load(mask, k)
+            gx = inside * (load(frame, k + pitch + 2) - load(frame, k + pitch))
+            gy = inside * (load(frame, k + 2 * pitch + 1) - load(frame, k + 1))
+            sum_t = sum_t + inside * load(frame, k + pitch + 1)
+            sum_x, sum_y = sum_x + gx, sum_y + gy
+            xx, xy, yy = xx + gx * gx, xy + gx * gy, yy + gy * gy
+            store(gradient_x, k, gx)
+            store(gradient_y, k, gy)
+        j0, j1 = np.float64(total(sum_x)), np.float64(total(sum_y))
+        # differences over two pixels
+        h00, h01, h11 = total(xx) - j0 * j0 / n, total(xy) - j0 * j1 / n, total(yy) - j1 * j1 / n
         trace, determinant = h00 + h11, h00 * h11 - h01 * h01
         smaller = 0.5 * (trace - np.sqrt(max(trace * trace - 4 * determinant, 0.0)))
-        if energy < n * FLAT_VARIANCE or smaller < n * FLAT_GRADIENT:
+        if not smaller >= n * FLAT_GRADIENT:
             continue
-        rest0 = dot(gradient_x, template) - np.float64(j0) * ones / n
-        rest1 = dot(gradient_y, template) - np.float64(j1) * ones / n
-        rest2 = rest3 = 0.0
+        mean_t = spread(np.float32(total(sum_t) / n))
+        tt, xt, yt = zero, zero, zero
+        for k in range(0, length, 16):
+            t = load(mask, k) * (load(frame, k + pitch + 1) - mean_t)
+            tt, xt, yt = tt + t * t, xt + t * load(gradient_x, k), yt + t * load(gradient_y, k)
+            store(template, k, t)
+        energy, rest0, rest1 = np.float64(total(tt)), np.float64(total(xt)), np.float64(total(yt))
+        if energy < n * FLAT_VARIANCE:
+            continue
+        j2 = j3 = rest2 = rest3 = 0.0
         factored = False
         scale = np.float32(np.exp2(labels[i, 2]))
         a, b = scale * np.float32(np.cos(labels[i, 3])), scale * np.float32(np.sin(labels[i, 3]))
@@ -197,37 +164,39 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
                 break
             if not (tx >= border and ty >= border and tx <= columns - border - 1 and ty <= rows - border - 1):
                 break
-            warp_window(target_image, tx, ty, a, b, reach, patch)
+            warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, patch)
             ox = oy = np.float32(0)
-            g0 = g1 = 0.0
-            mean = np.float64(0)
+            g0 = g1 = mean = 0.0
+            at, w00, w01, w10, w11 = 0, zero, zero, zero, zero
             for iteration in range(iterations + 1):
-                shift_window(patch, width, ox + np.float32(margin), oy + np.float32(margin), side, window)
-                total, power, product = np.int64(0), np.int64(0), np.int64(0)
-                s0, s1 = np.int64(0), np.int64(0)
-                for k in range(area):
-                    value = np.int64(window[k])
-                    total += value
-                    power += value * value
-                    product += value * np.int64(template[k])
-                    s0 += value * np.int64(gradient_x[k])
-                    s1 += value * np.int64(gradient_y[k])
-                mean = np.float64(total) / n
-                variance = power - mean * total
-                score = np.float32((product - mean * ones) / np.sqrt(max(variance * energy, 1.0)))
+                left, top = ox + np.float32(margin), oy + np.float32(margin)
+                column, row = np.int64(left), np.int64(top)
+                fx, fy = left - np.float32(column), top - np.float32(row)
+                at, w11 = row * pitch + column, spread(fx * fy)
+                w01, w10 = spread(fx - fx * fy), spread(fy - fx * fy)
+                w00 = spread(np.float32(1) - fx - fy + fx * fy)
+                sum_w, ww, wt, wx, wy = zero, zero, zero, zero, zero
+                for k in range(0, length, 16):
+                    j = at + k
+                    w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
+                    w = load(mask, k) * (w + w11 * load(patch, j + pitch + 1) - mean_t)
+                    sum_w, ww, wt = sum_w + w, ww + w * w, wt + w * load(template, k)
+                    wx, wy = wx + w * load(gradient_x, k), wy + w * load(gradient_y, k)
+                sum_of_w = np.float64(total(sum_w))
+                mean = sum_of_w / n
+                variance = total(ww) - mean * sum_of_w
+                score = np.float32(total(wt) / np.sqrt(max(variance * energy, 1e-3)))
                 if warp == 0 and iteration == 0:
                     first = score
                 if score > best:
                     best, best_a, best_b = score, a, b
                     best_x, best_y = tx + a * ox - b * oy, ty + b * ox + a * oy
-                g0, g1 = s0 - mean * j0 - rest0, s1 - mean * j1 - rest1
+                g0, g1 = total(wx) - mean * j0 - rest0, total(wy) - mean * j1 - rest1
                 if iteration == iterations:
                     break
-                # the gradients' unit: 2 pixels' difference
                 d0 = np.float32(2 * (h11 * g0 - h01 * g1) / determinant)
                 d1 = np.float32(2 * (h00 * g1 - h01 * g0) / determinant)
                 ox, oy = ox - d0, oy - d1
-                limit = np.float32(margin) - np.float32(0.01)
                 if not (abs(ox) < limit and abs(oy) < limit):
                     ox, oy = min(max(ox, -limit), limit), min(max(oy, -limit), limit)
                     break
@@ -238,19 +207,34 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
             if warp == warps - 1:
                 break
             if not factored:
+                sum_s, sum_r, sx, sy, rx, ry = zero, zero, zero, zero, zero, zero
+                ss, rr, rs, st, rt = zero, zero, zero, zero, zero
+                for k in range(0, length, 16):
+                    gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
+                    swell, turn, t = gx * dx + gy * dy, gy * dx - gx * dy, load(template, k)
+                    sum_s, sum_r = sum_s + swell, sum_r + turn
+                    sx, sy, rx, ry = sx + swell * gx, sy + swell * gy, rx + turn * gx, ry + turn * gy
+                    ss, rr, rs = ss + swell * swell, rr + turn * turn, rs + turn * swell
+                    st, rt = st + swell * t, rt + turn * t
+                j2, j3 = np.float64(total(sum_s)), np.float64(total(sum_r))
+                rest2, rest3 = np.float64(total(st)), np.float64(total(rt))
                 h[0, 0], h[1, 0], h[1, 1] = h00, h01, h11
-                h[2, 0], h[2, 1] = dot(swell, gradient_x) - j2 * (j0 / n), dot(swell, gradient_y) - j2 * (j1 / n)
-                h[3, 0], h[3, 1] = dot(turn, gradient_x) - j3 * (j0 / n), dot(turn, gradient_y) - j3 * (j1 / n)
-                h[2, 2], h[3, 3] = dot(swell, swell) - j2 * (j2 / n), dot(turn, turn) - j3 * (j3 / n)
-                h[3, 2] = dot(turn, swell) - j3 * (j2 / n)
+                h[2, 0], h[2, 1] = total(sx) - j2 * j0 / n, total(sy) - j2 * j1 / n
+                h[3, 0], h[3, 1] = total(rx) - j3 * j0 / n, total(ry) - j3 * j1 / n
                 damping = SIMILARITY_DAMPING * trace * (radius * radius)
-                h[2, 2], h[3, 3] = h[2, 2] + damping, h[3, 3] + damping
+                h[2, 2], h[3, 3] = total(ss) - j2 * j2 / n + damping, total(rr) - j3 * j3 / n + damping
+                h[3, 2] = total(rs) - j3 * j2 / n
                 if not cholesky4(h):
                     break
-                rest2 = dot(swell, template) - j2 * (ones / n)
-                rest3 = dot(turn, template) - j3 * (ones / n)
                 factored = True
-            g2, g3 = dot(swell, window) - mean * j2 - rest2, dot(turn, window) - mean * j3 - rest3
+            ws, wr = zero, zero
+            for k in range(0, length, 16):
+                j = at + k
+                w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
+                w = w + w11 * load(patch, j + pitch + 1) - mean_t
+                gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
+                ws, wr = ws + w * (gx * dx + gy * dy), wr + w * (gy * dx - gx * dy)
+            g2, g3 = total(ws) - mean * j2 - rest2, total(wr) - mean * j3 - rest3
             d0, d1, d2, d3 = solve4(h, g0, g1, g2, g3)
             da, db = np.float32(1) + 2 * d2, 2 * d3
             size = da * da + db * db
