@@ -2,9 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import AfterValidator
+
+from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.segmentation.classes import expand_classes
+
+
+MOVABLE = (
+    "backpack,bed,book,bottle,bowl,cell phone,chair,couch,cup,dining table,handbag,keyboard,laptop,mouse,potted plant,"
+    "sports ball,suitcase,teddy bear,tv,umbrella"
+)
+"""COCO classes that people move about (our assumption; no paper gives a list)."""
+
+
+def _known_classes(value: str) -> str:
+    try:
+        expand_classes(value)
+    except DynslamError as error:
+        raise ValueError(str(error)) from None
+    return value
+
+
+MovableClasses = Annotated[str, AfterValidator(_known_classes)]
+"""Comma-separated COCO names or presets, validated."""
 
 
 class BoxSettings(Settings):
@@ -30,6 +53,11 @@ class BoxEpipolarSettings(Settings):
         1.0, low=0.1, high=3.0, scale="log", limits=(0.01, 20.0), unit="px", meaning="RANSAC's inlier threshold"
     )
     confidence: float = tunable(0.99, low=0.9, high=0.999, limits=(0.5, 0.99999), meaning="RANSAC confidence")
+    fit: Literal["outside", "outside previous", "kept"] = tunable(
+        "outside",
+        meaning="matches that F is fitted to: outside the boxes, outside those of the previous frame (SG-SLAM), "
+        "or all that earlier filters kept (those outside the masks)",
+    )
 
 
 class MovingVoteSettings(Settings):
@@ -137,6 +165,10 @@ class ProbabilitySettings(Settings):
         unit="px",
         meaning="how near its flow must end to an earlier feature",
     )
+    expand_px: float = tunable(
+        0.0, low=0.0, high=60.0, limits=(0.0, 500.0), unit="px",
+        meaning="reach of matching point expansion: new features take after near ones that are sure; 0 = off",
+    )  # fmt: skip
 
 
 class TemplateSettings(Settings):
@@ -166,9 +198,29 @@ class ResidualSettings(Settings):
     )
 
 
+class DepthBlockSettings(Settings):
+    """B9 as in Blitz-SLAM: masks completed by blocks of continuous depth."""
+
+    edge_m: float = tunable(
+        0.1, low=0.03, high=0.5, scale="log", limits=(0.001, 10.0), unit="m", online=True,
+        meaning="depth range in a 2x2 block above which it is an edge between blocks (tau 1 and 2)",
+    )  # fmt: skip
+    min_share: float = tunable(
+        0.25, low=0.05, high=0.9, limits=(0.0, 1.0), online=True,
+        meaning="share of a block that must lie on the mask for all of it to be taken (tau 3)",
+    )  # fmt: skip
+    max_depth_m: float = tunable(
+        6.0, low=3.0, high=10.0, limits=(0.1, 1000.0), unit="m", meaning="depth beyond this is not used"
+    )
+    movable: MovableClasses = MOVABLE
+    """Classes that are dynamic while a person touches them: comma-separated COCO names."""
+
+
 class ClassRuleSettings(Settings):
     """B15, three rules: class, depth, epipolar line (SEG-SLAM; constants are our assumption)."""
 
+    movable: MovableClasses = MOVABLE
+    """Classes that move only at times: comma-separated COCO names."""
     threshold_px: float = tunable(
         1.0, low=0.2, high=5.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
         meaning="epipolar distance above which a point on a movable object is dropped",
@@ -199,3 +251,16 @@ class BoxDepthSettings(Settings):
         0.8, low=0.3, high=1.0, limits=(0.0, 1.0), meaning="a mask that covers more of the image is ignored"
     )
     dilation_px: int = tunable(3, low=0, high=20, limits=(0, 100), unit="px", meaning="radius by which masks are grown")
+
+
+class ReseedingSettings(Settings):
+    """B12, re-seeding (NGD-SLAM, Crowd-SLAM): how many of the features that culling left are used at most.
+
+    The extractor has to seek more than these (`features.n_features`, 1.5 times as many in NGD-SLAM); where it does
+    not, nothing is left out.
+    """
+
+    budget: int = tunable(
+        1000, low=300, high=2000, limits=(1, 20000), scale="log", online=True,
+        meaning="features used at most after culling; features.n_features must be larger",
+    )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -45,7 +46,7 @@ class BoxEpipolarFilter(DynamicFilter):
             return FilterResult.of(keep, stats)
         inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
         before = state.camera.undistort_points(flow.xy)
-        fit = flow.valid & state.keep & ~inside
+        fit = flow.valid & state.keep & ~self._left_out(inside, state)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
             fit = flow.valid & state.keep
         stats["matches"] = float(np.count_nonzero(fit))
@@ -59,3 +60,12 @@ class BoxEpipolarFilter(DynamicFilter):
         limit = np.where(inside[flow.valid], self.settings.inside_px, self.settings.outside_px)
         keep[flow.valid] = distance <= limit
         return FilterResult.of(keep, stats)
+
+    def _left_out(self, inside: NDArray[np.bool_], state: FilterState) -> NDArray[np.bool_]:
+        """Matches that F is not fitted to, bool ``[N]``."""
+        if self.settings.fit == "kept":
+            return np.zeros(len(inside), dtype=bool)
+        if self.settings.fit == "outside" or state.previous is None or state.flow is None:
+            return inside
+        boxes = dynamic_boxes(state.previous, self._segmentation)
+        return np.asarray(in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), boxes).any(axis=0))

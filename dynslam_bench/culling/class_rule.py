@@ -14,13 +14,6 @@ from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need,
 from .semantic import inside
 from .settings import EpipolarSettings
 
-MOVABLE = frozenset(
-    {"chair", "couch", "bed", "dining table", "tv", "laptop", "mouse", "keyboard", "cell phone", "book", "backpack",
-     "handbag", "suitcase", "sports ball", "bottle", "cup", "bowl", "umbrella", "teddy bear", "potted plant"}
-)  # fmt: skip
-"""COCO classes that people move about (our assumption; the paper gives no list)."""
-
-
 class ClassRuleFilter(DynamicFilter):
     """Drops all points on people; on movable things those off their line, or at the depth of a thing that moves.
 
@@ -47,9 +40,9 @@ class ClassRuleFilter(DynamicFilter):
         people = dynamic_mask(frame.instances, self._segmentation, frame.depth)
         keep &= ~inside(people, frame.keypoints.xy)
         stats["on_people"] = float(np.count_nonzero(~keep))
-        off_line, tested = self._off_line(frame, state, keep)
-        chosen = select(frame.instances, self._segmentation.model_copy(update={"classes": ",".join(sorted(MOVABLE))}))
-        for mask in chosen.masks:
+        movable = select(frame.instances, self._segmentation.model_copy(update={"classes": self.settings.movable}))
+        off_line, tested = self._off_line(frame, state, keep & ~inside(movable.union(), frame.keypoints.xy))
+        for mask in movable.masks:
             on = inside(mask, frame.keypoints.xy) & keep
             stats["on_movable"] += float(np.count_nonzero(on))
             voters = on & tested
@@ -64,7 +57,7 @@ class ClassRuleFilter(DynamicFilter):
         return FilterResult.of(keep, stats, people)
 
     def _off_line(self, frame: FrameBundle, state: FilterState, static: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which points fail the epipolar test, and which were tested at all, bool ``[N]`` each."""
+        """Which points fail the epipolar test with F of the static-labelled ones, and which were tested at all."""
         none = np.zeros(len(frame), dtype=bool)
         if state.flow is None or state.previous is None:
             return none, none

@@ -22,6 +22,8 @@ from .links import link_to_previous
 MIN_POINTS = 20
 MIN_COMPONENT = 4
 """Smaller fragments are noise: they are neither the static body nor an object."""
+_NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+_WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 
 
 class CorrelationFilter(DynamicFilter):
@@ -49,7 +51,7 @@ class CorrelationFilter(DynamicFilter):
         """Build the graph over the points that were tracked for the whole window."""
         keep = np.ones(len(frame), dtype=bool)
         stats = dict.fromkeys(("tracked", "edges", "cut", "components"), 0.0)
-        now = self._observe(frame, state)
+        now = self._observe(frame, state)  # positions and their covariances
         link = link_to_previous(frame, state)
         if self._history and (state.previous is None or len(self._history[-1]) != len(state.previous)):
             self._history.clear()
@@ -65,11 +67,9 @@ class CorrelationFilter(DynamicFilter):
             return FilterResult.of(keep, stats)
         edges = _delaunay_edges(frame.xy[rows])
         change = _edge(now[rows], edges) - _edge(then[rows], edges)
-        z_then = then[rows, 3]
-        covariance = _point_covariance(frame.z[rows], state.camera, self.settings.pixel_sigma)
-        covariance += _point_covariance(z_then, state.camera, self.settings.pixel_sigma)
-        total = (covariance[edges[:, 0]] + covariance[edges[:, 1]])[:, :, None] * np.eye(3)
-        distance = np.einsum("ni,nij,nj->n", change, np.linalg.inv(total), change)
+        covariance = (now[rows, 3:] + then[rows, 3:]).reshape(-1, 3, 3)
+        total = covariance[edges[:, 0]] + covariance[edges[:, 1]]
+        distance = (change * np.linalg.solve(total, change[:, :, None])[:, :, 0]).sum(axis=1)
         whole = distance <= chi2.ppf(self.settings.quantile, 3)
         stats |= {"edges": float(len(edges)), "cut": float(np.count_nonzero(~whole))}
         kept, stats["components"] = self._static_component(edges[whole], now[rows, :3])
@@ -77,13 +77,15 @@ class CorrelationFilter(DynamicFilter):
         return FilterResult.of(keep, stats)
 
     def _observe(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
-        """World points and depth ``[N, 4]`` under the predicted pose; NaN without depth or pose."""
+        """World points and their covariances ``[N, 3 + 9]`` under the predicted pose; NaN without depth or pose."""
         pose = np.eye(4) if state.T_world_pred is None and state.previous is None else state.T_world_pred
-        seen = np.full((len(frame), 4), np.nan)
+        seen = np.full((len(frame), 12), np.nan)
         valid = frame.z > 0
         if pose is not None and valid.any():
             seen[valid, :3] = se3.transform(pose, state.camera.unproject(frame.xy[valid], frame.z[valid]))
-            seen[valid, 3] = frame.z[valid]
+            variance = depth_variance(frame.depth, frame.keypoints.xy[valid])
+            local = point_covariance(frame.xy[valid], frame.z[valid], variance, state.camera, self.settings.pixel_sigma)
+            seen[valid, 3:] = (pose[:3, :3] @ local @ pose[:3, :3].T).reshape(-1, 9)
         return seen
 
     def _static_component(
@@ -124,14 +126,42 @@ def _edge(points: NDArray[np.float64], edges: NDArray[np.intp]) -> NDArray[np.fl
     return points[edges[:, 0], :3] - points[edges[:, 1], :3]
 
 
-def _point_covariance(z: NDArray[np.floating], camera: Camera, pixel_sigma: float) -> NDArray[np.float64]:
-    """Variances ``[N, 3]`` of points at depth z, m^2: the larger of depth and lateral noise on every axis.
+def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Variance of the depth at raw pixels ``[N, 2]``, m^2: a Gaussian mixture over the 3x3 neighbourhood.
 
-    The paper propagates a full covariance; the isotropic bound is ours, since vectors are compared in the world frame.
+    The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its components' variances
+    those of the sensor; depth edges get a large variance by it.
     """
-    z = np.asarray(z, dtype=np.float64)
-    lateral = z * pixel_sigma / camera.fx
-    return np.repeat((np.maximum(depth_sigma(z), lateral) ** 2)[:, None], 3, axis=1)
+    height, width = depth.shape
+    column, row = np.rint(xy).astype(np.intp).T
+    columns = (column[:, None] + _NEAR[:, 0]).clip(0, width - 1)
+    rows = (row[:, None] + _NEAR[:, 1]).clip(0, height - 1)
+    z = np.nan_to_num(depth[rows, columns].astype(np.float64), posinf=0.0, neginf=0.0)
+    weight = np.where(z > 0, _WEIGHT, 0.0)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+    mean = (weight * z).sum(axis=1)
+    return np.asarray((weight * (np.square(depth_sigma(z)) + np.square(z - mean[:, None]))).sum(axis=1))
+
+
+def point_covariance(
+    xy: NDArray[np.float64], z: NDArray[np.floating], variance: NDArray[np.float64], camera: Camera, pixel_sigma: float
+) -> NDArray[np.float64]:
+    """Covariances ``[N, 3, 3]`` of unprojected points in the camera frame, m^2.
+
+    Args:
+        xy: Undistorted pixels ``[N, 2]``.
+        z: Depths ``[N]``, metres.
+        variance: Variances of the depths ``[N]``, m^2.
+        camera: Intrinsics.
+        pixel_sigma: Standard deviation of a pixel coordinate.
+    """
+    depth = np.asarray(z, dtype=np.float64)
+    jacobian = np.zeros((len(depth), 3, 3))
+    jacobian[:, 0, 0], jacobian[:, 1, 1] = depth / camera.fx, depth / camera.fy
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = ((xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
+    jacobian[:, 2, 2] = 1.0
+    noise = np.column_stack([np.full((len(depth), 2), pixel_sigma**2), np.maximum(variance, 1e-12)])
+    return np.asarray((jacobian * noise[:, None]) @ jacobian.transpose(0, 2, 1))
 
 
 def _volume(points: NDArray[np.float64]) -> float:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.postprocess import dynamic_mask
@@ -18,6 +19,8 @@ from .links import inherit, link_to_previous
 from .semantic import inside
 
 UNKNOWN = 0.5
+SURE = (0.25, 0.75)
+"""Below and above, a feature is held for static and dynamic with certainty (Detect-SLAM)."""
 
 
 class ProbabilityFilter(DynamicFilter):
@@ -53,6 +56,8 @@ class ProbabilityFilter(DynamicFilter):
         if state.previous is None or len(self._probability) != len(state.previous):
             link[:] = -1
         prior = inherit(self._probability, link, UNKNOWN)
+        if self.settings.expand_px > 0:
+            prior = expand(frame.keypoints.xy, prior, link >= 0, self.settings.expand_px)
         if frame.instances is not None:
             prior = self._update(prior, self._observe(frame))
         self._probability = prior
@@ -77,3 +82,29 @@ class ProbabilityFilter(DynamicFilter):
         moving = np.where(on_mask, self.settings.hit, 1 - self.settings.hit)
         posterior = moving * prior / (moving * prior + (1 - moving) * (1 - prior))
         return np.asarray(posterior.clip(0.01, 0.99))
+
+
+def expand(
+    xy: NDArray[np.floating], probability: NDArray[np.float64], linked: NDArray[np.bool_], reach_px: float
+) -> NDArray[np.float64]:
+    """Matching point expansion: what has no history takes after the nearest feature that is sure of its own.
+
+    Args:
+        xy: Pixels of all features ``[N, 2]``.
+        probability: Their moving probabilities ``[N]``.
+        linked: bool ``[N]``, which of them have a history.
+        reach_px: How far that feature may be; its say fades as a Gaussian of half this width.
+
+    Returns:
+        Probabilities ``[N]``; those with a history unchanged.
+    """
+    expanded = probability.copy()
+    sure = np.flatnonzero(linked & ((probability < SURE[0]) | (probability > SURE[1])))
+    new = np.flatnonzero(~linked)
+    if not len(sure) or not len(new):
+        return expanded
+    distance, nearest = cKDTree(xy[sure]).query(xy[new], distance_upper_bound=reach_px)
+    near = np.isfinite(distance)
+    say = np.exp(-0.5 * np.square(distance[near] / (0.5 * reach_px)))
+    expanded[new[near]] = UNKNOWN + say * (probability[sure[np.asarray(nearest)[near]]] - UNKNOWN)
+    return expanded

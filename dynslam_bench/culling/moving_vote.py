@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.postprocess import dilate, select
+from dynslam_bench.segmentation.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .baseline_settings import MovingVoteSettings
@@ -47,7 +47,9 @@ class MovingVoteFilter(DynamicFilter):
         people = select(frame.instances, self._segmentation).union()
         moving, stats["corners"] = self._moving_corners(state.previous.gray, frame.gray, state.camera)
         stats["moving"] = float(len(moving))
-        votes = np.count_nonzero(inside(dilate(people, self.settings.radius_px), moving))
+        side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
+        around = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+        votes = np.count_nonzero(inside(around, moving))
         stats["votes"] = float(votes)
         if votes < self.settings.min_votes:
             return FilterResult.of(keep, stats)

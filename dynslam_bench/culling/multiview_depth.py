@@ -12,6 +12,7 @@ from dynslam_bench.segmentation.postprocess import dilate
 
 from .baseline_settings import MultiViewSettings
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
+from .light_track import light_track
 from .semantic import inside
 
 MAX_REFERENCE_DEPTH_M = 6.0
@@ -45,10 +46,12 @@ class MultiViewFilter(DynamicFilter):
         stats = {"references": 0.0, "seeds": 0.0, "mask_fraction": 0.0}
         if state.T_world_pred is None or len(state.keyframes) < self.settings.min_keyframes:
             return FilterResult.of(keep, stats)
-        references = self._choose(state.keyframes, state.T_world_pred)
+        pose = light_track(frame, state)
+        assert pose is not None
+        references = self._choose(state.keyframes, pose)
         depth = np.nan_to_num(frame.depth)
         flat = _flat(depth, self.settings.max_variance)
-        found = [self._hiding(view, depth, flat, state.T_world_pred, state.camera) for view in references]
+        found = [self._hiding(view, depth, flat, pose, state.camera) for view in references]
         seeds = np.concatenate(found)
         stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
         if not len(seeds):

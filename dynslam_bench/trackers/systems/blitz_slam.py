@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
+from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, DepthBlockSettings
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
@@ -18,18 +18,19 @@ if TYPE_CHECKING:
 class BlitzSlamSettings(SemanticSystemSettings):
     """Repaired masks and the epipolar test in boxes."""
 
-    segmentation: SegmentationSettings = SegmentationSettings(repair="depth", repair_depth_m=0.1, dilation_px=0)
+    segmentation: SegmentationSettings = SegmentationSettings(dilation_px=0)
+    depth_blocks: DepthBlockSettings = DepthBlockSettings()
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.5, outside_px=1000.0)
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 
 def build(settings: BlitzSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B9, B1, then B3 inside the boxes with F from outside them."""
+    """B9 and B1, then B3 inside the boxes with F from outside them."""
     from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.semantic import SemanticFilter
+    from dynslam_bench.culling.depth_blocks import DepthBlockFilter
 
     filters = [
-        SemanticFilter(settings.segmentation),
+        DepthBlockFilter(settings.depth_blocks, settings.segmentation),
         BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
     ]
     return compose(settings, context, filters, settings.flow)
@@ -45,5 +46,9 @@ SPEC = TrackerSpec(
     ranked=True,
     license="MIT (re-implemented from the description)",
     citation="Fan et al., Blitz-SLAM, Pattern Recognition 2022",
-    assumptions=("the residual removal of its mapping is left out: it does not touch the pose",),
+    assumptions=(
+        "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated)",
+        "which classes are movable (not stated)",
+        "the residual removal of its mapping is left out: it does not touch the pose",
+    ),
 )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class ChenSlamSettings(SemanticSystemSettings):
     """Masks and the epipolar test."""
 
-    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 

@@ -39,8 +39,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Dai et al., RGB-D SLAM in Dynamic Environments Using Point Correlations, TPAMI 2020",
     assumptions=(
-        "only the front end's graph, over a window of frames",
-        "isotropic point covariance",
+        "only the front end's graph, against the observation a window of frames ago",
+        "chi-square quantile of 0.95 and 1 px per keypoint (not stated)",
     ),
     remarks="its authors' name DSLAM also stands for Decentralised SLAM elsewhere",
 )

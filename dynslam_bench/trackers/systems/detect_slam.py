@@ -19,7 +19,7 @@ class DetectSlamSettings(SemanticSystemSettings):
     """Boxes on keyframes and the moving average."""
 
     segmentation: SegmentationSettings = SegmentationSettings(schedule="keyframes", dilation_px=0)
-    probability: ProbabilitySettings = ProbabilitySettings(rule="average", threshold=0.75)
+    probability: ProbabilitySettings = ProbabilitySettings(rule="average", threshold=0.75, expand_px=32.0)
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 
@@ -44,5 +44,6 @@ SPEC = TrackerSpec(
     assumptions=(
         "rate 0.3 and threshold 0.75 (no readable source)",
         "between keyframes boxes are carried by optical flow",
+        "matching point expansion: nearest sure feature within 32 px, with a Gaussian of half that",
     ),
 )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, MultiViewSettings
 from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
@@ -18,8 +19,11 @@ if TYPE_CHECKING:
 class DiSlamSettings(SemanticSystemSettings):
     """The epipolar test with boxes and multi-view depth."""
 
+    segmentation: SegmentationSettings = SegmentationSettings(confidence=0.1)
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
-    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0)
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(
+        inside_px=0.2, outside_px=1.0, fit="outside previous"
+    )
     multiview: MultiViewSettings = MultiViewSettings(grow=False)
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
@@ -46,5 +50,8 @@ SPEC = TrackerSpec(
     ranked=False,
     license="MIT (re-implemented from the description)",
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
-    assumptions=("the published code of SG-SLAM stands in for the epipolar half",),
+    assumptions=(
+        "the published code of SG-SLAM stands in for the epipolar half",
+        "multi-view depth without growing regions; the guard undoes it before the epipolar verdict",
+    ),
 )

@@ -19,7 +19,7 @@ class MorSlamSettings(SemanticSystemSettings):
     """Repaired masks and the epipolar test."""
 
     segmentation: SegmentationSettings = SegmentationSettings(repair="depth", repair_depth_m=0.1, dilation_px=0)
-    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 

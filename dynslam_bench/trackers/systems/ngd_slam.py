@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dynslam_bench.culling.baseline_settings import BoxDepthSettings
+from dynslam_bench.culling.baseline_settings import BoxDepthSettings, ReseedingSettings
+from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
@@ -15,17 +16,24 @@ if TYPE_CHECKING:
 
 
 class NgdSlamSettings(SemanticSystemSettings):
-    """Depth masks of boxes."""
+    """Depth masks of boxes, and half as many features again to choose the static ones from."""
 
+    features: FeatureSettings = FeatureSettings(n_features=1500)
     segmentation: SegmentationSettings = SegmentationSettings(schedule="every_nth", n=3, carry="sparse")
     box_depth: BoxDepthSettings = BoxDepthSettings()
+    reseeding: ReseedingSettings = ReseedingSettings(budget=1000)
 
 
 def build(settings: NgdSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B2 cut out by depth; B10 between detections."""
+    """B2 cut out by depth; B10 between detections; B12 fills up what is left."""
     from dynslam_bench.culling.box_depth import BoxDepthFilter
+    from dynslam_bench.culling.reseeding import ReseedingFilter
 
-    return compose(settings, context, [BoxDepthFilter(settings.box_depth, settings.segmentation)])
+    filters = [
+        BoxDepthFilter(settings.box_depth, settings.segmentation),
+        ReseedingFilter(settings.reseeding, settings.features),
+    ]
+    return compose(settings, context, filters)
 
 
 SPEC = TrackerSpec(
@@ -41,5 +49,7 @@ SPEC = TrackerSpec(
     assumptions=(
         "detection on every third frame stands in for its asynchronous detector",
         "masks are carried by our sparse flow, not by its clustering of corners",
+        "a person's depth is the median in the box alone (its code adds a second order statistic)",
+        "at most 1,000 of its 1,500 features are used, so that others have as many",
     ),
 )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class SofSlamSettings(SemanticSystemSettings):
     """The class rule without its depth part."""
 
-    class_rule: ClassRuleSettings = ClassRuleSettings(depth_m=0.0, vote_share=1.0)
+    class_rule: ClassRuleSettings = ClassRuleSettings(movable="chair,tv", depth_m=0.0, vote_share=1.0)
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 
@@ -39,7 +39,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Cui and Ma, SOF-SLAM, IEEE Access 2019",
     assumptions=(
-        "which classes are potentially dynamic",
+        "potentially dynamic are chairs and monitors (the class list is not public)",
         "RANSAC 1 px, 0.99; distance 1 px",
     ),
 )
