@@ -50,9 +50,7 @@ class MultiViewFilter(DynamicFilter):
         assert pose is not None
         references = self._choose(state.keyframes, pose)
         depth = np.nan_to_num(frame.depth)
-        flat = _flat(depth, self.settings.max_variance)
-        found = [self._hiding(view, depth, flat, pose, state.camera) for view in references]
-        seeds = np.concatenate(found)
+        seeds = self._hiding(references, depth, pose, state.camera)
         stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
         if not len(seeds):
             return FilterResult.of(keep, stats)
@@ -70,16 +68,18 @@ class MultiViewFilter(DynamicFilter):
         return [views[i] for i in ranked[: self.settings.references]]
 
     def _hiding(
-        self, view: KeyframeView, depth: NDArray[np.float32], flat: NDArray[np.bool_], pose: NDArray[np.float64],
-        camera: Camera,
-    ) -> NDArray[np.intp]:  # fmt: skip
-        """Pixels ``[M, 2]`` of the surfaces that hide the reference's points now."""
-        usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
-        world = se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable]))
-        then, now = world - view.T_world_cam[:3, 3], world - pose[:3, 3]
-        norms = np.linalg.norm(then, axis=1) * np.linalg.norm(now, axis=1)
-        cosine = (then * now).sum(axis=1) / np.maximum(norms, 1e-12)
-        local = se3.transform(se3.inverse(pose), world)
+        self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
+    ) -> NDArray[np.intp]:
+        """Pixels ``[M, 2]`` of the surfaces that hide the references' points now, reference by reference."""
+        world, then = [], []
+        for view in views:
+            usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
+            world.append(se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable])))
+            then.append(world[-1] - view.T_world_cam[:3, 3])
+        points = np.concatenate(world)
+        now = points - pose[:3, 3]
+        cosine = _cosine(np.concatenate(then), now)
+        local = now @ pose[:3, :3]
         pixels = np.full((len(local), 2), -1.0)
         ahead = local[:, 2] > 0.1
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
@@ -89,15 +89,16 @@ class MultiViewFilter(DynamicFilter):
         shown &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
         if not shown.any():
             return np.zeros((0, 2), np.intp)
-        around = np.rint(pixels[shown]).astype(np.intp)[:, None] + WINDOW
-        measured = depth[around[..., 1], around[..., 0]].astype(np.float64)
-        gap = local[shown, 2, None] - measured
-        gap = np.where((measured > 0) & (gap > 0), gap, np.inf)
-        best = gap.argmin(axis=1)
-        smallest = np.take_along_axis(gap, best[:, None], axis=1)[:, 0]
-        where = np.take_along_axis(around, best[:, None, None], axis=1)[:, 0]
-        hides = np.isfinite(smallest) & (smallest > self.settings.tau_m) & flat[where[:, 1], where[:, 0]]
-        return np.asarray(where[hides])
+        centre = np.rint(pixels[shown]).astype(np.intp)
+        expected = local[shown, 2].astype(np.float32)
+        # the smallest positive gap belongs to the largest of the measured depths that are nearer than expected
+        around = (centre @ (1, camera.width))[:, None] + WINDOW @ (1, camera.width)
+        measured = np.ascontiguousarray(depth).ravel().take(around)
+        nearer = np.where(measured < expected[:, None], measured, np.float32(0))
+        best = nearer.argmax(axis=1)
+        hiding = nearer[np.arange(len(best)), best]
+        where = (centre + WINDOW[best])[(hiding > 0) & (expected - hiding > self.settings.tau_m)]
+        return np.asarray(where[_depth_variance(depth, where) < self.settings.max_variance])
 
     def _region(self, seeds: NDArray[np.intp], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         height, width = depth.shape
@@ -116,9 +117,24 @@ class MultiViewFilter(DynamicFilter):
         return dilate(mask.astype(bool), self.settings.dilation_px)
 
 
-def _flat(depth: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
-    """Bool ``[H, W]``: pixels whose 41x41 neighbourhood has a depth variance below the limit, m^2."""
-    valid = (depth > 0).astype(np.float64)
-    box = [cv2.boxFilter(image, -1, (41, 41), normalize=False) for image in (valid, depth * valid, depth**2 * valid)]
-    count = np.maximum(box[0], 1)
-    return np.asarray(box[2] / count - np.square(box[1] / count) < limit)
+def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cosines ``[N]`` of the angles between vectors ``[N, 3]``."""
+    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    return np.asarray((first * second).sum(axis=1) / np.maximum(norms, 1e-12))
+
+
+def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Variance ``[N]`` of the depth in the 41x41 neighbourhoods of pixels ``[N, 2]``, m^2; missing depth aside."""
+    if not len(xy):
+        return np.zeros(0)
+    height, width = depth.shape
+    total, squares = cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    count = cv2.integral((depth > 0).view(np.uint8), sdepth=cv2.CV_32S)
+    low, high = (xy - MARGIN_PX).clip(0), np.minimum(xy + MARGIN_PX + 1, (width, height))
+
+    def within(table: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+        (x0, y0), (x1, y1) = low.T, high.T
+        return np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64)
+
+    n = np.maximum(within(count), 1)
+    return np.asarray(within(squares) / n - np.square(within(total) / n))

@@ -39,6 +39,20 @@ class Variant(Record):
     realtime: bool = False
 
 
+class Row(Record):
+    """A tracker once more, with settings of its own: a yardstick beside the systems.
+
+    Attributes:
+        tracker: One of the suite's trackers.
+        settings: What is different from its other row.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tracker: str
+    settings: dict[str, Any] = Field(min_length=1)
+
+
 class Suite(Record):
     """A benchmark suite: every tracker on every sequence, with every seed, in every variant.
 
@@ -55,6 +69,7 @@ class Suite(Record):
         threads: Threads of a run.
         settings: Overrides for every tracker that has the setting.
         tracker_settings: Overrides by tracker.
+        rows: Further rows: trackers of the suite once more, with other settings.
         variants: Ways to run everything.
         limits: What a run may take.
     """
@@ -73,6 +88,7 @@ class Suite(Record):
     threads: int = Field(default=1, ge=1)
     settings: dict[str, Any] = Field(default_factory=dict)
     tracker_settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    rows: tuple[Row, ...] = ()
     variants: tuple[Variant, ...] = Field(default=(Variant(),), min_length=1)
     limits: Limits = Limits()
 
@@ -102,18 +118,22 @@ class Suite(Record):
         """
         chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
         known = {name: set(field_names(TRACKERS.get(name).settings)) for name in chosen}
-        strangers = sorted(set(self.tracker_settings) - {*self.trackers, *self.optional})
+        named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
+        strangers = sorted(named - {*self.trackers, *self.optional})
         if strangers:
             raise RunError(
                 f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
                 did_you_mean(strangers[0], {*self.trackers, *self.optional}),
             )
+        entries: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
+        entries += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
         return [
             RunSpec(
                 tracker=tracker, sequence=sequence, seed=seed, frames=frames or self.frames, stride=self.stride,
                 settings={
                     **{name: value for name, value in self.settings.items() if name in known[tracker]},
                     **self.tracker_settings.get(tracker, {}),
+                    **own,
                 },
                 device=device, threads=threads or self.threads, limits=self.limits,
                 data_root=None if data_root is None else str(data_root), degrade=variant.degrade,
@@ -121,7 +141,7 @@ class Suite(Record):
             )
             for sequence in self.sequences
             for variant in self.variants
-            for tracker in chosen
+            for tracker, own in entries
             for seed in seeds or self.seeds
         ]  # fmt: skip
 

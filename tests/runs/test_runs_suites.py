@@ -97,3 +97,18 @@ def test_frames_of_a_run_are_read_however_they_are_written() -> None:
     assert {RunSpec(tracker="x", sequence="y", frames=way).frames for way in (None, ":", "0:", (0, None))} == {None}
     with pytest.raises(DynslamError, match=r"5:2"):
         RunSpec(tracker="x", sequence="y", frames="5:2")
+
+
+def test_dynamic_has_the_yardstick_with_exact_masks(tmp_path: Path) -> None:
+    specs = load_suite("dynamic").specs()
+    yardstick = [spec for spec in specs if spec.settings.get("segmentation.source") == "oracle"]
+    assert len(yardstick) == 16 and {spec.tracker for spec in yardstick} == {"mask-rcnn"}
+    plain = [spec for spec in specs if spec.tracker == "mask-rcnn" and not spec.settings]
+    assert len(plain) == 16, "beside the row with the network's masks"
+    assert not [spec for spec in load_suite("dynamic").specs(trackers=("orb-slam2",)) if spec.tracker != "orb-slam2"]
+    text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\n[[rows]]\ntracker = "{}"\nsettings = {}'
+    stranger = write(tmp_path / "a.toml", text.format("orb-slam2", '{ "guard.min_features" = 30 }'))
+    with pytest.raises(RunError, match="'orb-slam2', which is none of its trackers"):
+        load_suite(stranger).specs()
+    with pytest.raises(RunError, match="rows.0.settings"):
+        load_suite(write(tmp_path / "b.toml", text.format("never-move", "{}")))
