@@ -57,7 +57,8 @@ for _symbol, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (o
     _define(_symbol, _instruction)
 
 
-def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
+def pointer_to(context: Any, builder: Any, kind: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
+    """Code for the address of an array's element, as the address of a vector."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
@@ -66,7 +67,8 @@ def _constant(kind: ir.VectorType, value: float) -> Any:
     return ir.Constant(kind, [value] * WIDTH)
 
 
-def _splat(builder: Any, kind: ir.VectorType, value: Any) -> Any:
+def splat(builder: Any, kind: ir.VectorType, value: Any) -> Any:
+    """Code for a vector of sixteen equal numbers."""
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_WORD, 0))
     return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _constant(_WORDS, 0))
 
@@ -76,7 +78,7 @@ def load(typing_context, array, index):  # type: ignore[no-untyped-def]
     """Sixteen adjacent numbers of a flat float32 array; nothing is checked."""
 
     def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
-        loaded = builder.load(_pointer(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS))
+        loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS))
         loaded.align = 4
         return loaded
 
@@ -88,7 +90,7 @@ def load_bytes(typing_context, array, index):  # type: ignore[no-untyped-def]
     """Sixteen adjacent numbers of a flat uint8 array, as floats; nothing is checked."""
 
     def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
-        loaded = builder.load(_pointer(context, builder, kind.args[0], arguments[0], arguments[1], _BYTES))
+        loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _BYTES))
         loaded.align = 1
         return builder.sitofp(builder.zext(loaded, _WORDS), _FLOATS)
 
@@ -100,7 +102,7 @@ def store(typing_context, array, index, lanes):  # type: ignore[no-untyped-def]
     """Write sixteen adjacent numbers of a flat float32 array; nothing is checked."""
 
     def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
-        pointer = _pointer(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS)
+        pointer = pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS)
         builder.store(arguments[2], pointer, align=4)
         return context.get_dummy_value()
 
@@ -112,7 +114,7 @@ def spread(typing_context, value):  # type: ignore[no-untyped-def]
     """The same float32 in every lane."""
 
     def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
-        return _splat(builder, _FLOATS, arguments[0])
+        return splat(builder, _FLOATS, arguments[0])
 
     return LANES(types.float32), generate
 
@@ -161,13 +163,13 @@ def sample(typing_context, image, stride, columns, rows, at, column, row, step_x
         pixels, stride, columns, rows, at, column, row, step_x, step_y = arguments
         grid = []
         for k, array in ((2, columns), (3, rows)):
-            loaded = builder.load(_pointer(context, builder, kind.args[k], array, at, _WORDS))
+            loaded = builder.load(pointer_to(context, builder, kind.args[k], array, at, _WORDS))
             loaded.align = 4
             grid.append(loaded)
-        dx, dy = (_splat(builder, _WORDS, step) for step in (step_x, step_y))
-        x = builder.add(_splat(builder, _WORDS, column), builder.mul(grid[0], dx))
+        dx, dy = (splat(builder, _WORDS, step) for step in (step_x, step_y))
+        x = builder.add(splat(builder, _WORDS, column), builder.mul(grid[0], dx))
         x = builder.sub(x, builder.mul(grid[1], dy))
-        y = builder.add(_splat(builder, _WORDS, row), builder.mul(grid[0], dy))
+        y = builder.add(splat(builder, _WORDS, row), builder.mul(grid[0], dy))
         y = builder.add(y, builder.mul(grid[1], dx))
         sixteen, low = _constant(_WORDS, 16), _constant(_WORDS, 65535)
         whole = [builder.ashr(value, sixteen) for value in (x, y)]
@@ -175,7 +177,7 @@ def sample(typing_context, image, stride, columns, rows, at, column, row, step_x
             builder.fmul(builder.sitofp(builder.and_(value, low), _FLOATS), _constant(_FLOATS, 1 / 65536))
             for value in (x, y)
         ]
-        offset = builder.add(builder.mul(whole[1], _splat(builder, _WORDS, stride)), whole[0])
+        offset = builder.add(builder.mul(whole[1], splat(builder, _WORDS, stride)), whole[0])
         data = context.make_array(kind.args[0])(context, builder, pixels).data
         pairs = [ir.Constant(_PAIRS, ir.Undefined)] * 2  # two adjacent pixels in each lane, of the upper and lower row
         for lane in range(WIDTH):

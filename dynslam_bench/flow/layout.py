@@ -33,6 +33,12 @@ LEVEL_SIGMAS = (2.0, 2.0 * 2**0.5, 4.0, 4.0 * 2**0.5, 8.0, 8.0 * 2**0.5, 16.0)
 """Gaussian sigmas of the orientation maps, px of the full image."""
 LEVEL_STEPS = (2, 2, 2, 4, 4, 4, 4)
 """Full-image pixels per map pixel of each level."""
+LEVEL_BLURS = ((5, 1), (5, 1), (3, 2), (5, 1), (3, 2), (5, 2), (3, 4))
+"""Each level's blur of the one before: taps of a binomial and their distance in map pixels.
+
+Its variance is ``(taps - 1) / 4 * distance ** 2``: 1, 1, 2 at half resolution, that is sigmas of 2, 2.83 and 4 px; the
+mean of 2 x 2 brings 4.12 px, and 1, 2, 4, 8 at quarter resolution make 5.7, 8.1, 11.4 and 16.1.
+"""
 MARGIN = 48
 """Empty border around each map in full-image pixels: the outermost sample lies 16 * 2.38 = 38 px from the centre."""
 

@@ -1,8 +1,9 @@
 """Convolved orientation maps for the processor: what DAISY needs of one image, computed once a frame.
 
-Eight rectified directional derivatives are blurred in a cascade of seven Gaussians. Maps of small Gaussians are kept at
-half, of large ones at quarter resolution; each histogram is normalised on its own (partial normalisation) and stored as
-eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `daisy.py` is the float reference.
+Eight rectified directional derivatives are blurred in a cascade of seven Gaussians (`smoothing`). Maps of small
+Gaussians are kept at half, of large ones at quarter resolution; each histogram is normalised on its own (partial
+normalisation) and stored as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `daisy.py` is
+the reference.
 """
 
 from __future__ import annotations
@@ -16,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
-from ._jit import kernel
+from .buffers import BufferPool
 from .refinement import BORDER, pad_image
+from .smoothing import coarse_levels, fine_levels
 from .workers import run_stripes
 
 NORM_FLOOR = 0.01 * 255.0
 """Added to a histogram's norm before dividing, so that flat regions stay near zero (0.01 for images in [0, 1])."""
+FIXED_POINT = 256
+"""Units a grey level in the blurred derivatives."""
 
 
 class MapGeometry(NamedTuple):
@@ -81,44 +85,57 @@ def map_geometry(height: int, width: int) -> MapGeometry:
 
 
 def orientation_maps(
-    gray: NDArray[np.uint8], *, threads: int = 1, pool: ThreadPoolExecutor | None = None
+    gray: NDArray[np.uint8],
+    *,
+    threads: int = 1,
+    pool: ThreadPoolExecutor | None = None,
+    buffers: BufferPool | None = None,
 ) -> OrientationMaps:
-    """Compute the maps of a uint8 ``[H, W]`` image; the result does not depend on the number of threads."""
+    """Compute the maps of a uint8 ``[H, W]`` image; the result does not depend on the number of threads.
+
+    Args:
+        gray: The image.
+        threads: Over which rows are divided.
+        pool: Of the other threads.
+        buffers: Memory of maps that nobody holds any more is used again; None allocates anew.
+    """
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
-    histograms = np.zeros((geometry.total, layout.BINS), dtype=np.uint8)
-    rows, columns = _level_shape(height, width, 2)
-    half = np.empty((rows, columns), dtype=np.uint8)
-    exact = np.empty((rows, columns), dtype=np.float32)
-    run_stripes(_halve, rows, threads, pool, gray, exact, half)
-    source = np.empty((rows, columns * layout.BINS), dtype=np.float32)
-    run_stripes(_directional_derivatives, rows, threads, pool, exact, source)
-    sigma, step = 0.0, 2
-    for level, (wanted, level_step) in enumerate(zip(layout.LEVEL_SIGMAS, layout.LEVEL_STEPS, strict=True)):
-        if level_step != step:
-            rows, columns = _level_shape(height, width, level_step)
-            smaller = np.empty((rows, columns * layout.BINS), dtype=np.float32)
-            run_stripes(_halve_histograms, rows, threads, pool, source, smaller)
-            sigma, step, source = (sigma**2 + 0.25 * step**2) ** 0.5, level_step, smaller
-        target = np.empty_like(source)
-        weights = gaussian_weights((wanted**2 - sigma**2) ** 0.5 / step)
-        margin = layout.MARGIN // step
-        first = int(geometry.base[level]) + margin * int(geometry.stride[level]) + margin
-        run_stripes(
-            _blur_and_quantise, rows, threads, pool, source, target, weights, histograms.reshape(-1), first,
-            int(geometry.stride[level]), np.float32(NORM_FLOOR),
-        )  # fmt: skip
-        source, sigma = target, wanted
-    return OrientationMaps(gray, framed(gray), framed(half), histograms, geometry)
+    (rows, columns), (quarter_rows, quarter_columns) = _level_shape(height, width, 2), _level_shape(height, width, 4)
+    buffers = buffers or BufferPool()
+    histograms, whole, half = buffers.take(
+        (geometry.total, layout.BINS), (height + 2 * BORDER, width + 2 * BORDER),
+        (rows + 2 * BORDER, columns + 2 * BORDER),
+    )  # fmt: skip
+    coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
+    floor = np.float32(NORM_FLOOR * FIXED_POINT)
+    blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
+    fine = layout.LEVEL_STEPS.count(2)
+    cells = histograms.reshape(-1)
+    run_stripes(
+        fine_levels, -(-rows // 2), threads, pool, gray, half, BORDER, blurs[:fine], geometry, layout.MARGIN // 2,
+        floor, cells, coarse,
+    )  # fmt: skip
+    run_stripes(
+        coarse_levels, quarter_rows, threads, pool, coarse, quarter_columns, blurs[fine:], fine, geometry,
+        layout.MARGIN // 4, floor, cells,
+    )  # fmt: skip
+    pad_image(half[BORDER : BORDER + rows, BORDER : BORDER + columns], BORDER, half)
+    pad_image(gray, BORDER, whole)
+    return OrientationMaps(gray, whole, half, histograms, geometry)
 
 
 def half_image(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Rounded mean over 2 x 2 pixels of a uint8 ``[H, W]`` image."""
-    rows, columns = _level_shape(gray.shape[0], gray.shape[1], 2)
-    half, exact = np.empty((rows, columns), dtype=np.uint8), np.empty((rows, columns), dtype=np.float32)
-    _halve(0, rows, gray, exact, half)
-    return half
+    height, width = gray.shape
+    y, x = (
+        np.minimum(np.arange(2 * max(1, height // 2)), height - 1),
+        np.minimum(np.arange(2 * max(1, width // 2)), width - 1),
+    )
+    even = gray[np.ix_(y, x)].astype(np.uint16)
+    total = even[::2, ::2] + even[::2, 1::2] + even[1::2, ::2] + even[1::2, 1::2]
+    return np.asarray((total + 2) >> 2, dtype=np.uint8)
 
 
 def framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -140,110 +157,3 @@ def _level_shape(height: int, width: int, step: int) -> tuple[int, int]:
     for _ in range(int(np.log2(step))):
         height, width = max(1, height // 2), max(1, width // 2)
     return height, width
-
-
-@kernel
-def _halve(start, stop, gray, exact, rounded):  # type: ignore[no-untyped-def]
-    """Mean of 2 x 2 pixels."""
-    height, width = gray.shape
-    quarter = np.float32(0.25)
-    for y in range(start, stop):
-        upper = gray[min(2 * y, height - 1)]
-        lower = gray[min(2 * y + 1, height - 1)]
-        for x in range(exact.shape[1]):
-            right = min(2 * x + 1, width - 1)
-            total = np.int32(upper[2 * x]) + np.int32(upper[right]) + np.int32(lower[2 * x]) + np.int32(lower[right])
-            exact[y, x] = np.float32(total) * quarter
-            rounded[y, x] = np.uint8((total + 2) >> 2)
-
-
-@kernel
-def _directional_derivatives(start, stop, half, out):  # type: ignore[no-untyped-def]
-    """Rectified derivatives along eight directions, grey levels a full-image pixel, eight adjacent floats a pixel."""
-    height, width = half.shape
-    diagonal = np.float32(np.sqrt(0.5))
-    scale = np.float32(0.25)
-    zero = np.float32(0)
-    for y in range(start, stop):
-        above, below, here = half[max(y - 1, 0)], half[min(y + 1, height - 1)], half[y]
-        for x in range(width):
-            gx = (here[min(x + 1, width - 1)] - here[max(x - 1, 0)]) * scale
-            gy = (below[x] - above[x]) * scale
-            up = (gx + gy) * diagonal
-            down = (gy - gx) * diagonal
-            o = 8 * x
-            out[y, o] = max(gx, zero)
-            out[y, o + 1] = max(up, zero)
-            out[y, o + 2] = max(gy, zero)
-            out[y, o + 3] = max(down, zero)
-            out[y, o + 4] = max(-gx, zero)
-            out[y, o + 5] = max(-up, zero)
-            out[y, o + 6] = max(-gy, zero)
-            out[y, o + 7] = max(-down, zero)
-
-
-@kernel
-def _halve_histograms(start, stop, source, target):  # type: ignore[no-untyped-def]
-    """Mean of 2 x 2 histograms of eight bins."""
-    quarter = np.float32(0.25)
-    rows, columns = source.shape[0], source.shape[1] // 8
-    for y in range(start, stop):
-        upper, lower = source[min(2 * y, rows - 1)], source[min(2 * y + 1, rows - 1)]
-        for x in range(target.shape[1] // 8):
-            left, right = 16 * x, 8 * min(2 * x + 1, columns - 1)
-            for b in range(8):
-                target[y, 8 * x + b] = (
-                    (upper[left + b] + upper[right + b]) + (lower[left + b] + lower[right + b])
-                ) * quarter
-
-
-@kernel
-def _blur_and_quantise(start, stop, source, target, weights, histograms, first, stride, floor):  # type: ignore[no-untyped-def]
-    """Separable Gaussian of interleaved rows (edges repeated), and its partially normalised bytes."""
-    rows, length = source.shape
-    radius = len(weights) - 1
-    pad = 8 * radius
-    line = np.empty(length + 2 * pad, dtype=np.float32)
-    middle = line[pad : pad + length]
-    gains = np.empty(length // 8, dtype=np.float32)
-    full, half = np.float32(255.0), np.float32(0.5)
-    for y in range(start, stop):
-        here = source[y]
-        w = weights[0]
-        for i in range(length):
-            middle[i] = w * here[i]
-        for t in range(1, radius + 1):
-            above, below = source[max(y - t, 0)], source[min(y + t, rows - 1)]
-            w = weights[t]
-            for i in range(length):
-                middle[i] += w * (above[i] + below[i])
-        for t in range(radius):
-            for b in range(8):
-                line[8 * t + b] = middle[b]
-                line[pad + length + 8 * t + b] = middle[length - 8 + b]
-        out = target[y]
-        w = weights[0]
-        for i in range(length):
-            out[i] = w * middle[i]
-        for t in range(1, radius + 1):
-            left = line[pad - 8 * t : pad - 8 * t + length]
-            right = line[pad + 8 * t : pad + 8 * t + length]
-            w = weights[t]
-            for i in range(length):
-                out[i] += w * (left[i] + right[i])
-        for x in range(length // 8):
-            h = out[8 * x : 8 * x + 8]
-            squares = ((h[0] * h[0] + h[1] * h[1]) + (h[2] * h[2] + h[3] * h[3])) + (
-                (h[4] * h[4] + h[5] * h[5]) + (h[6] * h[6] + h[7] * h[7])
-            )
-            gains[x] = squares
-        for x in range(length // 8):
-            gains[x] = full / (np.sqrt(gains[x]) + floor)
-        for x in range(length // 8):
-            gain = gains[x]
-            for b in range(8):
-                line[8 * x + b] = gain
-        row = 8 * (first + y * stride)
-        cells = histograms[row : row + length]
-        for i in range(length):
-            cells[i] = np.uint8(np.int32(out[i] * line[i] + half))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
+from .buffers import BufferPool
 from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
 from .consensus import dissenting_labels
 from .estimator import FlowResult
@@ -48,10 +49,11 @@ class SparseDaisyFlow:
         self.settings = settings or FlowSettings()
         self.threads = max(1, threads)
         self.pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
+        self._buffers = BufferPool()
 
     def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
         """The orientation maps of a uint8 ``[H, W]`` image."""
-        return orientation_maps(gray, threads=self.threads, pool=self.pool)
+        return orientation_maps(gray, threads=self.threads, pool=self.pool, buffers=self._buffers)
 
     def track(
         self,
