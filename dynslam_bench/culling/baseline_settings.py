@@ -10,7 +10,6 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.segmentation.classes import expand_classes
 
-
 MOVABLE = (
     "backpack,bed,book,bottle,bowl,cell phone,chair,couch,cup,dining table,handbag,keyboard,laptop,mouse,potted plant,"
     "sports ball,suitcase,teddy bear,tv,umbrella"

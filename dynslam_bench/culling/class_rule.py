@@ -14,6 +14,7 @@ from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need,
 from .semantic import inside
 from .settings import EpipolarSettings
 
+
 class ClassRuleFilter(DynamicFilter):
     """Drops all points on people; on movable things those off their line, or at the depth of a thing that moves.
 

@@ -105,6 +105,6 @@ def expand(
         return expanded
     distance, nearest = cKDTree(xy[sure]).query(xy[new], distance_upper_bound=reach_px)
     near = np.isfinite(distance)
-    say = np.exp(-0.5 * np.square(distance[near] / (0.5 * reach_px)))
+    say = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * reach_px)))
     expanded[new[near]] = UNKNOWN + say * (probability[sure[np.asarray(nearest)[near]]] - UNKNOWN)
     return expanded

@@ -51,7 +51,7 @@ class ReseedingFilter(DynamicFilter):
         stats = {
             "static": float(np.count_nonzero(static)),
             "reseeded": float(np.count_nonzero(used & ~usual)),
-            "missing": float(max(self.settings.budget - np.count_nonzero(used), 0)),
+            "missing": float(max(self.settings.budget - int(np.count_nonzero(used)), 0)),
             "dropped": float(np.count_nonzero(static & ~used)),
         }
         keep = used | ~static  # only what was still in use is judged here
@@ -82,4 +82,3 @@ class ReseedingFilter(DynamicFilter):
         strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
         home = cell[:, 1] * (1 << 20) + cell[:, 0]
         return spread(home, strength, np.ones(len(rows), dtype=bool), quota)
-

@@ -9,7 +9,7 @@ from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SemanticSystemSettings, compose
+from .composition import SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -47,6 +47,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Fan et al., Blitz-SLAM, Pattern Recognition 2022",
     assumptions=(
+        SHARED_MASKS,
         "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated)",
         "which classes are movable (not stated)",
         "the residual removal of its mapping is left out: it does not touch the pose",

@@ -17,6 +17,9 @@ from dynslam_bench.slam.settings import BackendSettings
 
 from ..protocol import TrackerContext
 
+SHARED_MASKS = "masks come from the stage that all systems share: scores above 0.3, missed detections bridged"
+"""An assumption of every system with a semantic source."""
+
 if TYPE_CHECKING:
     from dynslam_bench.culling.filter import DynamicFilter
     from dynslam_bench.slam.pipeline import SlamPipeline

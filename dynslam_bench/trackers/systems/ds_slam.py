@@ -8,7 +8,7 @@ from dynslam_bench.culling.baseline_settings import MovingVoteSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SemanticSystemSettings, compose
+from .composition import SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -38,5 +38,6 @@ SPEC = TrackerSpec(
     ranked=True,
     license="MIT (re-implemented from the description)",
     citation="Yu et al., DS-SLAM, IROS 2018",
+    assumptions=(SHARED_MASKS,),
     remarks="has no degeneracy guard: the published system fails on walking_rpy (0.44 m)",
 )

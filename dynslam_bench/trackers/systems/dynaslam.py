@@ -8,7 +8,7 @@ from dynslam_bench.culling.baseline_settings import MultiViewSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SemanticSystemSettings, compose
+from .composition import SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.culling.filter import DynamicFilter
@@ -56,6 +56,15 @@ def build_masks_only(settings: DynaSlamSettings, context: TrackerContext) -> Sla
     return compose(settings, context, [SemanticFilter(settings.segmentation)])
 
 
+GEOMETRY = (
+    "regions grow around the depth of their seed, not around a running mean",
+    "the search window is sampled on every fourth pixel",
+    "the low-cost tracking matches the last frame, not the local map",
+    "parallax is taken between camera centres (the code's translation is in another frame)",
+)
+UNION = "the masks of N and G are united, as in the code (the paper keeps G's where both find an object)"
+
+
 def _spec(
     suffix: str, variant: str, settings: type[DynaSlamSettings], factory: str, faithful_code: bool
 ) -> TrackerSpec:
@@ -69,8 +78,9 @@ def _spec(
         license="MIT (re-implemented from the description; the authors' code is GPL-3.0)",
         citation="Bescos et al., DynaSLAM, IEEE RA-L 2018",
         assumptions=(
-            "regions grow around the depth of their seed",
-            "the search window is sampled on every fourth pixel",
+            *(() if settings is DynaSlamGeometrySettings else (SHARED_MASKS,)),
+            *(() if factory == "build_masks_only" else GEOMETRY),
+            *((UNION,) if variant.startswith("N+G") else ()),
         ),
         remarks="background inpainting is left out: it rejects nothing",
     )

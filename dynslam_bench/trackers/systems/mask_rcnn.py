@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SemanticSystemSettings, compose
+from .composition import SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -27,4 +27,5 @@ SPEC = TrackerSpec(
     provenance="faithful-code",
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
+    assumptions=(SHARED_MASKS,),
 )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.culling.baseline_settings import DepthRansacSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SemanticSystemSettings, compose
+from .composition import SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -38,6 +38,8 @@ SPEC = TrackerSpec(
     citation="Wu et al., YOLO-SLAM, Neural Computing and Applications 2022",
     assumptions=(
         "the set grows by the nearest depth first (order not stated)",
-        "boxes derive from the semantic source that all systems share",
+        "features of a box without depth go with the person",
+        "boxes derive from the masks",
+        SHARED_MASKS,
     ),
 )

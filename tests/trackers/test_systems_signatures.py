@@ -1,0 +1,102 @@
+"""The signature table: published classes by the written rule, measured classes, and the table of a small store."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.runs import RunSpec, RunStore, run_many
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+def load(name: str, path: Path):
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+signatures = load("baseline_signatures", TESTS / "benchmarks" / "baseline_signatures.py")
+fake = load("signatures_fake_store", TESTS / "reports" / "reports_fake_store.py")
+
+
+@pytest.mark.parametrize(
+    ("ate", "coverage", "broken", "expected"),
+    [
+        (0.012, 1.0, False, "survives"),
+        (0.031, 1.0, False, "between"),
+        (0.15, 1.0, False, "fails"),
+        (0.012, 0.79, False, "fails"),
+        (0.012, 1.0, True, "fails"),
+        (float("nan"), 1.0, False, "fails"),
+    ],
+)
+def test_measured_classes(ate: float, coverage: float, broken: bool, expected: str) -> None:
+    assert signatures.classify(ate, coverage, 0.3, 0.01, broken) == expected
+
+
+def test_a_twin_that_hardly_moves_cannot_tell() -> None:
+    assert signatures.classify(0.012, 1.0, 0.02, 0.01) == "either"
+
+
+@pytest.mark.parametrize(
+    ("tracker", "sequence", "expected"),
+    [
+        ("orb-slam2", "walking_xyz", "fails"),  # 0.459 to 0.752 of 0.307 never-move
+        ("dynaslam-g", "walking_rpy", "fails"),  # 0.251
+        ("dynaslam-g", "walking_halfsphere", "survives"),  # 0.035 of 3 x 0.025
+        ("ds-slam", "walking_rpy", "fails"),
+        ("yolo-slam", "walking_rpy", "fails"),
+        ("dai-slam", "walking_xyz", "between"),  # 0.087: neither
+        ("dynaslam", "sitting_static", "survives"),
+        ("di-slam", "walking_xyz", None),  # nothing published that could be read
+    ],
+)
+def test_published_classes(tracker: str, sequence: str, expected: str | None) -> None:
+    assert signatures.published_class(tracker, signatures.recorded(f"synthetic/{sequence}@3")) == expected
+
+
+def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
+    store = RunStore(tmp_path)
+    twin = "synthetic/walking_rpy"
+    for seed in (0, 1):
+        fake.add_run(store, "mask-rcnn", twin, seed, error=0.004, overrides={"segmentation.source": "oracle"})
+        fake.add_run(store, "mask-rcnn", twin, seed, error=0.005, provenance="faithful-code")
+        fake.add_run(store, "orb-slam2", twin, seed, error=0.5, provenance="faithful-code")
+        fake.add_run(store, "yolo-slam", twin, seed, error=0.005)
+        fake.add_run(store, "cfp-slam", twin, seed, error=0.005, provenance="inspired")
+        fake.add_run(store, "dai-slam", twin, seed, error=0.005, lost=range(90))
+        fake.add_run(store, "di-slam", twin, seed, error=0.005, provenance="inspired")
+    text = signatures.report(tmp_path)
+    verdicts = {line.split("|")[1].strip(): line.rsplit("|", 2)[1].strip() for line in text.splitlines() if "`" in line}
+    assert verdicts == {
+        "`mask-rcnn`": "match", "`orb-slam2`": "match", "`yolo-slam`": "**miss**", "`dai-slam`": "match",
+        "`cfp-slam`": "match (not counted)",
+    }  # fmt: skip
+    assert "match: 3 of 4 (75 %; the bar is 75 %)" in text
+    assert "yolo-slam on walking_rpy: survives" in text and "published fails" in text
+
+
+def test_table_of_real_runs_says_what_filters_cost_and_cull(tmp_path: Path) -> None:
+    oracle = {"segmentation.source": "oracle"}
+    specs = [
+        RunSpec(tracker=tracker, sequence="synthetic/walking_xyz", settings=settings, frames=(0, 6))
+        for tracker, settings in (("orb-slam2", {}), ("mask-rcnn", oracle), ("opf-slam", {}))
+    ]
+    run_many(specs, results=tmp_path)
+    text = signatures.report(tmp_path)
+    assert "| `opf-slam` |" in text and "| `orb-slam2` | 0.0 (walking_xyz) | 0 | - |" in text
+    assert "Culled nothing on any walking twin: none" in text
+    assert "| walking_xyz | 0." in text
+
+
+def test_a_store_without_the_yardstick_is_a_clear_error(tmp_path: Path) -> None:
+    fake.add_run(RunStore(tmp_path), "orb-slam2", "synthetic/walking_xyz", 0)
+    with pytest.raises(DynslamError, match=r"exact masks on synthetic/walking_xyz.*suite 'dynamic'"):
+        signatures.report(tmp_path)
