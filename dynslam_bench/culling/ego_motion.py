@@ -14,6 +14,9 @@ MIN_POINTS = 12
 KERNEL_PX = (12.0, 6.0, 4.0, 2.0, 2.0, 2.0)
 """Scale of the redescending kernel in each Gauss-Newton step: wide to catch a poor prediction, then narrow."""
 CELL = 32
+CORRELATION = 100.0
+"""By how much the flow counts for less than its points' number says, against the motion model: the points of one thing
+err together, most of all where it moves (the back end inflates the covariance of its poses likewise)."""
 
 
 def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -52,8 +55,10 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     """The pose predicted for this frame, refined by the flow to the previous image.
 
     Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the previous image, begun
-    at the motion model's prediction, with a redescending (Geman-McClure) kernel: what moves against the majority
-    that agrees with the prediction loses its say.
+    at the motion model's prediction and held to it as far as the model is sure (maximum a posteriori), with a
+    redescending (Geman-McClure) kernel. Without the hold a person nearby drags the estimate along even where most
+    points are static: a far background of one depth tells turning from moving sideways hardly apart, so that the
+    camera's translation is left to what is near, and that may walk.
 
     Args:
         frame: The current frame.
@@ -71,8 +76,29 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     start = np.eye(4) if state.T_world_pred is None else se3.inverse(state.T_world_prev) @ state.T_world_pred
     points = state.camera.unproject(frame.xy[use], frame.z[use])
     before = state.camera.undistort_points(flow.xy[use])
-    T_prev_cur = _align(points, before, state.camera, start, trust(frame, state, flow.xy[use]))
+    prior = None if state.T_world_pred is None else prior_information(state, start)
+    T_prev_cur = _align(points, before, state.camera, start, trust(frame, state, flow.xy[use]), prior)
     return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
+
+
+def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """What the motion model knows of the motion since the previous frame, in the flow's units.
+
+    Args:
+        state: With the covariance of the predicted motion.
+        T_prev_cur: The predicted motion.
+
+    Returns:
+        Information ``[6, 6]`` of (translation, rotation), both in the previous camera's frame, times `CORRELATION`;
+        None where the motion model knows nothing.
+    """
+    if state.motion_covariance is None or state.T_world_prev is None:
+        return None
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = state.T_world_prev[:3, :3].T
+    turn[3:, 3:] = T_prev_cur[:3, :3]
+    covariance = turn @ state.motion_covariance @ turn.T + 1e-12 * np.eye(6)
+    return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
 
 def _align(
@@ -80,17 +106,22 @@ def _align(
     pixels: NDArray[np.float64],
     camera: Camera,
     start: NDArray[np.float64],
-    prior: NDArray[np.float64],
+    trusted: NDArray[np.float64],
+    information: NDArray[np.float64] | None,
 ) -> NDArray[np.float64] | None:
-    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if it does not hold."""
+    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if it does not hold.
+
+    `information` ``[6, 6]`` holds it to the start pose.
+    """
     pose = start
-    weight = prior
+    inverse_start = se3.inverse(start)
+    weight = trusted
     for scale in KERNEL_PX:
         moved = se3.transform(pose, points)
         z = np.maximum(moved[:, 2], 0.05)
         error = camera.project(moved) - pixels
         error = np.where(moved[:, 2:3] > 0.05, np.nan_to_num(error, posinf=1e4, neginf=-1e4), 1e4)
-        weight = prior / np.square(1 + (error**2).sum(axis=1) / scale**2)
+        weight = trusted / np.square(1 + (error**2).sum(axis=1) / scale**2)
         x, y = moved[:, 0] / z, moved[:, 1] / z
         zero = np.zeros_like(x)
         # derivative of the pixel by a left perturbation exp(rho, phi) of the pose
@@ -98,6 +129,9 @@ def _align(
         dv = camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=1)
         hessian = (du * weight[:, None]).T @ du + (dv * weight[:, None]).T @ dv
         gradient = du.T @ (weight * error[:, 0]) + dv.T @ (weight * error[:, 1])
+        if information is not None:
+            hessian += information
+            gradient += information @ se3.log(pose @ inverse_start)
         try:
             step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), -gradient)
         except np.linalg.LinAlgError:

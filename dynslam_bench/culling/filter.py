@@ -80,6 +80,8 @@ class FilterState:
         previous_keep: bool, which keypoints of the previous frame were kept.
         T_world_prev: Pose of the previous frame, None if it was not tracked.
         T_world_pred: Pose predicted for this frame by the motion model, None without one.
+        motion_covariance: Covariance ``[6, 6]`` of the predicted motion since the previous frame: position in the world
+            (m), rotation in the camera's frame (rad); None where the motion model knows nothing.
         flow: Flow of this frame's keypoints *to the previous image* (raw pixels); None until the flow stage ran.
         keyframes: The latest keyframes, newest first.
         map_point: int64 ``[M]`` ids and float64 ``[M, 3]`` positions of local map points, or None.
@@ -92,6 +94,7 @@ class FilterState:
     previous_keep: NDArray[np.bool_] | None = None
     T_world_prev: NDArray[np.float64] | None = None
     T_world_pred: NDArray[np.float64] | None = None
+    motion_covariance: NDArray[np.float64] | None = None
     flow: FlowResult | None = None
     keyframes: tuple[KeyframeView, ...] = ()
     map_points: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None

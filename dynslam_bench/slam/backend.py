@@ -84,6 +84,17 @@ class RgbdBackend:
             return None
         return se3.inverse(self._predicted(None))
 
+    def motion_covariance(self) -> Array | None:
+        """How far the camera's motion since the last frame may be from the predicted one.
+
+        Returns:
+            Covariance ``[6, 6]`` of (position in the world in metres, rotation in the camera frame in radians); None
+            while lost or when nothing is known yet.
+        """
+        if self._motion is None or self.state != "ok":
+            return None
+        return self._motion.motion_covariance(self._dt, self.settings.motion)
+
     def _predicted(self, stamp: float | None) -> Array:
         assert self._last is not None
         dt = self._dt if stamp is None else stamp - self._last.timestamp

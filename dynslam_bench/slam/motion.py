@@ -115,6 +115,14 @@ class MotionState:
         step = np.concatenate([self.speed * dt, np.zeros(6)])
         return self.moved(step, f @ self.covariance @ f.T + noise)
 
+    def motion_covariance(self, dt: float, settings: MotionSettings) -> Array:
+        """Covariance ``[6, 6]`` of the motion in the next `dt` seconds.
+
+        Of (position in the world, rotation in the camera frame); where the camera is now plays no part.
+        """
+        noise = _process_noise(dt, settings.acceleration, settings.angular_acceleration)
+        return np.asarray(dt**2 * self.covariance[6:, 6:] + noise[:6, :6])
+
     def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
         """The state after a measured pose; a surprising one (chi-square) is believed more than the motion model."""
         p = self.covariance

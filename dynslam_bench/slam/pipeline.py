@@ -125,6 +125,7 @@ class SlamPipeline:
             previous_keep=self._previous_keep,
             T_world_prev=self._previous_pose,
             T_world_pred=self._backend.predict(),
+            motion_covariance=self._backend.motion_covariance(),
             keyframes=self._backend.keyframe_views(KEYFRAMES_SHOWN),
             map_points=self._backend.map_points(),
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import CAMERA, box_instance, bundle, keyframe, scene
+from scenes import CAMERA, Scene, box_instance, bundle, keyframe, scene
 
 from dynslam_bench.culling.coherence import coherent
 from dynslam_bench.culling.ego_motion import refine_prediction
@@ -96,6 +96,44 @@ def test_ego_motion_resists_a_large_moving_object() -> None:
     assert refined is not None
     error = se3.inverse(SIDEWAYS) @ refined
     assert np.linalg.norm(error[:3, 3]) < 2e-3 and se3.rotation_angle(error) < 1e-3
+
+
+def far_wall_and_walker(T_prev_cur: np.ndarray, walk: np.ndarray) -> Scene:
+    """A wall 3 m away, of one depth within the sensor's noise, and a person at 1 m who walks."""
+    made = scene(T_prev_cur, n_static=250, n_moving=120, seed=3)
+    rng = np.random.default_rng(3)
+    z = np.where(made.moving, rng.uniform(0.9, 1.1, len(made.frame)), rng.uniform(2.9, 3.1, len(made.frame)))
+    made.frame.z[:] = z
+    assert made.state.previous is not None and made.state.flow is not None
+    made.state.previous.depth[:] = 0.0  # the flow alone has to tell
+    before = se3.transform(T_prev_cur, CAMERA.unproject(made.frame.xy, z))
+    before[made.moving] -= walk
+    made.state.flow.xy[:] = CAMERA.project(before) + rng.normal(0, 0.3, (len(z), 2))
+    return made
+
+
+def test_the_motion_model_keeps_a_walker_from_dragging_the_camera_along() -> None:
+    made = far_wall_and_walker(np.eye(4), np.array([0.03, 0.0, 0.0]))  # 1 m/s at 30 Hz
+    free = refine_prediction(made.frame, made.state)
+    made.state.motion_covariance = np.diag([2.5e-3**2] * 3 + [0.012**2] * 3)
+    held = refine_prediction(made.frame, made.state)
+    assert free is not None and np.linalg.norm(free[:3, 3]) > 0.02, "the wall alone does not tell turning from moving"
+    assert held is not None and np.linalg.norm(held[:3, 3]) < 3e-3
+    made.state.T_world_pred = held
+    verdict = MotionFilter(MotionSettings()).apply(made.frame, made.state)
+    assert not verdict.keep[made.moving].any() and verdict.keep[~made.moving].mean() > 0.97
+
+
+def test_the_motion_model_does_not_hold_back_a_camera_that_really_accelerates() -> None:
+    jerk = se3.exp(np.array([0.004, -0.003, 0.002, 0.01, -0.02, 0.005]))
+    made = scene(jerk)
+    made.state.T_world_pred = np.eye(4)
+    made.state.motion_covariance = np.diag([2.5e-3**2] * 3 + [0.012**2] * 3)
+    held = refine_prediction(made.frame, made.state)
+    assert held is not None
+    assert se3.rotation_angle(se3.inverse(jerk) @ held) < 3e-3 < se3.rotation_angle(jerk) / 5
+    made.state.T_world_pred = held
+    assert MotionFilter(MotionSettings()).apply(made.frame, made.state).keep.all()
 
 
 def test_free_space_culls_what_stands_where_a_keyframe_saw_through() -> None:
