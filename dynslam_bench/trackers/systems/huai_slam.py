@@ -42,5 +42,8 @@ SPEC = TrackerSpec(
     ranked=False,
     license="MIT (re-implemented from the description)",
     citation="Huai et al., Sensors 25(6) 1696, 2025",
-    assumptions=("five frames, 0.33 m, 7 px, Bayes filter of 0.9",),
+    assumptions=(
+        "five frames, 7 px, Bayes filter of 0.9",
+        "masks are fitted to depth at their border, within 0.33 m, and not cut by it as a whole",
+    ),
 )
