@@ -30,7 +30,7 @@ from .matching import (
     tables_for,
 )
 from .refinement import BORDER
-from .searches.propagation import transported_labels
+from .searches.propagation import label_turns, transported_labels
 from .settings import FlowSettings
 from .sparse import SparseDaisyFlow
 from .superpixels import superpixels
@@ -194,7 +194,7 @@ class _OneWay:
         extent = np.full((n, 4), 8.0, dtype=np.float32)
         near = np.ascontiguousarray(neighbours[:, :most])
         no_motion = np.empty((0, 4), dtype=np.float32)
-        transported_labels(0, n, self.centres, labels, near, no_motion, -extent, extent, seen)
+        transported_labels(0, n, self.centres, labels, label_turns(labels), near, no_motion, -extent, extent, seen)
         return np.concatenate([labels[:, None], seen], axis=1)
 
 

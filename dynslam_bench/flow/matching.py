@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout
-from ._jit import inlined, kernel, sum_abs_diff8
+from ._jit import descriptor_sum, inlined, kernel
 from .maps import OrientationMaps, map_geometry
 from .settings import FlowSettings
 
@@ -213,18 +213,13 @@ def describe_once(x, y, a, image, tables, out, first):  # type: ignore[no-untype
 @inlined
 def descriptor_distance(x, y, si, ti, mine, descriptor, target, tables):  # type: ignore[no-untyped-def]
     """First term of Eq. 1: truncated distance of 136 bytes at `mine` to the target at (x, y), scale si, rotation ti."""
-    truncation = np.int32(tables.truncation)
-    total = np.int32(0)
-    mine = np.uint64(mine)
-    cell, phase = cell_of(x, y, tables.ring0[si])
-    for k in range(9):
-        theirs = np.uint64(cell + tables.samples[si, ti, phase, k])
-        total += min(sum_abs_diff8(target.histograms, theirs, descriptor, mine + np.uint64(8 * k)), truncation)
-    cell, phase = cell_of(x, y, tables.ring1[si])
-    for k in range(9, 17):
-        theirs = np.uint64(cell + tables.samples[si, ti, phase, k])
-        total += min(sum_abs_diff8(target.histograms, theirs, descriptor, mine + np.uint64(8 * k)), truncation)
-    return total
+    near, near_phase = cell_of(x, y, tables.ring0[si])
+    far, far_phase = cell_of(x, y, tables.ring1[si])
+    row = 4 * (si * layout.ROTATIONS + ti)
+    return descriptor_sum(
+        target.histograms, tables.samples, row + near_phase, row + far_phase, near, far, descriptor, mine,
+        tables.truncation,
+    )  # fmt: skip
 
 
 @inlined
@@ -256,7 +251,7 @@ def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ig
         return np.int64(OUTSIDE)
     si, ti = quantised(s, theta)
     supports = len(tables.support)
-    total = np.int32(0)
+    total = np.int64(0)
     for q in range(supports):
         tx, ty = cx, cy
         if q > 0:
@@ -272,8 +267,8 @@ def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ig
             total += tables.intensity[abs(gray - reference.appearance[i, q, 0])]
             total += tables.gradient[min(abs(gradient - reference.appearance[i, q, 1]), 255)]
         if total >= bound:
-            return np.int64(total)
-    return np.int64(total)
+            return total
+    return total
 
 
 @inlined

@@ -8,35 +8,38 @@ from ._jit import kernel
 
 
 @kernel
-def nearest_neighbours(points, order, width, out):  # type: ignore[no-untyped-def]
+def nearest_neighbours(start, stop, ordered, order, width, out):  # type: ignore[no-untyped-def]
     """The nearest other points of each point, in an approximate but deterministic search over rows of equal bands.
 
     Args:
-        points: float32 ``[N, 2]``.
-        order: int64 ``[N]``, indices sorted by x.
+        start: First place in the order.
+        stop: One past the last.
+        ordered: float32 ``[N, 2]``, the points sorted by x.
+        order: int64 ``[N]``, their indices.
         width: Number of points looked at on each side in that order.
-        out: int64 ``[N, K]``, nearest first; -1 where there are fewer.
+        out: int64 ``[N, K]``, nearest first; -1 where there are fewer. Rows are points, not places.
     """
     n, count = out.shape
-    out[:] = -1
-    best = np.empty(max(count, 1), dtype=np.float32)
-    for position in range(n):
-        i = order[position]
-        x, y = points[i, 0], points[i, 1]
-        found = 0
-        for other in range(max(0, position - width), min(n, position + width + 1)):
-            if other == position or count == 0:
-                continue
-            j = order[other]
-            dx, dy = points[j, 0] - x, points[j, 1] - y
-            distance = dx * dx + dy * dy
-            if found == count and distance >= best[count - 1]:
-                continue
-            k = found if found < count else count - 1
-            while k > 0 and best[k - 1] > distance:
-                best[k] = best[k - 1]
-                out[i, k] = out[i, k - 1]
-                k -= 1
-            best[k] = distance
-            out[i, k] = j
-            found = min(found + 1, count)
+    best, index = np.empty(count, dtype=np.float32), np.empty(count, dtype=np.int64)
+    distances = np.empty(2 * width + 1, dtype=np.float32)
+    for place in range(start, stop):
+        x, y = ordered[place, 0], ordered[place, 1]
+        first, last = max(0, place - width), min(n, place + width + 1)
+        for k in range(last - first):
+            dx, dy = ordered[first + k, 0] - x, ordered[first + k, 1] - y
+            distances[k] = dx * dx + dy * dy
+        distances[place - first] = np.inf
+        best[:], index[:] = np.inf, -1
+        worst = np.float32(np.inf)
+        for k in range(last - first):
+            distance = distances[k]
+            if distance < worst:
+                slot = count - 1
+                while slot > 0 and best[slot - 1] > distance:
+                    best[slot], index[slot] = best[slot - 1], index[slot - 1]
+                    slot -= 1
+                best[slot], index[slot] = distance, order[first + k]
+                worst = best[count - 1]
+        i = order[place]
+        for slot in range(count):
+            out[i, slot] = index[slot]

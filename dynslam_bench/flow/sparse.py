@@ -21,7 +21,7 @@ from .matching import CostTables, Reference, describe, reference_appearance, sid
 from .neighbours import nearest_neighbours
 from .refinement import BORDER, similarity_lucas_kanade
 from .searches.common import SearchState, new_state
-from .searches.propagation import common_motions, transported_labels
+from .searches.propagation import common_motions, label_turns, transported_labels
 from .searches.schedule import PROPAGATING, Phase, Plan, make_plan, phase_runner
 from .settings import FlowSettings
 from .subpixel import parabola
@@ -126,7 +126,9 @@ class SparseDaisyFlow:
         n = len(points)
         count = min(MOST_NEIGHBOURS, n - 1) if self.settings.search in PROPAGATING else 0
         found = np.empty((n, count), dtype=np.int64)
-        nearest_neighbours(points, np.argsort(points[:, 0], kind="stable"), NEIGHBOUR_WINDOW, found)
+        if count:
+            order = np.argsort(points[:, 0], kind="stable")
+            run_stripes(nearest_neighbours, n, self.threads, self.pool, points[order], order, NEIGHBOUR_WINDOW, found)
         return found
 
     def _runner(
@@ -172,9 +174,10 @@ class SparseDaisyFlow:
                         points, best, state.costs[:, 0].copy(), MOTION_HYPOTHESES, np.float32(MOTION_TOLERANCE_PX),
                         np.uint64(seed + number), motions,
                     )  # fmt: skip
+                turns = label_turns(best)
                 run_stripes(
-                    transported_labels, n, self.threads, self.pool, points, best, neighbours, motions, lower, upper,
-                    candidates,
+                    transported_labels, n, self.threads, self.pool, points, best, turns, neighbours, motions, lower,
+                    upper, candidates,
                 )  # fmt: skip
                 run(number, candidates)
         return state
@@ -207,7 +210,8 @@ class SparseDaisyFlow:
         n = len(points)
         extent = np.full((n, 4), 8.0, dtype=np.float32)
         predictions = np.empty((n, neighbours.shape[1], 4), dtype=np.float32)
-        transported_labels(0, n, points, labels, neighbours, np.empty((0, 4), np.float32), -extent, extent, predictions)
+        turns, no_motion = label_turns(labels), np.empty((0, 4), np.float32)
+        transported_labels(0, n, points, labels, turns, neighbours, no_motion, -extent, extent, predictions)
         alternative = np.empty((n, 4), dtype=np.float32)
         dissents = np.empty(n, dtype=np.bool_)
         dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
@@ -218,7 +222,8 @@ class SparseDaisyFlow:
         doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
         common_motions(points, labels, doubt, MOTION_HYPOTHESES, np.float32(MOTION_TOLERANCE_PX), np.uint64(1), motions)
         predictions = np.empty((n, 2, 4), dtype=np.float32)
-        transported_labels(0, n, points, labels, np.empty((n, 0), np.int64), motions, -extent, extent, predictions)
+        nobody = np.empty((n, 0), np.int64)
+        transported_labels(0, n, points, labels, turns, nobody, motions, -extent, extent, predictions)
         alternative = np.ascontiguousarray(predictions[:, 0])
         with np.errstate(invalid="ignore"):
             dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX

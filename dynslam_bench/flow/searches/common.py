@@ -49,30 +49,42 @@ def new_state(
 
 
 @inlined
-def stream(seed, point, phase):  # type: ignore[no-untyped-def]
-    """Start of a point's random numbers in one phase: a hash of its arguments (splitmix64)."""
-    z = np.uint64(seed) + _GOLDEN * (np.uint64(point) * np.uint64(64) + np.uint64(phase) + np.uint64(1))
-    z = (z ^ (z >> np.uint64(30))) * _MIX1
+def scrambled(state):  # type: ignore[no-untyped-def]
+    """64 random bits of a state (splitmix64)."""
+    z = (state ^ (state >> np.uint64(30))) * _MIX1
     z = (z ^ (z >> np.uint64(27))) * _MIX2
     return z ^ (z >> np.uint64(31))
 
 
 @inlined
+def stream(seed, point, phase):  # type: ignore[no-untyped-def]
+    """First state of a point's random numbers in one phase: a hash of its arguments."""
+    return scrambled(np.uint64(seed) + _GOLDEN * (np.uint64(point) * np.uint64(64) + np.uint64(phase) + np.uint64(1)))
+
+
+@inlined
 def advance(state):  # type: ignore[no-untyped-def]
-    """The next state of a point's stream; use its upper bits."""
-    return state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+    """The next state of a point's random numbers."""
+    return state + _GOLDEN
 
 
 @inlined
-def uniform(state):  # type: ignore[no-untyped-def]
-    """The state's float32 in [0, 1)."""
-    return np.float32(np.int32(state >> np.uint64(40))) * np.float32(1.0 / (1 << 24))
+def uniform(bits, quarter):  # type: ignore[no-untyped-def]
+    """One of the four float32 in [0, 1) that `scrambled` bits make, in steps of 2**-16."""
+    part = np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))
+    return np.float32(part) * np.float32(1.0 / 65536)
 
 
 @inlined
-def insert(state, i, u, v, s, theta, cost):  # type: ignore[no-untyped-def]
-    """Merge an evaluated label into the sorted flames of point i if it is better than the worst (``F = best N``)."""
-    costs, flames = state.costs[i], state.flames[i]
+def insert(flames, costs, label, cost):  # type: ignore[no-untyped-def]
+    """Merge an evaluated label into a point's sorted flames if it is better than the worst (``F = best N``).
+
+    Args:
+        flames: float32 ``[P, 4]``, changed in place.
+        costs: int64 ``[P]``, likewise.
+        label: float32 ``[4]``.
+        cost: Its cost.
+    """
     k = len(costs) - 1
     if cost >= costs[k]:
         return
@@ -82,12 +94,13 @@ def insert(state, i, u, v, s, theta, cost):  # type: ignore[no-untyped-def]
             flames[k, j] = flames[k - 1, j]
         k -= 1
     costs[k] = cost
-    flames[k, 0], flames[k, 1], flames[k, 2], flames[k, 3] = u, v, s, theta
+    for j in range(4):
+        flames[k, j] = label[j]
 
 
 @inlined
-def widen(lower, upper, best):  # type: ignore[no-untyped-def]
+def widen(lower, upper, flames):  # type: ignore[no-untyped-def]
     """Let a point's box contain the surroundings of its best displacement, which a neighbour may have brought."""
     room = np.float32(8)
     for j in range(2):
-        lower[j], upper[j] = min(lower[j], best[j] - room), max(upper[j], best[j] + room)
+        lower[j], upper[j] = min(lower[j], flames[0, j] - room), max(upper[j], flames[0, j] + room)

@@ -10,7 +10,10 @@ import numpy as np
 
 from .._jit import inlined, kernel
 from ..matching import label_cost
-from .common import advance, insert, stream, uniform, widen
+from .common import advance, insert, scrambled, stream, uniform, widen
+
+CANDIDATES, FOUNDING, OPPOSITES, FLIGHT = 0, 1, 2, 3
+"""Stages of a phase; all but the first and the last belong to phase 0."""
 
 
 @kernel
@@ -36,97 +39,127 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
         cauchy: `rules.cauchy_table`.
         steps: float32 ``[4]``, scale of the Cauchy steps.
     """
-    population = state.costs.shape[1]
-    iterations = len(counts)
-    label = np.empty(4, dtype=np.float32)
+    population, iterations = state.costs.shape[1], len(counts)
+    founding = population * (2 if rules.opposition else 1)
+    moths, flames = np.empty((population, 4), dtype=np.float32), np.empty((population, 4), dtype=np.float32)
+    costs = np.empty(population, dtype=np.int64)
+    lower, upper = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
     low, high = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
+    trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
+    label = np.empty(4, dtype=np.float32)
     for i in range(start, stop):
+        for j in range(4):
+            lower[j], upper[j] = state.lower[i, j], state.upper[i, j]
+            for m in range(population):
+                moths[m, j], flames[m, j] = state.moths[i, m, j], state.flames[i, m, j]
+        for m in range(population):
+            costs[m] = state.costs[i, m]
         random = stream(seed, i, phase)
-        moths, flames, costs = state.moths[i], state.flames[i], state.costs[i]
-        lower, upper = state.lower[i], state.upper[i]
-        used = state.used[i]
-        placed = 0
-        for c in range(candidates.shape[1]):
-            u, v, s, theta = candidates[i, c, 0], candidates[i, c, 1], candidates[i, c, 2], candidates[i, c, 3]
-            if used >= end or not np.isfinite(u + v + s + theta):
-                continue
-            cost = label_cost(i, u, v, s, theta, reference, target, tables, costs[population - 1])
-            used += 1
-            insert(state, i, u, v, s, theta, cost)
-            if phase == 0 and placed < population:
-                moths[placed, 0], moths[placed, 1], moths[placed, 2], moths[placed, 3] = u, v, s, theta
-                placed += 1
-        widen(lower, upper, flames[0])
-        if phase == 0:
-            for m in range(placed, population):
-                for j in range(4):  # LB + (UB - LB) rand
+        used, placed = state.used[i], 0
+        stage = CANDIDATES
+        while True:  # one place where costs are computed: what differs is which labels are tried
+            count = 0
+            if stage == CANDIDATES:
+                for c in range(candidates.shape[1]):
+                    total = np.float32(0)
+                    for j in range(4):
+                        trials[count, j] = candidates[i, c, j]
+                        total += candidates[i, c, j]
+                    count += np.isfinite(total)
+                if phase == 0:
+                    placed = min(count, population, end - used)
+                    for m in range(placed):
+                        for j in range(4):
+                            moths[m, j] = trials[m, j]
+            elif stage == FOUNDING:
+                for m in range(placed, population):
                     random = advance(random)
-                    moths[m, j] = lower[j] + (upper[j] - lower[j]) * uniform(random)
-                if used < end:
-                    used += 1
-                    u, v, s, theta = moths[m, 0], moths[m, 1], moths[m, 2], moths[m, 3]
-                    cost = label_cost(i, u, v, s, theta, reference, target, tables, costs[population - 1])
-                    insert(state, i, u, v, s, theta, cost)
-            if rules.opposition:
+                    bits = scrambled(random)
+                    for j in range(4):  # LB + (UB - LB) rand
+                        moths[m, j] = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
+                        trials[count, j] = moths[m, j]
+                    count += 1
+            elif stage == OPPOSITES:
                 for j in range(4):  # dynamic bounds dy, dz (Eq. 20)
                     low[j], high[j] = moths[0, j], moths[0, j]
                     for m in range(1, population):
                         low[j], high[j] = min(low[j], moths[m, j]), max(high[j], moths[m, j])
+                count = population
                 for m in range(population):
                     random = advance(random)
-                    factor = uniform(random)
+                    factor = uniform(scrambled(random), 0)
+                    random = advance(random)
+                    bits = scrambled(random)
                     for j in range(4):
-                        label[j] = factor * (low[j] + high[j]) - moths[m, j]  # Eq. 19
-                        random = advance(random)
-                        if label[j] < lower[j] or label[j] > upper[j]:  # Eq. 21-22
-                            label[j] = lower[j] + (upper[j] - lower[j]) * uniform(random)
-                    if used < end:
-                        used += 1
-                        cost = label_cost(
-                            i, label[0], label[1], label[2], label[3], reference, target, tables,
-                            costs[population - 1],
-                        )  # fmt: skip
-                        insert(state, i, label[0], label[1], label[2], label[3], cost)
+                        opposite = factor * (low[j] + high[j]) - moths[m, j]  # Eq. 19
+                        if opposite < lower[j] or opposite > upper[j]:  # Eq. 21-22
+                            opposite = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
+                        trials[m, j] = opposite
+            else:
+                if used >= end:
+                    break
+                iteration = min(max((used - founding) // population, 0), iterations - 1)
+                random = fly(moths, flames, lower, upper, iteration, rules, counts, spiral, cauchy, steps, random)
+                count = population
+                for m in range(population):
+                    for j in range(4):
+                        trials[m, j] = moths[m, j]
+            for k in range(min(count, end - used)):
+                for j in range(4):
+                    label[j] = trials[k, j]
+                cost = label_cost(
+                    i, label[0], label[1], label[2], label[3], reference, target, tables, costs[population - 1]
+                )
+                insert(flames, costs, label, cost)
+                used += 1
+            if stage == CANDIDATES:
+                widen(lower, upper, flames)
+                stage = FOUNDING if phase == 0 else FLIGHT
+            elif stage == FOUNDING:
+                stage = OPPOSITES if rules.opposition else FLIGHT
+            elif stage == OPPOSITES:
                 for m in range(population):  # the best N of X and its opposites
                     if costs[m] < tables.ceiling:
                         for j in range(4):
                             moths[m, j] = flames[m, j]
-        founding = population * (2 if rules.opposition else 1)
-        while used < end:
-            iteration = min(max((used - founding) // population, 0), iterations - 1)
-            fly(moths, flames, lower, upper, iteration, rules, counts, spiral, cauchy, steps, random)
-            random = stream(random, i, phase)
-            for m in range(population):
-                if used < end:
-                    used += 1
-                    u, v, s, theta = moths[m, 0], moths[m, 1], moths[m, 2], moths[m, 3]
-                    cost = label_cost(i, u, v, s, theta, reference, target, tables, costs[population - 1])
-                    insert(state, i, u, v, s, theta, cost)
+                stage = FLIGHT
         state.used[i] = used
+        for j in range(4):
+            state.lower[i, j], state.upper[i, j] = lower[j], upper[j]
+            for m in range(population):
+                state.moths[i, m, j], state.flames[i, m, j] = moths[m, j], flames[m, j]
+        for m in range(population):
+            state.costs[i, m] = costs[m]
 
 
 @inlined
 def fly(moths, flames, lower, upper, iteration, rules, counts, spiral, cauchy, steps, random):  # type: ignore[no-untyped-def]
-    """Move every moth once (Eq. 8-18)."""
+    """Move every moth once (Eq. 8-18); returns the next random state."""
     population, iterations = len(moths), len(counts)
     progress = np.float32(iteration + 1) / np.float32(iterations)
     r = np.float32(1) + progress if rules.as_printed else np.float32(-1) - progress  # Eq. 9
     first_half = 2 * (iteration + 1) <= iterations
+    stepping, pulling = rules.cauchy and first_half, rules.best_flame and not first_half
     a = np.float32(0.6) - np.float32(0.4) * progress  # Eq. 18
+    fewest = counts[iteration] - 1
     for m in range(population):
-        flame = flames[min(m, counts[iteration] - 1)]  # Eq. 8
-        for j in range(4):
+        flame = min(m, fewest)  # Eq. 8
+        random = advance(random)
+        bits, jumps = scrambled(random), np.uint64(0)
+        if stepping:
             random = advance(random)
-            t = (r - np.float32(1)) * uniform(random) + np.float32(1)  # Eq. 10
+            jumps = scrambled(random)
+        for j in range(4):
+            t = (r - np.float32(1)) * uniform(bits, j) + np.float32(1)  # Eq. 10
             turn = spiral[min(max(np.int64((t + np.float32(2)) * np.float32(1024)), 0), 4095)]
             distance = abs(flames[m, j] - moths[m, j])
-            goal = flame[j]
-            if rules.best_flame and not first_half:  # Eq. 17
+            goal = flames[flame, j]
+            if pulling:  # Eq. 17
                 goal = a * goal + (np.float32(1) - a) * flames[0, j]
                 if rules.half:
                     goal = goal * np.float32(0.5)
             position = distance * turn + goal
-            if rules.cauchy and first_half:  # Eq. 13
-                random = advance(random)
-                position += cauchy[np.int64(random >> np.uint64(52))] * steps[j]
+            if stepping:  # Eq. 13
+                position += cauchy[np.int64((jumps >> np.uint64(16 * j)) & np.uint64(4095))] * steps[j]
             moths[m, j] = min(max(position, lower[j]), upper[j])
+    return random

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._jit import kernel
 from ..matching import label_cost
-from .common import advance, insert, stream, uniform, widen
+from .common import advance, insert, scrambled, stream, uniform, widen
 
 
 @kernel
@@ -26,33 +26,46 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
         seed: Of the frame.
         shrink: Factor of the window per evaluation (PatchMatch: 0.5); 1 is a uniform random search of the whole box.
     """
-    worst = state.costs.shape[1] - 1
     label = np.empty(4, dtype=np.float32)
+    flames, costs = np.empty((1, 4), dtype=np.float32), np.empty(1, dtype=np.int64)
+    lower, upper = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
     for i in range(start, stop):
         random = stream(seed, i, phase)
-        lower, upper = state.lower[i], state.upper[i]
-        best, costs = state.flames[i, 0], state.costs[i]
-        used = state.used[i]
-        for c in range(candidates.shape[1]):
-            u, v, s, theta = candidates[i, c, 0], candidates[i, c, 1], candidates[i, c, 2], candidates[i, c, 3]
-            if used < end and np.isfinite(u + v + s + theta):
-                used += 1
-                insert(state, i, u, v, s, theta, label_cost(i, u, v, s, theta, reference, target, tables, costs[worst]))
-        widen(lower, upper, best)
+        for j in range(4):
+            lower[j], upper[j], flames[0, j] = state.lower[i, j], state.upper[i, j], state.flames[i, 0, j]
+        costs[0] = state.costs[i, 0]
+        used, given, widened = state.used[i], 0, False
         window = np.float32(0.5)
         while used < end:
-            for j in range(4):
+            if given < candidates.shape[1]:
+                total = np.float32(0)
+                for j in range(4):
+                    label[j] = candidates[i, given, j]
+                    total += label[j]
+                given += 1
+                if not np.isfinite(total):
+                    continue
+            else:
+                if not widened:
+                    widen(lower, upper, flames)
+                    widened = True
                 random = advance(random)
-                extent = upper[j] - lower[j]
-                if shrink == 1:
-                    label[j] = lower[j] + extent * uniform(random)
-                else:
-                    step = (np.float32(2) * uniform(random) - np.float32(1)) * window * extent
-                    label[j] = min(max(best[j] + step, lower[j]), upper[j])
+                bits = scrambled(random)
+                for j in range(4):
+                    extent = upper[j] - lower[j]
+                    if shrink == 1:
+                        label[j] = lower[j] + extent * uniform(bits, j)
+                    else:
+                        step = (np.float32(2) * uniform(bits, j) - np.float32(1)) * window * extent
+                        label[j] = min(max(flames[0, j] + step, lower[j]), upper[j])
+                window *= np.float32(shrink)
+                if window * (upper[0] - lower[0]) < np.float32(1):
+                    window = np.float32(0.5)
+            cost = label_cost(i, label[0], label[1], label[2], label[3], reference, target, tables, costs[0])
+            insert(flames, costs, label, cost)
             used += 1
-            cost = label_cost(i, label[0], label[1], label[2], label[3], reference, target, tables, costs[worst])
-            insert(state, i, label[0], label[1], label[2], label[3], cost)
-            window *= np.float32(shrink)
-            if window * (upper[0] - lower[0]) < np.float32(1):
-                window = np.float32(0.5)
-        state.used[i] = used
+        if not widened:
+            widen(lower, upper, flames)
+        state.used[i], state.costs[i, 0] = used, costs[0]
+        for j in range(4):
+            state.lower[i, j], state.upper[i, j], state.flames[i, 0, j] = lower[j], upper[j], flames[0, j]

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from .._jit import inlined, kernel
+from .common import advance, scrambled
+
+VOTERS = 256
+"""Points that vote on a hypothesis, about."""
 
 
 @kernel
-def transported_labels(start, stop, points, labels, neighbours, motions, lower, upper, out):  # type: ignore[no-untyped-def]
+def transported_labels(start, stop, points, labels, turns, neighbours, motions, lower, upper, out):  # type: ignore[no-untyped-def]
     """Labels of neighbours and of common motions, as seen from each point.
 
     A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
@@ -20,6 +24,7 @@ def transported_labels(start, stop, points, labels, neighbours, motions, lower, 
         stop: One past the last.
         points: float32 ``[N, 2]``.
         labels: float32 ``[N, 4]``, best labels of the previous phase.
+        turns: float32 ``[N, 2]`` of `label_turns`.
         neighbours: int64 ``[N, K]``, indices; negative means none.
         motions: float32 ``[M, 4]``, similarities ``(a, b, tx, ty)``: ``p' = [[a, -b], [b, a]] p + t``; NaN means none.
         lower: float32 ``[N, 4]``.
@@ -27,6 +32,11 @@ def transported_labels(start, stop, points, labels, neighbours, motions, lower, 
         out: float32 ``[N, K + M, 4]``, NaN where there is none.
     """
     count = neighbours.shape[1]
+    sizes, angles = np.empty(len(motions), dtype=np.float32), np.empty(len(motions), dtype=np.float32)
+    for m in range(len(motions)):
+        a, b = motions[m, 0], motions[m, 1]
+        sizes[m] = np.float32(0.5) * np.float32(np.log2(max(a * a + b * b, np.float32(1e-12))))
+        angles[m] = np.float32(np.arctan2(b, a))
     for i in range(start, stop):
         x, y = points[i, 0], points[i, 1]
         for k in range(count):
@@ -34,26 +44,34 @@ def transported_labels(start, stop, points, labels, neighbours, motions, lower, 
             if j < 0:
                 out[i, k, 0] = np.nan
                 continue
-            s, theta = labels[j, 2], labels[j, 3]
-            scale = np.float32(np.exp2(s))
-            c, n = np.float32(np.cos(theta)) * scale, np.float32(np.sin(theta)) * scale
+            c, n = turns[j, 0], turns[j, 1]
             dx, dy = x - points[j, 0], y - points[j, 1]
             u = points[j, 0] + labels[j, 0] + c * dx - n * dy - x
             v = points[j, 1] + labels[j, 1] + n * dx + c * dy - y
-            admit(out[i, k], u, v, s, theta, lower[i], upper[i])
+            admit(out, i, k, u, v, labels[j, 2], labels[j, 3], lower, upper)
         for m in range(len(motions)):
             a, b = motions[m, 0], motions[m, 1]
             u, v = a * x - b * y + motions[m, 2] - x, b * x + a * y + motions[m, 3] - y
-            s = np.float32(0.5) * np.float32(np.log2(max(a * a + b * b, np.float32(1e-12))))
-            admit(out[i, count + m], u, v, s, np.float32(np.arctan2(b, a)), lower[i], upper[i])
+            admit(out, i, count + m, u, v, sizes[m], angles[m], lower, upper)
 
 
 @inlined
-def admit(out, u, v, s, theta, lower, upper):  # type: ignore[no-untyped-def]
+def admit(out, i, k, u, v, s, theta, lower, upper):  # type: ignore[no-untyped-def]
     """Store a candidate."""
-    out[0], out[1] = u, v
-    out[2] = min(max(s, lower[2]), upper[2])
-    out[3] = min(max(theta, lower[3]), upper[3])
+    out[i, k, 0], out[i, k, 1] = u, v
+    out[i, k, 2] = min(max(s, lower[i, 2]), upper[i, 2])
+    out[i, k, 3] = min(max(theta, lower[i, 3]), upper[i, 3])
+
+
+@kernel
+def label_turns(labels):  # type: ignore[no-untyped-def]
+    """What labels ``[N, 4]`` do to directions: ``2**s (cos theta, sin theta)``, float32 ``[N, 2]``."""
+    turns = np.empty((len(labels), 2), dtype=np.float32)
+    for i in range(len(labels)):
+        scale = np.float32(np.exp2(labels[i, 2]))
+        turns[i, 0] = np.float32(np.cos(labels[i, 3])) * scale
+        turns[i, 1] = np.float32(np.sin(labels[i, 3])) * scale
+    return turns
 
 
 @kernel
@@ -73,48 +91,76 @@ def common_motions(points, labels, costs, hypotheses, tolerance, seed, out):  # 
     n = len(points)
     if n < 4:
         return
-    order = np.argsort(costs)
     half = max(n // 2, 4)
-    free = np.ones(n, dtype=np.bool_)
-    stride = max(1, half // 256)
+    good = better_half(costs, half)
+    # where the good points lie and where their labels take them, one coordinate after the other for vector code
+    x, y = np.empty(half, dtype=np.float32), np.empty(half, dtype=np.float32)
+    to_x, to_y = np.empty(half, dtype=np.float32), np.empty(half, dtype=np.float32)
+    count = 0
+    for i in good:
+        x[count], y[count] = points[i, 0], points[i, 1]
+        to_x[count], to_y[count] = points[i, 0] + labels[i, 0], points[i, 1] + labels[i, 1]
+        count += 1
+    voters = np.empty((4, half), dtype=np.float32)
     state = np.uint64(seed) ^ np.uint64(0x5DEECE66D)
-    limit = tolerance * tolerance
+    limit = np.float32(tolerance * tolerance)
     for m in range(2):
+        if count < 6:
+            return
+        voting, every = 0, -(-count // VOTERS)
+        for k in range(0, count, every):
+            voters[0, voting], voters[1, voting] = x[k], y[k]
+            voters[2, voting], voters[3, voting] = to_x[k], to_y[k]
+            voting += 1
+        from_x, from_y, goal_x, goal_y = voters[0, :voting], voters[1, :voting], voters[2, :voting], voters[3, :voting]
         best = 0
         for _ in range(hypotheses):
-            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            i = order[np.int64((state >> np.uint64(33)) % np.uint64(half))]
-            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            j = order[np.int64((state >> np.uint64(33)) % np.uint64(half))]
-            if i == j or not free[i] or not free[j]:
-                continue
-            dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+            state = advance(state)
+            bits = scrambled(state)
+            i = np.int64(((bits & np.uint64(0xFFFFFFFF)) * np.uint64(count)) >> np.uint64(32))
+            j = np.int64(((bits >> np.uint64(32)) * np.uint64(count)) >> np.uint64(32))
+            dx, dy = x[j] - x[i], y[j] - y[i]
             length = dx * dx + dy * dy
             if length < 400:
                 continue
-            ex, ey = dx + labels[j, 0] - labels[i, 0], dy + labels[j, 1] - labels[i, 1]
+            ex, ey = to_x[j] - to_x[i], to_y[j] - to_y[i]
             a, b = (ex * dx + ey * dy) / length, (ey * dx - ex * dy) / length
             grown = a * a + b * b
             if grown < 0.15 or grown > 6.5:
                 continue
-            tx = points[i, 0] + labels[i, 0] - a * points[i, 0] + b * points[i, 1]
-            ty = points[i, 1] + labels[i, 1] - b * points[i, 0] - a * points[i, 1]
-            votes = 0
-            for r in range(0, half, stride):
-                k = order[r]
-                if free[k]:
-                    x, y = points[k, 0], points[k, 1]
-                    rx, ry = a * x - b * y + tx - x - labels[k, 0], b * x + a * y + ty - y - labels[k, 1]
-                    if rx * rx + ry * ry < limit:
-                        votes += 1
+            tx, ty = to_x[i] - a * x[i] + b * y[i], to_y[i] - b * x[i] - a * y[i]
+            votes = np.int32(0)
+            for k in range(voting):
+                rx, ry = a * from_x[k] - b * from_y[k] + tx - goal_x[k], b * from_x[k] + a * from_y[k] + ty - goal_y[k]
+                votes = np.int32(votes + np.int32(rx * rx + ry * ry < limit))
             if votes > best and votes >= 6:
-                best = votes
+                best = int(votes)
                 out[m, 0], out[m, 1], out[m, 2], out[m, 3] = a, b, tx, ty
         if best == 0:
             return
         a, b, tx, ty = out[m, 0], out[m, 1], out[m, 2], out[m, 3]
-        for k in range(n):
-            x, y = points[k, 0], points[k, 1]
-            rx, ry = a * x - b * y + tx - x - labels[k, 0], b * x + a * y + ty - y - labels[k, 1]
-            if rx * rx + ry * ry < 4 * limit:
-                free[k] = False
+        left = 0
+        for k in range(count):  # the second motion is sought among those that do not obey the first
+            rx, ry = a * x[k] - b * y[k] + tx - to_x[k], b * x[k] + a * y[k] + ty - to_y[k]
+            if rx * rx + ry * ry >= 4 * limit:
+                x[left], y[left], to_x[left], to_y[left] = x[k], y[k], to_x[k], to_y[k]
+                left += 1
+        count = left
+
+
+@inlined
+def better_half(costs, half):  # type: ignore[no-untyped-def]
+    """Indices of the `half` lowest costs, ascending; of equal ones the first."""
+    threshold = np.partition(costs, half - 1)[half - 1]
+    below = 0
+    for cost in costs:
+        below += cost < threshold
+    ties, count = half - below, 0
+    chosen = np.empty(half, dtype=np.int64)
+    for i in range(len(costs)):
+        tie = costs[i] == threshold and ties > 0
+        if costs[i] < threshold or tie:
+            chosen[count] = i
+            count += 1
+            ties -= tie
+    return chosen
