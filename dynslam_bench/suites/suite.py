@@ -67,6 +67,7 @@ class Suite(Record):
         frames: Part of every sequence, ``[start, stop]``; without it all.
         stride: Take every so many frames.
         threads: Threads of a run.
+        cache: Whether features and masks that trackers share are computed once (see `RunSpec.cache`).
         settings: Overrides for every tracker that has the setting.
         tracker_settings: Overrides by tracker.
         rows: Further rows: trackers of the suite once more, with other settings.
@@ -86,6 +87,7 @@ class Suite(Record):
     frames: tuple[int, int | None] | None = None
     stride: int = Field(default=1, ge=1)
     threads: int = Field(default=1, ge=1)
+    cache: bool = False
     settings: dict[str, Any] = Field(default_factory=dict)
     tracker_settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     rows: tuple[Row, ...] = ()
@@ -135,7 +137,7 @@ class Suite(Record):
                     **self.tracker_settings.get(tracker, {}),
                     **own,
                 },
-                device=device, threads=threads or self.threads, limits=self.limits,
+                device=device, threads=threads or self.threads, cache=self.cache, limits=self.limits,
                 data_root=None if data_root is None else str(data_root), degrade=variant.degrade,
                 drop_share=variant.drop_share, realtime=variant.realtime,
             )
