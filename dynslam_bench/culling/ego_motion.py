@@ -11,8 +11,12 @@ from dynslam_bench.geometry.camera import Camera
 from .filter import FilterState, FrameBundle
 
 MIN_POINTS = 12
-KERNEL_PX = (12.0, 6.0, 4.0, 2.0, 2.0, 2.0)
-"""Scale of the redescending kernel in each Gauss-Newton step: wide to catch a poor prediction, then narrow."""
+TURN_PX = (12.0, 6.0, 4.0)
+"""Scale of the redescending kernel in the first Gauss-Newton steps, in which the camera may only turn."""
+KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
+"""The same in the steps after them; narrow as the flow is exact: fitting walkers at the walls' cost must not pay."""
+BENT_SHARE = 0.05
+"""Added to the scale, as a share of a point's flow: a rolling shutter bends fast motion."""
 CELL = 32
 CORRELATION = 100.0
 """By how much the flow counts for less than its points' number says, against the motion model: the points of one thing
@@ -56,9 +60,10 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
 
     Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the previous image, begun
     at the motion model's prediction and held to it as far as the model is sure (maximum a posteriori), with a
-    redescending (Geman-McClure) kernel. Without the hold a person nearby drags the estimate along even where most
-    points are static: a far background of one depth tells turning from moving sideways hardly apart, so that the
-    camera's translation is left to what is near, and that may walk.
+    redescending (Geman-McClure) kernel. Otherwise a person nearby drags the estimate along even where most points are
+    static: a far background of one depth tells turning from moving sideways hardly apart, so that the camera's
+    translation is left to what is near, and that may walk. For the same reason the camera may only turn at first:
+    while the kernel is wide, walls that fit to three pixels and walkers that fit look better than walls alone.
 
     Args:
         frame: The current frame.
@@ -116,12 +121,13 @@ def _align(
     pose = start
     inverse_start = se3.inverse(start)
     weight = trusted
-    for scale in KERNEL_PX:
+    bent = np.square(BENT_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
+    for number, scale in enumerate(TURN_PX + KERNEL_PX):
         moved = se3.transform(pose, points)
         z = np.maximum(moved[:, 2], 0.05)
         error = camera.project(moved) - pixels
         error = np.where(moved[:, 2:3] > 0.05, np.nan_to_num(error, posinf=1e4, neginf=-1e4), 1e4)
-        weight = trusted / np.square(1 + (error**2).sum(axis=1) / scale**2)
+        weight = trusted / np.square(1 + (error**2).sum(axis=1) / (scale**2 + bent))
         x, y = moved[:, 0] / z, moved[:, 1] / z
         zero = np.zeros_like(x)
         # derivative of the pixel by a left perturbation exp(rho, phi) of the pose
@@ -132,6 +138,9 @@ def _align(
         if information is not None:
             hessian += information
             gradient += information @ se3.log(pose @ inverse_start)
+        if number < len(TURN_PX):
+            hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
+            hessian[:3, :3] = np.trace(hessian) * np.eye(3)
         try:
             step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), -gradient)
         except np.linalg.LinAlgError:
