@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -119,7 +120,7 @@ class StudySummary(Record):
     tune: list[str] = Field(default_factory=list)
 
 
-def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None) -> StudySummary:
+def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: int = 1) -> StudySummary:
     """Run the best configurations again, check them on the held-out split and write preset and summary.
 
     The candidate that is best on the tune split with fresh seeds is chosen; the held-out split only judges it.
@@ -127,6 +128,7 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None) -> StudyS
     Args:
         tuner: A study with finished trials.
         on_note: Told what is going on.
+        jobs: Runs at a time.
 
     Returns:
         The summary; `best.toml` and `summary.json` lie in the study's folder.
@@ -143,13 +145,13 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None) -> StudyS
     tune = tuner.evaluator.instances(spec.tune, seeds)
     held_out = tuner.evaluator.instances(spec.held_out, seeds)
     note("default settings with fresh seeds")
-    default = _run(tuner, spec.space.fixed, [*tune, *held_out])
+    default = _run(tuner, spec.space.fixed, [*tune, *held_out], jobs)
     candidates = []
     for trial in best:
         note(f"trial {trial.number} with fresh seeds")
         candidate = Candidate(trial=trial.number, params=trial.params, values=list(trial.values))
         try:
-            again = _run(tuner, tuner.settings_of(trial), [*tune, *held_out])
+            again = _run(tuner, tuner.settings_of(trial), [*tune, *held_out], jobs)
         except InstanceFailedError as error:
             candidates.append(candidate.model_copy(update={"failed": str(error), "feasible": False}))
             continue
@@ -245,14 +247,18 @@ def count_states(study: optuna.Study) -> dict[str, int]:
     return counts
 
 
-def _run(tuner: Tuner, settings: Mapping[str, Any], instances: Sequence[Instance]) -> dict[Instance, Outcome]:
+def _run(
+    tuner: Tuner, settings: Mapping[str, Any], instances: Sequence[Instance], jobs: int
+) -> dict[Instance, Outcome]:
     """Run a configuration without the stage cache, so that its times are its own."""
-    found = {}
-    for instance in instances:
+
+    def one(instance: Instance) -> Outcome:
         outcome = tuner.evaluator.run(settings, instance, cache=False)
         assert outcome is not None
-        found[instance] = outcome
-    return found
+        return outcome
+
+    with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-final") as pool:
+        return dict(zip(instances, pool.map(one, instances), strict=True))
 
 
 def _conclude(chosen: Candidate) -> str:

@@ -33,6 +33,8 @@ from .storage import open_storage, study_folder, worker_is_dead, worker_name
 from .study_file import StudySpec
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
+CODE = ("version", "source")
+"""What of a study's identity tells the code that ran it: must be the same to go on, not to read."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
 
@@ -62,15 +64,17 @@ class Tuner:
     Args:
         spec: The study.
         results: The results folder.
+        reading: Only look at a stored study: one of another version of the code opens too, but runs nothing more.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
-            study's name; nothing has run then.
+            study's name; nothing has run then. With `reading` also when nothing is stored.
     """
 
-    def __init__(self, spec: StudySpec, results: str | Path = "results") -> None:
+    def __init__(self, spec: StudySpec, results: str | Path = "results", *, reading: bool = False) -> None:
         self.spec = spec
         self.results = Path(results)
+        self.reading = reading
         self.tracker = TRACKERS.get(spec.tracker)
         defaults = apply_overrides(self.tracker.settings(), spec.space.fixed)
         self.space = search_space(self.tracker.settings, spec.space)
@@ -95,8 +99,11 @@ class Tuner:
             on_event: Told of everything that happens.
 
         Raises:
-            StudyError: The default settings themselves fail on a sequence; says where and why.
+            StudyError: The default settings themselves fail on a sequence; says where and why. Or the study was opened
+                for reading.
         """
+        if self.reading:
+            raise StudyError(f"study '{self.spec.name}' was opened for reading")
         self._bury_dead_workers()
         self.reference(on_event)
         if not self.study.get_trials(deepcopy=False):
@@ -259,6 +266,10 @@ class Tuner:
         directions: list[Literal["minimize", "maximize"]] = [
             "minimize" if objective == "accuracy" else "maximize" for objective in self.spec.objectives
         ]
+        if self.reading and not self.spec.storage and not self.folder.is_dir():
+            raise StudyError(
+                f"there is no study '{self.spec.name}' in {self.results}", "dynslam-bench tune run STUDY.toml"
+            )
         storage = open_storage(self.results, self.spec)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:
@@ -277,7 +288,7 @@ class Tuner:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
                 study.set_metric_names(list(self.spec.objectives))
-        elif stored != identity:
+        elif not _same(stored, identity, but=CODE if self.reading else ()):
             raise StudyError(
                 f"study '{self.spec.name}' is stored with other {_difference(stored, identity)}",
                 f"give the study another name, or delete {self.folder}",
@@ -317,6 +328,10 @@ def run_study(
     tuner = Tuner(spec, results)
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner
+
+
+def _same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:
+    return all(stored.get(key) == now.get(key) for key in (stored.keys() | now.keys()) - set(but))
 
 
 def _difference(stored: dict[str, Any], now: dict[str, Any]) -> str:

@@ -103,7 +103,7 @@ def tune_a_little(results: Path, *, frames: int, jobs: int, trials: int) -> tupl
     )
     render({*spec.tune, *spec.held_out})
     tuner = run_trials(spec, results, jobs)
-    summary = finish(tuner, note)
+    summary = finish(tuner, note, jobs=jobs)
     return summary.conclusion, write_page(tuner, summary)
 
 

@@ -66,7 +66,7 @@ def run(
     if trials is not None:
         spec = spec.model_copy(update={"trials": trials})
     tuner = run_trials(spec, results, jobs)
-    summary = finish(tuner, note)
+    summary = finish(tuner, note, jobs=jobs)
     show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
 
 
@@ -85,7 +85,7 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     from dynslam_bench.tuning import Tuner, read_study
     from dynslam_bench.tuning.final_runs import best_trials, count_states
 
-    tuner = Tuner(read_study(study), results)
+    tuner = Tuner(read_study(study), results, reading=True)
     facts: dict[str, Any] = {
         "study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials,
         **count_states(tuner.study),
@@ -122,7 +122,7 @@ def best(
     if chosen.is_file():
         text = chosen.read_text()
     else:
-        tuner = Tuner(spec, results)
+        tuner = Tuner(spec, results, reading=True)
         found = best_trials(tuner.study, 1)
         if not found:
             raise StudyError(f"study '{spec.name}' has no finished trial", f"dynslam-bench tune run {study}")
@@ -139,9 +139,11 @@ def best(
 def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Write a study's page; the best are run again if that was not done yet."""
     from dynslam_bench.tuning import StudySummary, Tuner, finish, read_study, write_page
+    from dynslam_bench.tuning.storage import study_folder
 
-    tuner = Tuner(read_study(study), results)
-    stored = tuner.folder / "summary.json"
+    spec = read_study(study)
+    stored = study_folder(results, spec) / "summary.json"
+    tuner = Tuner(spec, results, reading=stored.is_file())
     if stored.is_file():
         summary = StudySummary.read(stored)
     else:

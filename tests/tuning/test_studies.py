@@ -51,7 +51,7 @@ def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_p
     assert trials[0].value == pytest.approx(0.0, abs=1e-12), "the default's ratio to itself is one"
     best = tuner.study.best_trial
     assert best.value < -0.5 and abs(math.log(best.params["gain"])) < math.log(1.3)
-    summary = finish(tuner)
+    summary = finish(tuner, jobs=2)
     held = summary.candidates[0].held_out
     assert held.high < 1 and held.sequences == 2
     assert not summary.improves, "two held-out sequences prove nothing"
@@ -225,6 +225,25 @@ def test_resuming_something_else_is_refused_with_the_difference(sequences: list[
         run_study(make(sequences, trials=2, seeds=[0, 1]), results=tmp_path)
     more = run_study(make(sequences, trials=3), results=tmp_path)
     assert len(more.study.get_trials()) == 3, "more trials of the same study are welcome"
+
+
+def test_a_study_of_older_code_can_be_read_but_not_continued(
+    sequences: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = make(sequences, trials=2)
+    run_study(spec, results=tmp_path)
+    monkeypatch.setattr("dynslam_bench.tuning.study.source_fingerprint", lambda tracker: "newer")
+    with pytest.raises(StudyError, match="stored with other source"):
+        Tuner(spec, tmp_path)
+    reader = Tuner(spec, tmp_path, reading=True)
+    assert len(reader.study.get_trials()) == 2
+    with pytest.raises(StudyError, match="opened for reading"):
+        reader.run()
+    with pytest.raises(StudyError, match="seeds"):
+        Tuner(make(sequences, seeds=[5]), tmp_path, reading=True)
+    with pytest.raises(StudyError, match="there is no study 'toy'"):
+        Tuner(spec, tmp_path / "elsewhere", reading=True)
+    assert not (tmp_path / "elsewhere" / "studies").exists(), "looking creates nothing"
 
 
 def test_space_of_a_real_tracker_can_be_drawn() -> None:
