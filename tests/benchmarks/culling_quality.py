@@ -1,0 +1,162 @@
+"""Culling quality of `emfoa-oft` and its ablations: precision and recall per feature against exact masks.
+
+    python tests/benchmarks/culling_quality.py [--sequences "synthetic/walking_xyz?frames=300" ...] [--frames 60:160]
+        [--only emfoa-oft "no masks"] [--cache DIR]
+
+Every feature of every frame lies on one of three things, by the renderer's exact masks:
+
+- *moving*: an instance with a point that moved by more than the renderer's threshold since the previous frame;
+- *still person*: a person that did not move in that frame. Masks drop these by class, geometry should not, and the map
+  is better off without them; so they count neither for nor against and are shown apart;
+- *background*: everything else.
+
+Recall is the share of the moving features that were culled; precision the share of moving ones among the culled moving
+and background features; the last two columns are the share of the background and of the still people that was culled.
+Counts are pooled over all frames and sequences. What is culled is what the back end did not get, after the starvation
+guard. ATE is the online one in mm under tum-rgbd/v1, the mean over the sequences.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+
+from dynslam_bench.evaluation.evaluate import evaluate  # noqa: E402
+from dynslam_bench.evaluation.protocol import get_protocol  # noqa: E402
+from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
+from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
+from dynslam_bench.sequences.frame import FrameMasks  # noqa: E402
+from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
+
+SEQUENCES = [f"synthetic/walking_{motion}?frames=300" for motion in ("xyz", "static", "halfsphere", "rpy")]
+NO_DEPTH = {"motion.enabled": False, "free_space.enabled": False}
+ROWS: dict[str, tuple[str, dict[str, object]]] = {
+    "emfoa-oft": ("emfoa-oft", {}),
+    "emfoa-oft-no-flow": ("emfoa-oft-no-flow", {}),
+    "emfoa-oft-paper": ("emfoa-oft-paper", {}),
+    "emfoa-oft without depth tests": ("emfoa-oft", NO_DEPTH),
+    "emfoa-oft-lk": ("emfoa-oft-lk", {}),
+    "emfoa-oft-patchmatch": ("emfoa-oft-patchmatch", {}),
+    "emfoa-oft-literal": ("emfoa-oft-literal", {}),
+    "emfoa-oft-object": ("emfoa-oft-object", {}),
+    "emfoa-oft-object with depth tests": ("emfoa-oft-object", {"motion.enabled": True, "free_space.enabled": True}),
+    "emfoa-oft-no-masks": ("emfoa-oft-no-masks", {}),
+    "emfoa-oft-no-masks, Lucas-Kanade": ("emfoa-oft-no-masks", {"flow.method": "lucas-kanade"}),
+    "emfoa-oft-no-masks, PatchMatch": ("emfoa-oft-no-masks", {"flow.search": "patchmatch"}),
+    "emfoa-oft-no-masks, literal EMFOA": ("emfoa-oft-no-masks", {"flow.search": "emfoa-literal"}),
+    "emfoa-oft-no-masks without motion test": ("emfoa-oft-no-masks", {"motion.enabled": False}),
+    "emfoa-oft-no-masks without free space": ("emfoa-oft-no-masks", {"free_space.enabled": False}),
+    "emfoa-oft-paper-no-masks": ("emfoa-oft-paper-no-masks", {}),
+    "orb-slam2": ("orb-slam2", {}),
+}
+
+
+@dataclass
+class Counts:
+    """Features by what they lie on: how many there were and how many were culled."""
+
+    seen: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    culled: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def add(self, kind: np.ndarray, keep: np.ndarray) -> None:
+        """Count one frame's features of kinds 0 (background), 1 (still person) and 2 (moving)."""
+        self.seen += np.bincount(kind, minlength=3)
+        self.culled += np.bincount(kind[~keep], minlength=3)
+
+    @property
+    def recall(self) -> float:
+        """Share of the moving features that were culled."""
+        return float(self.culled[2] / max(self.seen[2], 1))
+
+    @property
+    def precision(self) -> float:
+        """Share of the moving ones among culled moving and background features; NaN where none was culled."""
+        total = self.culled[2] + self.culled[0]
+        return float(self.culled[2] / total) if total else float("nan")
+
+    def loss(self, kind: int) -> float:
+        """Share of the features of a kind that was culled."""
+        return float(self.culled[kind] / max(self.seen[kind], 1))
+
+
+def kinds(masks: FrameMasks, xy: np.ndarray) -> np.ndarray:
+    """What each feature (raw pixels ``[N, 2]``) lies on: 0 background, 1 a person standing still, 2 a moving thing."""
+    height, width = masks.instances.shape
+    column, row = np.rint(xy).astype(int).T
+    instance = masks.instances[row.clip(0, height - 1), column.clip(0, width - 1)]
+    people = [number for number, name in masks.class_names.items() if name == "person"]
+    return np.where(np.isin(instance, list(masks.moving)), 2, np.where(np.isin(instance, people), 1, 0))
+
+
+def measure(
+    tracker_id: str, settings: dict[str, object], name: str, part: tuple[int, int | None], cache: Path, counts: Counts
+) -> tuple[float, float]:
+    """Run one tracker on one sequence; adds to `counts`, returns ATE in metres and coverage."""
+    sequence = open_sequence(name, frames=part)
+    assert sequence.masks is not None and sequence.ground_truth is not None, f"{name} has no exact masks"
+    context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
+    tracker = build_tracker(tracker_id, settings, context)
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    stamps, poses = [], []
+    for i in range(len(sequence)):
+        frame = sequence[i]
+        result = tracker.track(frame)
+        if result.state == "ok":
+            stamps.append(frame.timestamp)
+            poses.append(result.T_world_cam)
+        assert result.keypoints_xy is not None and result.keypoints_keep is not None
+        counts.add(kinds(sequence.masks[i], result.keypoints_xy), result.keypoints_keep)
+    if len(stamps) < 3:
+        return float("nan"), len(stamps) / len(sequence)
+    online = Trajectory(np.array(stamps), np.array(poses))
+    metrics = evaluate(
+        online, sequence.ground_truth, get_protocol("tum-rgbd/v1"), input_timestamps=sequence.timestamps
+    ).metrics
+    return float(metrics["ate_rmse_m"]), len(stamps) / len(sequence)
+
+
+def main() -> None:
+    """Print one table row a system."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sequences", nargs="+", default=SEQUENCES)
+    parser.add_argument("--frames", default="0:", help="part of each sequence, A:B")
+    parser.add_argument("--only", nargs="+", default=list(ROWS), choices=list(ROWS), metavar="ROW")
+    parser.add_argument("--cache", type=Path, help="folder of the stage cache; default: a temporary one")
+    chosen = parser.parse_args()
+    first, last = chosen.frames.split(":")
+    part = (int(first or 0), int(last) if last else None)
+    cv2.setNumThreads(1)
+    with tempfile.TemporaryDirectory() as scratch:
+        print("| system | precision | recall | background culled | still people culled | ATE, mm | coverage |")
+        print("| --- | --- | --- | --- | --- | --- | --- |")
+        for label in chosen.only:
+            tracker_id, settings = ROWS[label]
+            counts = Counts()
+            runs = [
+                measure(tracker_id, settings, name, part, chosen.cache or Path(scratch), counts)
+                for name in chosen.sequences
+            ]
+            each = " ".join(f"{1e3 * ate:.1f}" for ate, _ in runs)
+            print(
+                f"| {label} | {100 * counts.precision:.1f} % | {100 * counts.recall:.1f} % "
+                f"| {100 * counts.loss(0):.1f} % | {100 * counts.loss(1):.1f} % "
+                f"| {1e3 * np.mean([ate for ate, _ in runs]):.1f} ({each}) | {100 * min(c for _, c in runs):.0f} % |",
+                flush=True,
+            )
+    print("\nATE in brackets: " + ", ".join(chosen.sequences))
+
+
+if __name__ == "__main__":
+    main()
