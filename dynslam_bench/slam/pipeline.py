@@ -39,7 +39,13 @@ KEYFRAMES_SHOWN = 20
 
 
 class MaskStage(Protocol):
-    """Gives each frame its instances: by a network, from a file, or carried over from an earlier frame."""
+    """Gives each frame its instances: by a network, from a file, or carried over from an earlier frame.
+
+    Attributes:
+        segmented: Whether the latest frame's instances are fresh, not carried over.
+    """
+
+    segmented: bool
 
     def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
         """The objects in the frame; `keyframe` says that the previous frame asked for a fresh segmentation."""
@@ -160,6 +166,8 @@ class SlamPipeline:
         if self._flow is not None:
             found = self._no_flow_stats if state.flow is None else state.flow.stats
             stats |= {f"flow_{key}": value for key, value in found.items()}
+        if self._masks is not None:
+            stats["segmented"] = float(self._masks.segmented)
         if self._cached:
             stats["cached_stages"] = float(sum(stage.hit for stage in self._cached.values()))
         self._remember(bundle, keep, image, result)
