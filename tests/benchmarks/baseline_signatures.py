@@ -9,7 +9,10 @@ rendered twin beside the class that published figures put it in, and which filte
 Measured class (medians over the seeds):
   fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not end;
   survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same twin;
-  between   neither; `either` where a twin moves so little that both hold: it cannot tell the two apart.
+  between   neither.
+Where a twin moves so little that both hold (half of never-move is below three times the yardstick's error: the rotating
+and the standing camera), the cell survives: what is as good as exact masks has not failed. The count with `fails` first
+is given as well.
 
 Published class, from the product's own table of reported numbers, by the same rule: a cell is
   fails     if all published ATEs of the system on the recorded sequence are >= 0.5 x never-move there;
@@ -37,7 +40,7 @@ from dynslam_bench.reports.rows import LoadedRun, load_runs, open_stores
 from dynslam_bench.runs.scoring import DEFAULT_PROTOCOL
 from dynslam_bench.trackers.registry import TRACKERS
 
-FAILS, SURVIVES, BETWEEN, EITHER = "fails", "survives", "between", "either"
+FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
 PUBLISHED_AS = {
     "orb-slam2": ("ORB-SLAM2",),
     "mask-rcnn": ("DynaSLAM N",),
@@ -84,12 +87,14 @@ class Cell:
         return float(np.median(self.coverages)) if self.coverages else 0.0
 
 
-def classify(ate: float, coverage: float, never_move: float, yardstick: float, broken: bool = False) -> str:
-    """The measured class of a cell."""
+def classify(
+    ate: float, coverage: float, never_move: float, yardstick: float, broken: bool = False, *, fails_first: bool = False
+) -> str:
+    """The measured class of a cell; where both hold it survives, unless `fails_first`."""
     fails = broken or not np.isfinite(ate) or coverage < 0.8 or ate >= 0.5 * never_move
     survives = np.isfinite(ate) and ate <= 3 * yardstick and coverage >= 0.8 and not broken
     if fails and survives:
-        return EITHER
+        return FAILS if fails_first else SURVIVES
     return FAILS if fails else SURVIVES if survives else BETWEEN
 
 
@@ -196,26 +201,29 @@ def report(folder: Path) -> str:
                      f"| {3 * yardstick[twin].ate:.4f} |")  # fmt: skip
     lines += ["", "| system | provenance | twin | ATE m | coverage | measured | published | verdict |",
               "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
-    matched, clear, misses = 0, 0, []
+    matched, by_letter, clear, misses = 0, 0, 0, []
     for tracker in trackers:
         for twin in twins:
             cell = cells.get((tracker, twin))
             expected = published_class(tracker, recorded(twin))
             if cell is None or expected is None:
                 continue
-            measured = classify(cell.ate, cell.coverage, standstill[twin], yardstick[twin].ate, cell.broken > 0)
+            numbers = (cell.ate, cell.coverage, standstill[twin], yardstick[twin].ate, cell.broken > 0)
+            measured = classify(*numbers)
             verdict = "not clear" if expected == BETWEEN else "match" if measured == expected else "**miss**"
             if provenance[tracker] in FAITHFUL and expected != BETWEEN:
                 clear += 1
                 matched += measured == expected
+                by_letter += classify(*numbers, fails_first=True) == expected
                 if measured != expected:
                     misses.append(f"{tracker} on {short(twin)}: {measured} ({cell.ate:.4f} m), published {expected}")
             elif verdict != "not clear":
                 verdict += " (not counted)"
             lines.append(f"| `{tracker}` | {provenance[tracker]} | {short(twin)} | {cell.ate:.4f} "
                          f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |")  # fmt: skip
-    share = f"{100 * matched / clear:.0f} %" if clear else "-"
-    lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %)."]
+    share, other = (f"{100 * n / clear:.0f} %" if clear else "-" for n in (matched, by_letter))
+    lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %).",
+              f"With `fails` first where both classes hold: {by_letter} of {clear} ({other})."]  # fmt: skip
     lines += ["", "Misses:", "", *(f"- {miss}" for miss in misses)] if misses else []
     return "\n".join([*lines, "", *filter_table(trackers, twins, cells, provenance)])
 
