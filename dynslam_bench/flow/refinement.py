@@ -250,6 +250,39 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
             labels[i, 3] = np.float32(np.arctan2(best_b, best_a))
 
 
+@kernel
+def coarse_to_fine(  # type: ignore[no-untyped-def]
+    start, stop, points, labels, half_template, half_target, template, target, border, coarse, fine, iterations,
+    tolerance, correlation,
+):  # fmt: skip
+    """`similarity_lucas_kanade` at half, then at full resolution.
+
+    Args:
+        start: First point.
+        stop: One past the last.
+        points: float32 ``[N, 2]``.
+        labels: float32 ``[N, 4]``, changed in place.
+        half_template: Half-resolution template image.
+        half_target: Half-resolution target image.
+        template: Template image.
+        target: Target image.
+        border: Pixels repeated around the images.
+        coarse: Radius, margin and warps at half resolution.
+        fine: Radius, margin and warps at full resolution.
+        iterations: Translations a warp, at most.
+        tolerance: Stop below this change, in the images' pixels.
+        correlation: float32 ``[N]``, filled with that of the full resolution.
+    """
+    similarity_lucas_kanade(
+        start, stop, points, labels, half_template, half_target, border, 2, coarse[0], coarse[1], coarse[2],
+        iterations, tolerance, correlation,
+    )  # fmt: skip
+    similarity_lucas_kanade(
+        start, stop, points, labels, template, target, border, 1, fine[0], fine[1], fine[2], iterations, tolerance,
+        correlation,
+    )  # fmt: skip
+
+
 @inlined
 def cholesky4(h):  # type: ignore[no-untyped-def]
     """Lower Cholesky factor of a 4 x 4 matrix, in place; False if it is not positive definite."""

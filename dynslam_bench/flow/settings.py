@@ -135,10 +135,10 @@ class FlowSettings(Settings):
         True, when=_DAISY, meaning="dense mode: try on every region the motion that consistent regions nearby suggest"
     )
     dense_budget: int = tunable(
-        192, low=48, high=768, limits=(8, 4096), scale="log", when=_DAISY,
+        384, low=48, high=768, limits=(8, 4096), scale="log", when=_DAISY,
         meaning="dense mode: cost evaluations a superpixel in the label search",
     )  # fmt: skip
-    dense_sweeps: int = tunable(8, low=1, high=12, limits=(1, 32), when=_DAISY, meaning="dense mode: `sweeps`")
+    dense_sweeps: int = tunable(12, low=1, high=16, limits=(1, 32), when=_DAISY, meaning="dense mode: `sweeps`")
     dense_range_px: float = tunable(
         160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px", when=_DAISY,
         meaning="dense mode: `range_px`",

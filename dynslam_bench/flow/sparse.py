@@ -19,7 +19,7 @@ from .estimator import FlowResult
 from .maps import OrientationMaps, orientation_maps
 from .matching import CostTables, Reference, describe, reference_appearance, side, tables_for
 from .neighbours import nearest_neighbours
-from .refinement import BORDER, similarity_lucas_kanade
+from .refinement import BORDER, coarse_to_fine, similarity_lucas_kanade
 from .searches.common import SearchState, new_state
 from .searches.propagation import common_motions, label_turns, transported_labels
 from .searches.schedule import PROPAGATING, Phase, Plan, make_plan, phase_runner
@@ -31,7 +31,8 @@ MOTION_HYPOTHESES = 192
 MOTION_TOLERANCE_PX = 5.0
 NEIGHBOUR_WINDOW = 40
 PARABOLA_STEP_PX = 2.0
-COARSE_RADIUS, COARSE_MARGIN, COARSE_WARPS = 7, 3, 2
+COARSE = (7, 3, 2)
+"""Radius, margin and warps of the refinement at half resolution."""
 FINE_MARGIN, FINE_WARPS, BACK_MARGIN = 2, 2, 3
 TOLERANCE_PX = 0.03
 MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
@@ -107,7 +108,9 @@ class SparseDaisyFlow:
         height, width = target.gray.shape
         valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
         if settings.forward_backward_px > 0 and settings.refinement == "lucas-kanade":
-            valid &= self._way_back(points, xy, labels, reference, target) <= settings.forward_backward_px
+            going = np.flatnonzero(valid)
+            back = self._way_back(points[going], xy[going], labels[going], reference, target)
+            valid[going] = back <= settings.forward_backward_px
         stats = flow_stats(n, int(valid.sum()), int(evaluations.sum()))
         return FlowResult(xy, valid, np.asarray(cost / tables.ceiling, dtype=np.float32), stats)
 
@@ -188,15 +191,12 @@ class SparseDaisyFlow:
     ) -> NDArray[np.float32]:  # fmt: skip
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
         correlation = np.empty(len(points), dtype=np.float32)
-        radius, iterations = self.settings.refinement_window_px // 2, self.settings.refinement_iterations
-        for first, second, step, size, margin, warps in (
-            (reference.framed_half, target.framed_half, 2, COARSE_RADIUS, COARSE_MARGIN, COARSE_WARPS),
-            (reference.framed, target.framed, 1, radius, FINE_MARGIN, FINE_WARPS),
-        ):
-            run_stripes(
-                similarity_lucas_kanade, len(points), self.threads, self.pool, points, labels, first, second, BORDER,
-                step, size, margin, warps, iterations, np.float32(TOLERANCE_PX), correlation,
-            )  # fmt: skip
+        fine = (self.settings.refinement_window_px // 2, FINE_MARGIN, FINE_WARPS)
+        run_stripes(
+            coarse_to_fine, len(points), self.threads, self.pool, points, labels, reference.framed_half,
+            target.framed_half, reference.framed, target.framed, BORDER, COARSE, fine,
+            self.settings.refinement_iterations, np.float32(TOLERANCE_PX), correlation,
+        )  # fmt: skip
         return correlation
 
     def second_opinion(
