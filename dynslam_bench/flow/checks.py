@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,3 +52,28 @@ def usable_points(points: NDArray[np.float32], shape: tuple[int, ...]) -> NDArra
     with np.errstate(invalid="ignore"):
         inside = (points >= 0).all(axis=1) & (points <= (width - 1, height - 1)).all(axis=1)
     return np.asarray(inside, dtype=np.bool_)
+
+
+class Request(NamedTuple):
+    """Points to be tracked.
+
+    Attributes:
+        points: float32 ``[N, 2]``, the points, 0 where they are not usable.
+        usable: bool ``[N]``, finite and inside the reference.
+    """
+
+    points: NDArray[np.float32]
+    usable: NDArray[np.bool_]
+
+
+def request(
+    reference: NDArray[np.uint8], target: NDArray[np.uint8], points: NDArray[np.float32]
+) -> Request | FlowResult:
+    """The points as a method may use them, or the result where there is nothing to track (no points, equal images)."""
+    points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
+    if not len(points):
+        return empty_result()
+    if same_image(reference, target):
+        return unseen_result(points)
+    usable = usable_points(points, reference.shape)
+    return Request(np.where(usable[:, None], points, 0).astype(np.float32), usable)

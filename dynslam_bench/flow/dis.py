@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
+from .checks import flow_stats, request, unseen_result, usable_points
 from .estimator import FlowResult
 from .settings import FlowSettings
 
@@ -46,28 +46,24 @@ class DisFlow:
         seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`. The guess is not used."""
-        points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
-        n = len(points)
-        if not n:
-            return empty_result()
-        if same_image(reference, target):
-            return unseen_result(points)
+        asked = request(reference, target, points)
+        if isinstance(asked, FlowResult):
+            return asked
+        clean, usable = asked
         if min(reference.shape) < SMALLEST_SIDE:
-            return unseen_result(points)
+            return unseen_result(clean)
         if reference.max() == reference.min() or target.max() == target.min():
-            return unseen_result(points)
-        usable = usable_points(points, reference.shape)
-        clean = np.where(usable[:, None], points, 0).astype(np.float32)
+            return unseen_result(clean)
         xy = clean + _read(self.dense(reference, target), clean)
         valid = usable & usable_points(xy, target.shape)
-        cost = np.zeros(n, dtype=np.float32)
+        cost = np.zeros(len(clean), dtype=np.float32)
         if self.settings.forward_backward_px > 0:
             seen = np.where(valid[:, None], xy, clean).astype(np.float32)
             back = seen + _read(self.dense(target, reference), seen)
             cost = np.hypot(*(back - clean).T).astype(np.float32)
             valid &= cost <= self.settings.forward_backward_px
         xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
-        return FlowResult(xy, valid, cost, flow_stats(n, int(valid.sum())))
+        return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum())))
 
 
 def _read(flow: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
+from .checks import flow_stats, request, usable_points
 from .estimator import FlowResult
 from .settings import FlowSettings
 
@@ -36,14 +36,10 @@ class LucasKanadeFlow:
         seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`."""
-        points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
-        n = len(points)
-        if not n:
-            return empty_result()
-        if same_image(reference, target):
-            return unseen_result(points)
-        usable = usable_points(points, reference.shape)
-        clean = np.where(usable[:, None], points, 0).astype(np.float32)
+        asked = request(reference, target, points)
+        if isinstance(asked, FlowResult):
+            return asked
+        clean, usable = asked
         initial = clean.copy()
         if guess is not None:
             predicted = np.asarray(guess, dtype=np.float32).reshape(-1, 2)
@@ -54,7 +50,7 @@ class LucasKanadeFlow:
             back, returned, _ = self._follow(target, reference, np.where(valid[:, None], xy, clean), clean)
             valid &= returned & (np.hypot(*(back - clean).T) <= self.settings.forward_backward_px)
         xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
-        stats = flow_stats(n, int(valid.sum()))
+        stats = flow_stats(len(clean), int(valid.sum()))
         return FlowResult(xy, valid, error, stats)
 
     def _follow(

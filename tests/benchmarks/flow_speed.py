@@ -1,6 +1,9 @@
 """Time of the sparse flow by stage, budget and thread count; of the dense flow; and time against iterations.
 
-    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40]
+    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40] [--bars | --searches]
+
+``--bars`` prints the sparse mode at its defaults only: wall and processor time on one thread, wall time on two.
+``--searches`` prints time and correct tracks over the budget for each search.
 
 1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the yardstick
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
@@ -15,7 +18,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from flow_data import corners, synthetic
+from flow_accuracy import SEARCHES
+from flow_data import Pair, corners, synthetic
 
 from dynslam_bench.flow.build import build_flow
 from dynslam_bench.flow.dense import DenseDaisyFlow
@@ -23,8 +27,8 @@ from dynslam_bench.flow.estimator import FlowEstimator
 from dynslam_bench.flow.settings import FlowSettings
 
 
-def timed(function: Callable[[], object], repeats: int) -> tuple[float, float, float]:
-    """Minimum and median wall time, and minimum processor time of the calling thread, in milliseconds."""
+def timed(function: Callable[[], object], repeats: int) -> tuple[float, float, float, float]:
+    """Minimum and median wall time, minimum and median processor time of the calling thread, in milliseconds."""
     wall, processor = [], []
     function()
     for _ in range(repeats):
@@ -32,7 +36,7 @@ def timed(function: Callable[[], object], repeats: int) -> tuple[float, float, f
         function()
         wall.append(time.perf_counter() - start)
         processor.append(time.thread_time() - used)
-    return 1e3 * min(wall), 1e3 * float(np.median(wall)), 1e3 * min(processor)
+    return 1e3 * min(wall), 1e3 * float(np.median(wall)), 1e3 * min(processor), 1e3 * float(np.median(processor))
 
 
 def one_frame(flow: FlowEstimator, first: np.ndarray, second: np.ndarray, points: np.ndarray) -> Callable[[], object]:
@@ -41,17 +45,61 @@ def one_frame(flow: FlowEstimator, first: np.ndarray, second: np.ndarray, points
     return lambda: flow.track(reference, flow.prepare(second), points)
 
 
+def a_thousand(reference: np.ndarray) -> np.ndarray:
+    """1,000 keypoints of an image, repeated where it has fewer."""
+    points = corners(reference, 4000)
+    return np.concatenate([points] * (1 + 1000 // len(points)))[:1000]
+
+
+def bars(pair: Pair, repeats: int) -> None:
+    """The sparse mode at its defaults: maps of one new image, search, refinement and the way back."""
+    points = a_thousand(pair.reference)
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points, default settings\n")
+    print("| threads | wall ms, median | wall ms, minimum | processor ms, median | minimum | aimed at |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for threads, aim in ((1, "30 (25)"), (2, "16")):
+        run = one_frame(build_flow(FlowSettings(), threads=threads), pair.reference, pair.target, points)
+        low, median, used, often = timed(run, repeats)
+        processor = f"{often:.1f} | {used:.1f}" if threads == 1 else "- | -"
+        print(f"| {threads} | {median:.1f} | {low:.1f} | {processor} | {aim} |", flush=True)
+
+
+def searches(pairs: list[Pair], repeats: int) -> None:
+    """Processor time of one frame and correct tracks, for each search over the budget, on the same pairs."""
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n")
+    print("| search | budget | processor ms, minimum | median | % < 1.5 px |\n| --- | --- | --- | --- | --- |")
+    for search in SEARCHES:
+        for budget in (48, 64, 96, 192, 384):
+            settings = FlowSettings(search=search, budget=budget)
+            flow = build_flow(settings)
+            points = a_thousand(pairs[0].reference)
+            _, _, used, often = timed(one_frame(flow, pairs[0].reference, pairs[0].target, points), repeats)
+            good = []
+            for pair in pairs:
+                result = flow.track(flow.prepare(pair.reference), flow.prepare(pair.target), pair.points)
+                good.append(np.hypot(*(result.xy - pair.truth).T) < 1.5)
+            star = " (default)" if settings == FlowSettings() else ""
+            share = 100 * np.concatenate(good).mean()
+            print(f"| {search} | {budget}{star} | {used:.1f} | {often:.1f} | {share:.1f} |", flush=True)
+
+
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=40)
-    repeats = parser.parse_args().repeats
-    pair = synthetic(("similarity",), 3)[-1]
-    first, second = pair.reference, pair.target
-    points = corners(first, 4000)
-    points = np.concatenate([points] * (1 + 1000 // len(points)))[:1000]
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points\n")
+    parser.add_argument("--bars", action="store_true")
+    parser.add_argument("--searches", action="store_true")
+    options = parser.parse_args()
+    repeats = options.repeats
     cv2.setNumThreads(1)
+    pairs = synthetic(("similarity", "homography", "foreground") if options.searches else ("similarity",), 3)
+    pair = pairs[-1]
+    if options.bars or options.searches:
+        bars(pair, repeats) if options.bars else searches(pairs, repeats)
+        return
+    first, second = pair.reference, pair.target
+    points = a_thousand(first)
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points\n")
     lucas_kanade = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
     yardstick = timed(one_frame(build_flow(lucas_kanade), first, second, points), repeats)
     print("| method, budget | threads | min ms | median ms | processor ms | ratio to LK | % < 1.5 px |")
@@ -59,7 +107,7 @@ def main() -> None:
     print(
         f"| Lucas-Kanade, 4 levels, one way | 1 | {yardstick[0]:.1f} | {yardstick[1]:.1f} | {yardstick[2]:.1f} | 1 | |"
     )
-    rows = [FlowSettings(budget=budget) for budget in (24, 48, 96, 144, 192, 384)]
+    rows = [FlowSettings(budget=budget) for budget in (24, 48, 64, 96, 192, 384)]
     rows += [FlowSettings(search="patchmatch"), FlowSettings(forward_backward_px=0.0), FlowSettings(refinement="none")]
     for settings in rows:
         for threads in (1, 2):

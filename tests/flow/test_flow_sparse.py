@@ -66,6 +66,41 @@ def test_finds_similarities_to_a_fraction_of_a_pixel(scale, degrees, tx, ty):
     assert (error[result.valid] < 1.5).mean() > 0.97 and result.valid.mean() > 0.85
 
 
+@pytest.mark.parametrize("window", [5, 9, 17, 31, 41])
+def test_refinement_windows_of_every_size_align_to_a_fraction_of_a_pixel(window):
+    image = picture(15)
+    target, matrix = moved(image, 1.03, 2, 2.6, -1.7)
+    points = grid(margin=50)
+    truth = points @ matrix[:, :2].T + matrix[:, 2]
+    flow = SparseDaisyFlow(FlowSettings(refinement_window_px=window))
+    labels = np.zeros((len(points), 4), np.float32)
+    labels[:, :2] = truth - points + np.random.default_rng(0).uniform(-1.5, 1.5, points.shape)
+    correlation = flow.refine(points, labels, flow.prepare(image), flow.prepare(target))
+    error = np.hypot(*(points + labels[:, :2] - truth).T)
+    assert np.median(error) < (0.25 if window == 5 else 0.1) and (correlation > 0.9).mean() > 0.9
+    assert correlation.max() <= 1 + 1e-5
+    if window >= 17:
+        assert np.median(abs(labels[:, 2] - np.log2(1.03))) < 0.02
+        assert np.median(abs(labels[:, 3] - np.deg2rad(2))) < 0.01
+
+
+def test_points_at_the_border_are_refined_without_reading_beyond_the_image():
+    image = picture(16, (120, 160))
+    target = np.ascontiguousarray(np.roll(image, 1, axis=1))
+    y, x = np.mgrid[0:120:7, 0:160:9]
+    edge = (x < 20) | (y < 20) | (x > 140) | (y > 100)
+    points = np.stack([x[edge], y[edge]], 1).astype(np.float32)
+    flow = SparseDaisyFlow(FlowSettings(refinement_window_px=41))
+    rng = np.random.default_rng(0)
+    labels = (rng.uniform(-1, 1, (len(points), 4)) * (200, 200, 1.2, 0.8)).astype(np.float32)
+    before = labels.copy()
+    correlation = flow.refine(points, labels, flow.prepare(image), flow.prepare(target))
+    assert np.isfinite(labels).all() and (np.abs(correlation) <= 1 + 1e-5).all()
+    outside = ((points + before[:, :2] < 0) | (points + before[:, :2] > (159, 119))).any(axis=1)
+    assert outside.sum() > 50 and (correlation[outside] == -1).all()
+    np.testing.assert_array_equal(labels[outside], before[outside])
+
+
 def test_beats_lucas_kanade_on_large_motion_of_a_photograph():
     path = DATA / "tum/rgbd_dataset_freiburg1_xyz/rgb"
     if not path.is_dir():
