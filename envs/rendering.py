@@ -57,12 +57,13 @@ class Canvas:
 
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
-        picture = self._picture(frame, result)
+        picture = self.picture(frame, result)
         plot = self._plan.draw(episode, self._truth)
         body = np.concatenate([picture, plot], axis=1)
         return np.concatenate([body, self._strip(result, episode, body.shape[1])], axis=0)
 
-    def _picture(self, frame: Frame, result: TrackResult) -> Image:
+    def picture(self, frame: Frame, result: TrackResult) -> Image:
+        """The image alone with its features and mask, uint8 ``[480, W, 3]``, red first."""
         image = np.array(frame.rgb, dtype=np.uint8)
         if result.dynamic_mask is not None and result.dynamic_mask.any():
             mask = np.asarray(result.dynamic_mask, dtype=bool)

@@ -62,6 +62,9 @@ def run(
     ] = None,
     cache: Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")] = False,
+    sheet: Annotated[
+        bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
+    ] = False,
     retry: Retry = None,
     time_limit: Annotated[Optional[float], typer.Option(help="Seconds that a run may take.")] = None,  # noqa: UP045
     memory_limit: Annotated[Optional[float], typer.Option(help="MB that a run may take.")] = None,  # noqa: UP045
@@ -86,7 +89,7 @@ def run(
     specs = [
         RunSpec(
             tracker=tracker, sequence=sequence, settings=overrides, frames=part, stride=stride, seed=number,
-            device=device, threads=threads, realtime=realtime, video=video, camera=camera, cache=cache,
+            device=device, threads=threads, realtime=realtime, video=video, sheet=sheet, camera=camera, cache=cache,
             drop_share=drop, degrade=strengths,
             data_root=None if data_root is None else str(data_root),
             limits=Limits(time_s=time_limit, memory_mb=memory_limit),

@@ -21,6 +21,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.tum_file import write_tum
 
 from .child import FRAMES_FILE
+from .sheet import SheetWriter
 from .spec import RunSpec
 
 Send = Callable[[dict[str, Any]], None]
@@ -55,6 +56,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
     send({"type": "started", "frames": len(base.sequence)})
     video = _Video(folder / "video.mp4", base) if spec.video else None
+    sheet = SheetWriter(folder / "sheet.png", base) if spec.sheet else None
     with (folder / FRAMES_FILE).open("w") as log:
         writer = _FrameWriter(base, log)
         env.reset(seed=spec.seed)
@@ -64,6 +66,8 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             writer.write()
             if video is not None:
                 video.add()
+            if sheet is not None:
+                sheet.add()
             done = base.episode.next_index
             send({"type": "frame", "index": done - 1})
             if done - reported >= job["progress_every"] or over:
@@ -78,7 +82,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             over = terminated or truncated
     if video is not None:
         video.close()
-    outcome = _finish(base, folder)
+    outcome = _finish(base, folder, sheet)
     env.close()
     return {"type": "done", **outcome}
 
@@ -96,7 +100,7 @@ def _partial(env: SlamEnv) -> dict[str, Any]:
     return partial if last is None else partial | {"pose_error_trans_m": last.trans_m}
 
 
-def _finish(env: SlamEnv, folder: Path) -> dict[str, Any]:
+def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, Any]:
     began = time.perf_counter()
     final = env.final_trajectory()
     outcome: dict[str, Any] = {"finalize_s": None, "keyframes": None, "map_points": None, "gpu_memory_mb": None}
@@ -109,6 +113,8 @@ def _finish(env: SlamEnv, folder: Path) -> dict[str, Any]:
 
         write_keyframes_csv(folder / "keyframes.csv", outputs)
         write_ply(folder / "map.ply", outputs)
+        if sheet is not None:
+            sheet.write(outputs, env.online_trajectory() if final is None else final)
         outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
     if env.device.startswith("cuda"):
         import torch

@@ -50,6 +50,7 @@ class RunSpec(Record):
         data_root: Folder of the recorded sequences; None for the default one.
         camera: Camera of a folder that does not say its own.
         video: Whether to write ``video.mp4``.
+        sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
         limits: What it may take.
     """
 
@@ -70,6 +71,7 @@ class RunSpec(Record):
     data_root: str | None = None
     camera: str | None = None
     video: bool = False
+    sheet: bool = False
     limits: Limits = Field(default_factory=Limits)
 
     @field_validator("frames", mode="before")

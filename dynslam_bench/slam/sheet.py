@@ -132,14 +132,20 @@ def _main_plane(points: Array, track: Array) -> Array:
 
 
 class _Canvas:
-    """Maps plane coordinates in metres to the pixels of a panel."""
+    """Maps plane coordinates in metres to the pixels of a panel.
 
-    def __init__(self, extent: Array) -> None:
+    Args:
+        whole: Points ``[N, 2]`` that are all to be in view.
+        bulk: Points ``[M, 2]`` of which stray ones may be cut off.
+    """
+
+    def __init__(self, whole: Array, bulk: Array | None = None) -> None:
         self.image = np.full((PANEL[1], PANEL[0], 3), 255, np.uint8)
-        if len(extent):
-            low, high = np.quantile(extent, 0.01, axis=0), np.quantile(extent, 0.99, axis=0)
-        else:
-            low, high = np.zeros(2), np.ones(2)
+        ends = [whole] if len(whole) else []
+        if bulk is not None and len(bulk):
+            ends.append(np.quantile(bulk, [0.01, 0.99], axis=0))
+        corners = np.concatenate(ends) if ends else np.array([[0.0, 0.0], [1.0, 1.0]])
+        low, high = corners.min(axis=0), corners.max(axis=0)
         self._centre = (low + high) / 2
         size = np.maximum(high - low, 1e-3)
         self._scale = 0.88 * float(min(PANEL[0] / size[0], PANEL[1] / size[1]))
@@ -166,10 +172,12 @@ def _draw_map(outputs: MapOutputs, plane: Array) -> Image:
     poses = [record.T_world_cam for record in outputs.keyframes]
     centres = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
     flat = outputs.positions @ plane
-    canvas = _Canvas(np.concatenate([flat, centres @ plane]))
+    canvas = _Canvas(centres @ plane, flat)
     pixels = canvas.pixels(flat)
-    inside = ((pixels >= 0) & (pixels < PANEL)).all(axis=1)
-    canvas.image[pixels[inside, 1], pixels[inside, 0]] = np.minimum(outputs.colours[inside], 200)
+    inside = ((pixels >= 0) & (pixels < np.array(PANEL) - 1)).all(axis=1)
+    columns, rows = pixels[inside].T
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        canvas.image[rows + dy, columns + dx] = np.minimum(outputs.colours[inside], 200)
     span = float(np.ptp(centres, axis=0).max()) if len(centres) else 0.0
     size = max(0.05 * span, 0.04)
     outline = size * np.array([[0, 0, 0], [-0.8, -0.6, 1], [0.8, -0.6, 1], [0.8, 0.6, 1], [-0.8, 0.6, 1], [0, 0, 0]])

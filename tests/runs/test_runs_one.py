@@ -7,6 +7,7 @@ import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from envs_toys import TARGET, truth, write_folder
@@ -236,6 +237,17 @@ def test_a_fresh_interpreter_does_the_same(store: RunStore, toy_folder: str, mon
 def test_video(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 5), video=True), store)
     assert (store.folder(record.run_id) / "video.mp4").stat().st_size > 1000
+
+
+def test_sheet(store: RunStore, tmp_path: Path) -> None:
+    spec = RunSpec(tracker="orb-slam2", sequence="synthetic/sitting_xyz?frames=12", sheet=True, data_root=str(tmp_path))
+    folder = store.folder(run_one(spec, store).run_id)
+    picture = cv2.imread(str(folder / "sheet.png"))
+    assert picture.shape == (856, 1488, 3)
+    panels = [picture[80:420, x : x + 460] for x in (20, 510, 1005)] + [
+        picture[480:820, x : x + 460] for x in (270, 760)
+    ]
+    assert all(panel.std() > 4 for panel in panels), "each panel shows something"
 
 
 def test_scores_under_another_protocol_need_no_run(store: RunStore, toy_folder: str) -> None:

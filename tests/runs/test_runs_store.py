@@ -26,7 +26,7 @@ def test_run_id_depends_on_what_matters_and_on_nothing_else(toy_folder: str, tmp
     assert len(first) == 16 and resolve(RunSpec(**base)).run_id == first
     same = [
         {"settings": {"noise.clip": "2.0"}}, {"settings": {"noise.clip": 2}}, {"limits": {"time_s": 5}},
-        {"video": True}, {"degrade": {"blur": 0.0}}, {"data_root": str(tmp_path)},
+        {"video": True}, {"sheet": True}, {"degrade": {"blur": 0.0}}, {"data_root": str(tmp_path)},
     ]  # fmt: skip
     assert {resolve(RunSpec(**(base | change))).run_id for change in same} == {first}
     other = [
