@@ -105,7 +105,8 @@ def table(rows: list[dict]) -> str:
     lines = ["| sequence | control | runs | final ATE, m: min / median / max | online: median | coverage | still |",
              "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     groups: dict[tuple[str, str], list[dict]] = {}
-    for row in rows:
+    rank = [(id, control) for id in SYNTHETIC_IDS for control in CONTROLS]
+    for row in sorted(rows, key=lambda row: rank.index((row["id"], row["control"]))):
         groups.setdefault((row["id"], row["control"]), []).append(row)
     for (id, control), members in groups.items():
         final = [m["final"] for m in members]
