@@ -105,7 +105,7 @@ class Tuner:
         if self.reading:
             raise StudyError(f"study '{self.spec.name}' was opened for reading")
         self._bury_dead_workers()
-        self.reference(on_event)
+        self.reference(on_event, jobs)
         if not self.study.get_trials(deepcopy=False):
             self.study.enqueue_trial(default_configuration(self.space, self.base), skip_if_exists=True)
         deadline = None if self.spec.timeout_s is None else time.monotonic() + self.spec.timeout_s
@@ -119,18 +119,22 @@ class Tuner:
                 future.result()
         return self.study
 
-    def reference(self, on_event: OnEvent | None = None) -> dict[Instance, Outcome]:
+    def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[Instance, Outcome]:
         """The default settings' outcomes on the tune split, to which every trial is compared."""
-        for number, instance in enumerate(self.tune_instances):
-            if instance in self._reference:
-                continue
+        missing = [instance for instance in self.tune_instances if instance not in self._reference]
+
+        def one(instance: Instance) -> Outcome:
+            number = self.tune_instances.index(instance)
             _tell(on_event, "reference", number, len(self.tune_instances), f"{instance.sequence} seed {instance.seed}")
             try:
                 outcome = self.evaluator.run(self.spec.space.fixed, instance, cache=self.spec.cache)
             except InstanceFailedError as error:
                 raise StudyError(f"the default settings fail: {error}", "a study needs a default that runs") from error
             assert outcome is not None
-            self._reference[instance] = outcome
+            return outcome
+
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-reference") as pool:
+            self._reference.update(zip(missing, pool.map(one, missing), strict=True))
         return self._reference
 
     def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
