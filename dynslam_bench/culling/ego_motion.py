@@ -55,6 +55,25 @@ def trust(frame: FrameBundle, state: FilterState, before: NDArray[np.floating]) 
     return np.where(np.isfinite(before).all(axis=1), share[cell(before)], ones)
 
 
+def rigid_flow(
+    frame: FrameBundle, state: FilterState, rows: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where points would have been in the previous frame if the world stood still and only the camera moved.
+
+    Args:
+        frame: The current frame.
+        state: With the previous and the predicted pose.
+        rows: bool ``[N]``, the points asked for, K of them; all with depth.
+
+    Returns:
+        Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels ``[K, 2]``.
+    """
+    assert state.T_world_prev is not None and state.T_world_pred is not None
+    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
+    moved = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+    return moved, state.camera.project(moved)
+
+
 def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.float64] | None:
     """The pose predicted for this frame, refined by the flow to the previous image.
 

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from dynslam_bench.geometry.camera import Camera
 
 from .coherence import coherent
+from .ego_motion import rigid_flow
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from .semantic import inside
 from .settings import EpipolarSettings
 
 MIN_MATCHES = 16  # twice the eight-point algorithm's minimum
+RIGID_PX = 2.0
+"""Nearer than this to where the camera's motion puts it, a point moves with the static world."""
 Points = NDArray[np.float64]
 
 _METHODS = {"ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS, "magsac": cv2.USAC_MAGSAC}
@@ -82,12 +85,36 @@ def homography_share(first: Points, second: Points) -> float:
     return 0.0 if matrix is None else float(np.mean(mask))
 
 
+def contradiction(frame: FrameBundle, state: FilterState, failing: NDArray[np.bool_], before: Points) -> float:
+    """Share of the points which move as depth and the camera's motion say that the epipolar test rejects.
+
+    Where a person fills the image, the largest set of matches that agree on an F may be the person's. Depth tells: the
+    camera's motion is known from elsewhere (`ego_motion`), and points that follow it are static. An F that rejects many
+    of them is not the camera's.
+
+    Args:
+        frame: The current frame.
+        state: With flow, previous and predicted pose.
+        failing: bool ``[N]``, points that fail the epipolar test.
+        before: Undistorted pixels ``[N, 2]`` in the previous image.
+
+    Returns:
+        The share, 0 to 1; 0 where too few points have depth or no pose is known.
+    """
+    if state.flow is None or state.T_world_prev is None or state.T_world_pred is None:
+        return 0.0
+    rows = state.flow.valid & state.keep & (frame.z > 0)
+    rows[rows] = np.linalg.norm(rigid_flow(frame, state, rows)[1] - before[rows], axis=1) < RIGID_PX
+    return float(failing[rows].mean()) if np.count_nonzero(rows) >= MIN_MATCHES else 0.0
+
+
 class EpipolarFilter(DynamicFilter):
     """Drops points, or objects, whose flow leaves the epipolar line.
 
     F comes from the flow of the points that earlier filters kept; the test covers all points with a valid flow.
     Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``, ``homography_share`` (0 where
-    the parallax had decided already), ``degenerate`` (1 where the guard skipped the test), ``moving_objects``.
+    the parallax had decided already), ``contradiction`` (see `contradiction`), ``degenerate`` (1 where the guard
+    skipped the test), ``moving_objects``.
     """
 
     name = "epipolar"
@@ -103,7 +130,8 @@ class EpipolarFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
         stats = dict.fromkeys(
-            ("matches", "inliers", "parallax_px", "homography_share", "degenerate", "moving_objects"), 0.0
+            ("matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate", "moving_objects"),
+            0.0,
         )
         keep = np.ones(len(frame), dtype=bool)
         flow = state.flow
@@ -128,6 +156,10 @@ class EpipolarFilter(DynamicFilter):
         distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
         failing[flow.valid] = distance > self.settings.threshold_px
         stats["inliers"] = float(np.count_nonzero(fit & ~failing))
+        if self.settings.max_contradiction < 1:
+            stats["contradiction"] = contradiction(frame, state, failing, before)
+            if stats["contradiction"] > self.settings.max_contradiction:
+                return FilterResult.of(keep, {**stats, "degenerate": 1.0})
         if self.settings.mode == "point":
             moving = coherent(failing, flow.valid, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
             return FilterResult.of(~moving, stats)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
 from .coherence import coherent
-from .ego_motion import CELL, depth_sigma
+from .ego_motion import CELL, depth_sigma, rigid_flow
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from .settings import MotionSettings
 
@@ -55,11 +54,8 @@ class MotionFilter(DynamicFilter):
 
     def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
         assert state.flow is not None and state.previous is not None
-        assert state.T_world_prev is not None and state.T_world_pred is not None
-        T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-        moved = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[tested], frame.z[tested]))
+        moved, expected = rigid_flow(frame, state, tested)
         before = state.camera.undistort_points(state.flow.xy[tested])
-        expected = state.camera.project(moved)
         distance = np.linalg.norm(expected - before, axis=1)
         explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
         limit_px = self.settings.threshold_px + self.settings.threshold_share * explained

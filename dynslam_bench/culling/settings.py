@@ -45,6 +45,11 @@ class EpipolarSettings(Settings):
         0.8, low=0.5, high=1.0, limits=(0.0, 1.0),
         meaning="share of the matches explained by one homography above which the test is skipped as degenerate",
     )  # fmt: skip
+    max_contradiction: float = tunable(
+        0.2, low=0.05, high=1.0, limits=(0.0, 1.0),
+        meaning="share of the points moving as their depth and the camera's motion say, of which F may reject so many "
+        "before it counts as that of something else that moves, and the test is skipped; 1 never asks",
+    )  # fmt: skip
     min_share: float = tunable(
         0.4, low=0.0, high=0.8, limits=(0.0, 1.0), online=True, when={"mode": ["point"]},
         meaning="share of the tested points around a failing one that must fail too; 0 drops every failing point",

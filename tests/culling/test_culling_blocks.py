@@ -68,6 +68,20 @@ def test_epipolar_says_that_it_is_degenerate(motion: np.ndarray) -> None:
     assert verdict.keep.all() and verdict.stats["degenerate"] == 1
 
 
+def test_epipolar_distrusts_an_f_that_depth_contradicts() -> None:
+    """People who fill most of the image own the largest set of matches that agree on an F; the walls then fail it."""
+    motion = se3.exp(np.array([0.05, 0, 0.01, 0, 0.01, 0]))
+    made = scene(motion, n_static=120, n_moving=600, motion=np.array([0, 0.05, 0]))
+    settings = EpipolarSettings(min_share=0.0, homography_share=1.0)
+    fooled = EpipolarFilter(settings.model_copy(update={"max_contradiction": 1.0})).apply(made.frame, made.state)
+    assert (~fooled.keep[~made.moving]).mean() > 0.5, "the scene does fool the plain test"
+    verdict = EpipolarFilter(settings).apply(made.frame, made.state)
+    assert verdict.keep.all() and verdict.stats["degenerate"] == 1.0 and verdict.stats["contradiction"] > 0.5
+    made = scene(motion, motion=np.array([0, 0.1, 0]))
+    verdict = EpipolarFilter(settings).apply(made.frame, made.state)
+    assert (verdict.keep == ~made.moving).all() and verdict.stats["contradiction"] < 0.05
+
+
 def test_epipolar_object_mode_drops_whole_objects_and_nothing_else() -> None:
     made = scene(SIDEWAYS, motion=ACROSS)
     made.frame.instances = box_instance(200, 100, 331, 381)

@@ -102,7 +102,12 @@ def _variant(name: str, defaults: dict[str, Any]) -> type[EmfoaOftSettings]:
 
 
 NO_DEPTH_TEST = {"motion.enabled": False, "free_space.enabled": False}
-AS_PRINTED = {**NO_DEPTH_TEST, "epipolar.min_share": 0.0, "epipolar.parallax_share": 0.0}
+AS_PRINTED = {
+    **NO_DEPTH_TEST,
+    "epipolar.min_share": 0.0,
+    "epipolar.parallax_share": 0.0,
+    "epipolar.max_contradiction": 1.0,
+}
 
 SPECS = [
     _spec("emfoa-oft", "the paper's system: masks, EMFOA-optimised DAISY Filter Flow, epipolar culling", {}),

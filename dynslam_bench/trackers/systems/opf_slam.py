@@ -18,7 +18,7 @@ class OpfSlamSettings(SystemSettings):
     """Lucas-Kanade and the epipolar test."""
 
     epipolar: EpipolarSettings = EpipolarSettings(
-        min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0
+        min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
     )
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
