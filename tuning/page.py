@@ -98,7 +98,7 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
         if summary.importances:
             figures["importances"] = plots.plot_param_importances(study, target=target, target_name=name)
         if shared:
-            ranked = sorted(shared, key=lambda key: -summary.importances.get(key, 0.0))[:8]
+            ranked = sorted(shared, key=lambda key: -summary.importances.get(key, 0.0))[:5]
             figures["slices"] = plots.plot_slice(study, params=ranked, target=target, target_name=name)
         if several:
             figures["front"] = plots.plot_pareto_front(study, target_names=[_NAMES[o] for o in spec.objectives])

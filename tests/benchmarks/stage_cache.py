@@ -1,12 +1,13 @@
 """The stage cache in one paired run: the same study of epipolar thresholds without it, then with it.
 
-    python tests/benchmarks/stage_cache.py [--segmenter embedded | onnx:FILE ...] [--sequence ID] [--frames 30]
-        [--trials 10]
+    python tests/benchmarks/stage_cache.py [--segmenter embedded | onnx:FILE | resnet50 ...] [--sequence ID]
+        [--frames 30] [--trials 10]
 
 Both studies draw the same settings (random sampler, one seed) and run every trial whole. Printed: wall time of the
 studies and of a trial (median over the trials after the first, which fills the cache), whether every trajectory has the
 same bytes, and the stages' times as the runs report them. The default sequence is the Bonn excerpt beside the checkout
-with its YOLO network where present, and a rendered one with the embedded network. The cache starts empty.
+with its YOLO network where present, and a rendered one with the embedded network. `resnet50` is the full-size Mask
+R-CNN with random weights: its time does not depend on them. The cache starts empty.
 """
 
 from __future__ import annotations
@@ -60,6 +61,19 @@ def beginning(source: Path, frames: int, folder: Path) -> str:
     return str(target)
 
 
+def full_size(folder: Path) -> str:
+    """Source of a Mask R-CNN of the published size with random weights."""
+    import torch
+
+    from dynslam_bench.segmentation.loading import save_network
+    from dynslam_bench.segmentation.network import MaskRCNN
+    from dynslam_bench.segmentation.network_config import NetworkConfig
+
+    torch.manual_seed(0)
+    save_network(MaskRCNN(NetworkConfig()), folder / "resnet50.pt")
+    return f"weights:{folder / 'resnet50.pt'}"
+
+
 def paired(sequence: str, segmenter: str, trials: int, frames: int) -> None:
     """Print the comparison for one sequence and network."""
     from dynslam_bench.sequences.catalogue import open_sequence
@@ -68,6 +82,8 @@ def paired(sequence: str, segmenter: str, trials: int, frames: int) -> None:
         os.environ["DYNSLAM_BENCH_CACHE"] = str(Path(folder) / "cache")
         if Path(sequence).is_dir():
             sequence = beginning(Path(sequence), frames, Path(folder) / "data")
+        if segmenter == "resnet50":
+            segmenter = full_size(Path(folder))
         opened = open_sequence(sequence)
         for index in range(len(opened)):  # rendered sequences are rendered now
             opened[index]
