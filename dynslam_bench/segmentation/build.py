@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -62,6 +63,7 @@ def build_segmenter(
     masks: MaskSource | None = None,
     device: str = "cpu",
     threads: int = 1,
+    deferred: bool = False,
 ) -> ConfiguredSegmenter | None:
     """The segmenter that the settings ask for; None for source ``none``.
 
@@ -71,6 +73,7 @@ def build_segmenter(
         masks: Exact masks of the sequence, for ``oracle``.
         device: ``cpu`` or ``cuda:N``, for networks that run in torch.
         threads: Threads a network may use.
+        deferred: Load a network whose file is there only once a frame needs it; with the stage cache none may.
 
     Raises:
         SegmentationError: The source is not available here, or its file does not fit.
@@ -85,15 +88,48 @@ def build_segmenter(
     context = SegmenterContext(
         sequence_id, masks, device, threads, argument, min(LOWEST_CONFIDENCE, settings.confidence)
     )
-    try:
-        built = load_object(spec.entry_point)(settings, context)
-    except DynslamError:
-        raise
-    except Exception as error:  # a foreign factory may raise anything; our own raise DynslamError
-        raise SegmentationError(f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
-    if not isinstance(built, Segmenter):
-        raise SegmentationError(f"'{spec.entry_point}' gave a {type(built).__name__} without segment()")
-    return ConfiguredSegmenter(built, settings, source)
+
+    def load() -> Segmenter:
+        try:
+            built = load_object(spec.entry_point)(settings, context)
+        except DynslamError:
+            raise
+        except Exception as error:  # a foreign factory may raise anything; our own raise DynslamError
+            raise SegmentationError(
+                f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}"
+            ) from error
+        if not isinstance(built, Segmenter):
+            raise SegmentationError(f"'{spec.entry_point}' gave a {type(built).__name__} without segment()")
+        return built
+
+    waits = deferred and prefix in ("embedded", "coco", "onnx", "weights") and weights_digest(settings, sequence_id)
+    return ConfiguredSegmenter(DeferredSegmenter(load) if waits else load(), settings, source)
+
+
+class DeferredSegmenter:
+    """A segmenter that is loaded when the first frame asks for it.
+
+    Args:
+        load: Loads it.
+    """
+
+    def __init__(self, load: Callable[[], Segmenter]) -> None:
+        self._load = load
+        self._segmenter: Segmenter | None = None
+
+    def loaded(self) -> Segmenter:
+        """The segmenter itself, loaded now if it was not before.
+
+        Raises:
+            SegmentationError: The network's file does not fit.
+        """
+        if self._segmenter is None:
+            self._segmenter = self._load()
+        return self._segmenter
+
+    def segment(self, frame: Frame) -> Instances:
+        """The objects in the frame."""
+        return self.loaded().segment(frame)
 
 
 class ConfiguredSegmenter:

@@ -104,11 +104,16 @@ def build_mask_stage(
     masks: MaskSource | None = None,
     device: str = "cpu",
     threads: int = 1,
+    deferred: bool = False,
 ) -> MaskScheduler | None:
     """The segmentation stage that the settings ask for; None for source ``none``.
+
+    `deferred` loads a network only once a frame needs it; the rest as for `build_segmenter`.
 
     Raises:
         SegmentationError: The source is not available here.
     """
-    segmenter = build_segmenter(settings, sequence_id=sequence_id, masks=masks, device=device, threads=threads)
+    segmenter = build_segmenter(
+        settings, sequence_id=sequence_id, masks=masks, device=device, threads=threads, deferred=deferred
+    )
     return None if segmenter is None else MaskScheduler(settings, segmenter)

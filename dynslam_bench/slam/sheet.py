@@ -152,7 +152,7 @@ class _Canvas:
 
     def pixels(self, xy: Array) -> NDArray[np.int32]:
         offset = (xy - self._centre) * self._scale
-        return np.rint(offset * (1, -1) + (PANEL[0] / 2, PANEL[1] / 2)).clip(-10000, 10000).astype(np.int32)
+        return np.asarray(np.rint(offset * (1, -1) + (PANEL[0] / 2, PANEL[1] / 2)).clip(-10000, 10000), np.int32)
 
     def line(self, xy: Array, colour: tuple[int, int, int], width: int = 1) -> None:
         if len(xy) > 1:

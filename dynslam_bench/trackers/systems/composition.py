@@ -74,7 +74,7 @@ def compose(
     if isinstance(settings, SemanticSystemSettings):
         masks = build_mask_stage(
             settings.segmentation, sequence_id=context.sequence_id, masks=context.masks, device=context.device,
-            threads=context.threads,
+            threads=context.threads, deferred=cache is not None,
         )  # fmt: skip
     if masks is None:
         needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
