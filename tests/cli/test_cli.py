@@ -350,7 +350,7 @@ def test_a_study(cli, tmp_path):
     Path("study.toml").write_text(STUDY)
     (parameter,) = json.loads(cli("tune", "space", "study.toml", "--json")[1])
     assert parameter["name"] == "features.n_features"
-    assert "has no finished trial" in one_line(cli("tune", "best", "study.toml")[2])
+    assert "there is no study 'tiny'" in one_line(cli("tune", "best", "study.toml")[2])
     code, out, err = cli("tune", "run", "study.toml", "--json")
     found = json.loads(out)
     assert code == 0 and err == "" and Path(found["page"]).is_file() and found["summary"]["trials"]["complete"] == 2
