@@ -24,13 +24,25 @@ from .outputs import KeyframeRecord, MapOutputs
 from .relocalisation import locate
 from .result import TrackResult
 from .settings import BackendSettings
-from .tracking import ENOUGH_FIRST, Matches, Tracked, local_points, match_last_frame, match_map, solve
+from .tracking import (
+    ENOUGH_FIRST,
+    Matches,
+    Tracked,
+    established,
+    local_points,
+    match_last_frame,
+    match_map,
+    share_in_view,
+    solve,
+)
 
 Array = NDArray[np.float64]
 State = Literal["initialising", "ok", "lost"]
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
+MIN_KEYFRAME = 15
+"""Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
 
 
 class RgbdBackend:
@@ -232,13 +244,17 @@ class RgbdBackend:
     def _first_pose(
         self, seen: Observations, last: Tracked, prediction: Array, stats: dict[str, float]
     ) -> tuple[Matches | None, Array]:
-        """A first pose: from the last frame; else from the reference keyframe; else from any keyframe."""
+        """A first pose: from the last frame; else from the reference keyframe; else from any keyframe.
+
+        The last frame's map points come first. Where they are few, what only its depth image gives helps as well.
+        """
         s = self.settings.tracking
-        for widen in (1.0, 2.5):
-            matches = match_last_frame(
-                self.world, last, seen, prediction, widen * s.radius_px, self.mapper.close_m, s.max_distance
-            )
-            if len(matches) < ENOUGH_FIRST:
+        close_m = self.mapper.close_m
+        for widen, depth_m, enough in (
+            (1.0, 0.0, s.mapped_matches), (1.0, close_m, ENOUGH_FIRST), (2.5, close_m, ENOUGH_FIRST)
+        ):  # fmt: skip
+            matches = match_last_frame(self.world, last, seen, prediction, widen * s.radius_px, depth_m, s.max_distance)
+            if len(matches) < enough:
                 continue
             estimate = solve(self.world, seen, matches, prediction, rounds=3)
             if estimate.count >= ENOUGH_FIRST // 2:
@@ -256,6 +272,12 @@ class RgbdBackend:
     # ------------------------------------------------------------------ keyframes
 
     def _wants_keyframe(self, tracked: Tracked) -> bool:
+        """Whether too little of the map is left in this frame, and the frame has something to add.
+
+        Points that many keyframes observe are what counts: on people who walk by, young points come and go, and a
+        keyframe for each of them would only carry the map along with the people. Where the view itself moves on, the
+        young points count as well.
+        """
         s = self.settings.keyframes
         gap = self._frame - self._last_keyframe_frame
         if gap <= s.min_gap:
@@ -264,11 +286,18 @@ class RgbdBackend:
         known = tracked.point >= 0
         tracked_close = int(np.count_nonzero(close & known))
         new_close = int(np.count_nonzero(close & ~known))
-        hungry = tracked_close < s.min_close and new_close > s.new_close
         inliers = int(np.count_nonzero(known))
         self._peak = max(self._peak, inliers)
-        weak = inliers < s.tracked_share * self._peak
-        return bool((weak or hungry or (gap >= s.max_gap and new_close > s.new_close)) and inliers > 15)
+        if inliers <= MIN_KEYFRAME:
+            return False
+        if tracked_close < s.min_close and new_close > s.new_close:
+            return True
+        if gap >= s.max_gap and new_close > s.new_close:
+            return True
+        if inliers < s.tracked_share * established(self.world, self._reference, s.established):
+            return True
+        view = share_in_view(self.world, int(self.world.keyframes[-1]), tracked.T_cam_world)
+        return view < s.view_share or (view < s.moved_share and inliers < s.tracked_share * self._peak)
 
     def _make_keyframe(self, frame: FrameBundle, tracked: Tracked, timings: dict[str, float]) -> None:
         slot, spent = self.mapper.insert(tracked.seen, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp)

@@ -20,6 +20,10 @@ class TrackingSettings(Settings):
         4.0, low=1.5, high=12.0, limits=(0.5, 100.0), unit="px", online=True,
         meaning="search window around the projection of a map point, at octave 0",
     )  # fmt: skip
+    mapped_matches: int = tunable(
+        100, low=20, high=400, limits=(1, 10000), online=True,
+        meaning="so many matches with map points of the last frame make points from its depth alone unnecessary",
+    )  # fmt: skip
     max_distance: int = tunable(
         90, low=40, high=120, limits=(1, 256), unit="bits", online=True,
         meaning="largest Hamming distance of a match by projection",
@@ -60,7 +64,19 @@ class KeyframeSettings(Settings):
     )  # fmt: skip
     tracked_share: float = tunable(
         0.75, low=0.4, high=0.95, limits=(0.0, 1.0), online=True,
-        meaning="a keyframe is made when fewer than this share of the reference keyframe's points are tracked",
+        meaning="a keyframe is made when fewer points are tracked than this share of the reference keyframe's "
+        "established ones, or of the most since the last keyframe if the view has moved",
+    )  # fmt: skip
+    established: int = tunable(
+        3, low=1, high=5, limits=(1, 100), meaning="keyframes that observe an established point, at least"
+    )
+    view_share: float = tunable(
+        0.9, low=0.5, high=0.98, limits=(0.0, 1.0), online=True,
+        meaning="a keyframe is made when less than this share of the last keyframe's points lies in the image",
+    )  # fmt: skip
+    moved_share: float = tunable(
+        0.97, low=0.8, high=1.0, limits=(0.0, 1.0), online=True,
+        meaning="the view has moved when less than this share of the last keyframe's points lies in the image",
     )  # fmt: skip
     min_close: int = tunable(
         100, low=30, high=300, limits=(0, 10000), meaning="a keyframe is made when fewer close points are tracked"

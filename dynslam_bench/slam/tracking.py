@@ -78,7 +78,7 @@ def match_last_frame(
 ) -> Matches:  # fmt: skip
     """Look for the last frame's points around their projections into the new frame.
 
-    Beside map points these are points that only the last frame's depth gives, as long as they are close.
+    Beside map points these are points that only the last frame's depth gives, nearer than `close_m`.
 
     Args:
         world: The map.
@@ -86,7 +86,7 @@ def match_last_frame(
         seen: The new frame's features.
         T_cam_world: Predicted pose of the new frame.
         radius_px: Half side of the window at octave 0; it grows with the feature's scale.
-        close_m: Depth below which the last frame's own depth is used.
+        close_m: Depth below which the last frame's own depth is used, metres; 0 to use map points alone.
         max_distance: Largest Hamming distance.
     """
     camera = world.camera
@@ -172,3 +172,22 @@ def local_points(world: Map, known: Matches, mode: str, limit: int = 80) -> Slot
     near = near[:limit]
     points = np.unique(world.kf_point[near])
     return points[points >= 0].astype(np.int64)
+
+
+def established(world: Map, keyframe: int, observations: int) -> int:
+    """How many of a keyframe's points at least so many keyframes observe (or all there are, in a young map)."""
+    points = world.kf_point[keyframe]
+    points = points[points >= 0]
+    return int(np.count_nonzero(world.n_obs[points] >= min(observations, world.keyframe_count)))
+
+
+def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
+    """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
+    points = world.kf_point[keyframe]
+    local = se3.transform(T_cam_world, world.position[points[points >= 0]])
+    if not len(local):
+        return 1.0
+    ahead = local[:, 2] > 0.05
+    uv = world.camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+    inside = ahead & (uv >= 0).all(axis=1) & (uv[:, 0] < world.camera.width) & (uv[:, 1] < world.camera.height)
+    return float(np.mean(inside))
