@@ -1,6 +1,9 @@
-"""Resident memory, keyframes and points of the back end on a loop through a simulated room.
+"""Resident memory, keyframes and points of `orb-slam2` on a rendered room, walked to and fro.
 
-    python tests/benchmarks/backend_memory.py [--frames 10000] [--loop 300]
+    python tests/benchmarks/backend_memory.py [--sequence synthetic/sitting_xyz] [--frames 10000] [--loop 300]
+
+The whole tracker runs: features, tracking, mapping, culling of keyframes and points. The sequence's first `loop` frames
+are held in memory and played forwards and backwards in turn, so that nothing but the tracker grows.
 
 Bar: less than 1 MB of growth a 1,000 frames after frame 2,000.
 """
@@ -8,10 +11,10 @@ Bar: less than 1 MB of growth a 1,000 frames after frame 2,000.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -19,10 +22,11 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
-from dynslam_bench.geometry import se3  # noqa: E402
-from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
+from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
+from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 
 
 def resident_mb() -> float:
@@ -34,42 +38,33 @@ def resident_mb() -> float:
 def main() -> int:
     """Print memory every 500 frames and the growth after frame 2,000."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sequence", default="synthetic/sitting_xyz")
     parser.add_argument("--frames", type=int, default=10000)
     parser.add_argument("--loop", type=int, default=300)
     options = parser.parse_args()
-    spec = importlib.util.spec_from_file_location("slam_conftest", ROOT / "tests/slam/conftest.py")
-    assert spec is not None and spec.loader is not None
-    simulated = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(simulated)
-    room = simulated.PointWorld(count=6000)
-    backend = RgbdBackend()
-    backend.reset(room.camera, 0)
-    angle = 2 * np.pi * np.arange(options.loop) / options.loop
-    zero = np.zeros_like(angle)
-    turn = se3.exp(np.stack([zero, zero, zero, 0.1 * np.sin(2 * angle), 0.9 * np.sin(angle), zero], axis=1))
-    shift = se3.exp(
-        np.stack([0.5 * np.sin(angle), 0.2 * np.sin(2 * angle), 0.3 * np.cos(angle), zero, zero, zero], axis=1)
-    )
-    loop = shift @ turn
+    cv2.setNumThreads(1)
+    sequence = open_sequence(options.sequence, frames=(0, options.loop))
+    loop = [sequence[i] for i in range(len(sequence))]
+    loop += loop[-2:0:-1]
+    tracker = build_tracker("orb-slam2", {}, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     marks: list[tuple[int, float]] = []
-    lost, spent = 0, 0.0
+    lost, begin = 0, time.process_time()
     for i in range(options.frames):
-        frame = room.see(loop[i % options.loop], i)
-        begin = time.process_time()
-        result = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32), None)
-        spent += time.process_time() - begin
+        result = tracker.track(replace(loop[i % len(loop)], index=i, timestamp=i / 30))
         lost += result.state != "ok"
-        if (i + 1) % 500 == 0:
+        if i % 500 == 499:
             marks.append((i + 1, resident_mb()))
-            print(
-                f"frame {i + 1}: {marks[-1][1]:.1f} MB, {result.stats['keyframes']:.0f} keyframes, "
-                f"{result.stats['map_points']:.0f} points, {lost} lost, {1e3 * spent / (i + 1):.1f} ms cpu a frame",
-                flush=True,
+            sys.stdout.write(
+                f"frame {i + 1:6d}  {marks[-1][1]:7.1f} MB  {result.stats['keyframes']:4.0f} keyframes  "
+                f"{result.stats['map_points']:6.0f} points  {lost} lost  "
+                f"{1e3 * (time.process_time() - begin) / (i + 1):.1f} ms a frame\n"
             )
-    late = [(frame, memory) for frame, memory in marks if frame >= 2000]
+            sys.stdout.flush()
+    late = np.array([mark for mark in marks if mark[0] >= 2000])
     if len(late) > 1:
-        growth = (late[-1][1] - late[0][1]) / (late[-1][0] - late[0][0]) * 1000
-        print(f"growth after frame 2,000: {growth:.2f} MB a 1,000 frames (bar: < 1)")
+        slope = np.polyfit(late[:, 0], late[:, 1], 1)[0]
+        sys.stdout.write(f"growth after frame 2,000: {1e3 * slope:.2f} MB a 1,000 frames (bar 1)\n")
     return 0
 
 

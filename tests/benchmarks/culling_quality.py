@@ -1,7 +1,7 @@
-"""Culling quality of `emfoa-oft` and its ablations: precision and recall per feature against exact masks.
+"""Culling quality of `emfoa-oft`, its ablations and other systems, per feature, against exact masks.
 
     python tests/benchmarks/culling_quality.py [--sequences "synthetic/walking_xyz?frames=300" ...] [--frames 60:160]
-        [--only emfoa-oft "no masks"] [--cache DIR]
+        [--only emfoa-oft yolo-slam] [--masks oracle] [--cache DIR] [--jobs N]
 
 Every feature of every frame lies on one of three things, by the renderer's exact masks:
 
@@ -11,9 +11,10 @@ Every feature of every frame lies on one of three things, by the renderer's exac
 - *background*: everything else.
 
 Recall is the share of the moving features that were culled; precision the share of moving ones among the culled moving
-and background features; the last two columns are the share of the background and of the still people that was culled.
-Counts are pooled over all frames and sequences. What is culled is what the back end did not get, after the starvation
-guard. ATE is the online one in mm under tum-rgbd/v1, the mean over the sequences.
+and background features; the next columns are the share of the background and of the still people that was culled, and
+the share of the frames in which nothing was. Counts are pooled over all frames and sequences. What is culled is what
+the back end did not get, after the starvation guard. ATE is the online one in mm under tum-rgbd/v1, the mean over the
+sequences.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ import argparse
 import os
 import sys
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -39,6 +42,7 @@ from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
 from dynslam_bench.sequences.frame import FrameMasks  # noqa: E402
 from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
+from dynslam_bench.trackers.registry import TRACKERS  # noqa: E402
 
 SEQUENCES = [f"synthetic/walking_{motion}?frames=300" for motion in ("xyz", "static", "halfsphere", "rpy")]
 NO_DEPTH = {"motion.enabled": False, "free_space.enabled": False}
@@ -69,11 +73,15 @@ class Counts:
 
     seen: np.ndarray = field(default_factory=lambda: np.zeros(3))
     culled: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    frames: int = 0
+    idle: int = 0
 
     def add(self, kind: np.ndarray, keep: np.ndarray) -> None:
         """Count one frame's features of kinds 0 (background), 1 (still person) and 2 (moving)."""
         self.seen += np.bincount(kind, minlength=3)
         self.culled += np.bincount(kind[~keep], minlength=3)
+        self.frames += 1
+        self.idle += bool(keep.all())
 
     @property
     def recall(self) -> float:
@@ -127,34 +135,41 @@ def measure(
     return float(metrics["ate_rmse_m"]), len(stamps) / len(sequence)
 
 
+def row(label: str, names: list[str], part: tuple[int, int | None], masks: str | None, cache: Path) -> str:
+    """One system's row of the table."""
+    cv2.setNumThreads(1)
+    tracker_id, settings = ROWS.get(label, (label, {}))
+    if masks is not None and hasattr(TRACKERS.get(tracker_id).settings(), "segmentation"):
+        settings = settings | {"segmentation.source": masks}
+    counts = Counts()
+    runs = [measure(tracker_id, settings, name, part, cache, counts) for name in names]
+    each = " ".join(f"{1e3 * ate:.1f}" for ate, _ in runs)
+    return (
+        f"| {label} | {100 * counts.precision:.1f} % | {100 * counts.recall:.1f} % "
+        f"| {100 * counts.loss(0):.1f} % | {100 * counts.loss(1):.1f} % | {100 * counts.idle / counts.frames:.0f} % "
+        f"| {1e3 * np.mean([ate for ate, _ in runs]):.1f} ({each}) | {100 * min(c for _, c in runs):.0f} % |"
+    )
+
+
 def main() -> None:
     """Print one table row a system."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequences", nargs="+", default=SEQUENCES)
     parser.add_argument("--frames", default="0:", help="part of each sequence, A:B")
-    parser.add_argument("--only", nargs="+", default=list(ROWS), choices=list(ROWS), metavar="ROW")
+    parser.add_argument("--only", nargs="+", default=list(ROWS), metavar="ROW", help="rows of the table, or trackers")
+    parser.add_argument("--masks", metavar="SOURCE", help="where all systems have their masks from, e.g. oracle")
     parser.add_argument("--cache", type=Path, help="folder of the stage cache; default: a temporary one")
+    parser.add_argument("--jobs", type=int, default=1)
     chosen = parser.parse_args()
     first, last = chosen.frames.split(":")
     part = (int(first or 0), int(last) if last else None)
-    cv2.setNumThreads(1)
-    with tempfile.TemporaryDirectory() as scratch:
-        print("| system | precision | recall | background culled | still people culled | ATE, mm | coverage |")
-        print("| --- | --- | --- | --- | --- | --- | --- |")
-        for label in chosen.only:
-            tracker_id, settings = ROWS[label]
-            counts = Counts()
-            runs = [
-                measure(tracker_id, settings, name, part, chosen.cache or Path(scratch), counts)
-                for name in chosen.sequences
-            ]
-            each = " ".join(f"{1e3 * ate:.1f}" for ate, _ in runs)
-            print(
-                f"| {label} | {100 * counts.precision:.1f} % | {100 * counts.recall:.1f} % "
-                f"| {100 * counts.loss(0):.1f} % | {100 * counts.loss(1):.1f} % "
-                f"| {1e3 * np.mean([ate for ate, _ in runs]):.1f} ({each}) | {100 * min(c for _, c in runs):.0f} % |",
-                flush=True,
-            )
+    with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
+        print("| system | precision | recall | background culled | still people culled | frames without culling "
+              "| ATE, mm | coverage |")  # fmt: skip
+        print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+        shared = (chosen.sequences, part, chosen.masks, chosen.cache or Path(scratch))
+        for line in pool.map(row, chosen.only, *([value] * len(chosen.only) for value in shared)):
+            print(line, flush=True)
     print("\nATE in brackets: " + ", ".join(chosen.sequences))
 
 
