@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from abc import ABC, abstractmethod
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 
@@ -18,7 +19,7 @@ START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 
 
-class Child:
+class Child(ABC):
     """A running child; `connection` speaks to it.
 
     Args:
@@ -34,9 +35,9 @@ class Child:
         """A file descriptor that becomes readable when the child ends, if there is one."""
         return None
 
+    @abstractmethod
     def poll(self) -> int | None:
         """Its exit code (minus the signal's number if one ended it), None while it runs."""
-        raise NotImplementedError
 
     def kill(self) -> None:
         """End it, with everything that it started."""

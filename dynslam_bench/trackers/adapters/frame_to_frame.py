@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from typing import Generic, Protocol, TypeVar
 
 import cv2
@@ -33,7 +34,7 @@ class Aligner(Protocol[Prepared]):
         ...
 
 
-class FrameToFrame(Generic[Prepared]):
+class FrameToFrame(ABC, Generic[Prepared]):
     """Chains the motions from frame to frame; subclasses say how two frames are aligned.
 
     A frame that cannot be aligned is lost. The next one is aligned to the last good frame again, at most five times in
@@ -44,9 +45,9 @@ class FrameToFrame(Generic[Prepared]):
         self._name = name
         self._aligner: Aligner[Prepared] | None = None
 
+    @abstractmethod
     def make_aligner(self, camera: Camera) -> Aligner[Prepared]:
         """The alignment for images of this (undistorted) camera."""
-        raise NotImplementedError
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; nothing here is random."""
