@@ -250,6 +250,21 @@ def test_sheet(store: RunStore, tmp_path: Path) -> None:
     assert all(panel.std() > 4 for panel in panels), "each panel shows something"
 
 
+def test_the_same_bits_on_one_thread_and_on_two(store: RunStore, tmp_path: Path) -> None:
+    """Features, flow, culling, tracking and mapping; the networks that make masks are not part of it."""
+    folders = []
+    for threads in (1, 2):
+        spec = RunSpec(
+            tracker="emfoa-oft", sequence="synthetic/walking_xyz?frames=12", data_root=str(tmp_path), seed=3,
+            settings={"segmentation.source": "oracle"}, threads=threads,
+        )  # fmt: skip
+        folders.append(store.folder(run_one(spec, store).run_id))
+    assert folders[0] != folders[1]
+    for name in ("trajectory_online.txt", "trajectory_final.txt", "keyframes.csv", "map.ply"):
+        one, two = ((folder / name).read_bytes() for folder in folders)
+        assert one == two and len(one) > 100, name
+
+
 def test_scores_under_another_protocol_need_no_run(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store)
     first = score(store, record)
