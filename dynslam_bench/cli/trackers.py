@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .options import AsJson, Assignments, SettingsFile, gather_settings
 from .output import VERIFICATION_FAILED, write, write_fields, write_json, write_table
+
+if TYPE_CHECKING:
+    from dynslam_bench.trackers import TrackerSpec
 
 app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
 
@@ -48,6 +51,7 @@ def info(
     from dynslam_bench.trackers import TRACKERS
 
     spec = TRACKERS.get(tracker)
+    numbers = _published(spec)
     facts: dict[str, Any] = {
         "id": spec.id, "label": spec.label, "summary": spec.summary, "provenance": spec.provenance,
         "ranked": spec.ranked, "sensors": spec.sensors, "deterministic": spec.deterministic, "version": spec.version,
@@ -56,15 +60,37 @@ def info(
         "remarks": spec.remarks,
     }  # fmt: skip
     if as_json:
-        write_json({**facts, "settings": flatten(spec.settings()), "reported": dict(spec.reported)})
+        write_json({**facts, "settings": flatten(spec.settings()), "reported": numbers})
         return
     write_fields(facts)
     write()
     write(settings_table(spec.settings).rstrip())
-    if spec.reported:
+    if numbers:
         write()
-        rows = [(name, metric, value) for name, row in spec.reported.items() for metric, value in row.items()]
-        write_table(("sequence", "reported metric", "value"), rows)
+        write_table(
+            ("sequence", "reported metric", "value", "source", "remarks"), [tuple(row.values()) for row in numbers]
+        )
+
+
+def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
+    """What others report of a system: its own spec's numbers, the published ones and those that the paper claims."""
+    from dynslam_bench.reports.reported import CLAIMED, claimed, published
+
+    own = [
+        (name, metric, value, "its spec", "") for name, row in spec.reported.items() for metric, value in row.items()
+    ]
+    read = [
+        (p.sequence, p.metric, p.value, p.source, "; ".join(filter(None, (p.alignment, p.remarks))))
+        for p in published()
+        if p.system in spec.published_as
+    ]
+    paper = [
+        (c.sequence, c.quantity, c.value, f"EMFOA-OFT-SLAM, table {c.table}", f"{CLAIMED}: see 'report audit-paper'")
+        for c in claimed()
+        if c.system in spec.published_as and c.kind == "value"
+    ]
+    names = ("sequence", "metric", "value", "source", "remarks")
+    return [dict(zip(names, row, strict=True)) for row in own + read + paper]
 
 
 @app.command()

@@ -37,6 +37,9 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
+    def verify(self) -> None:
+        """Raise `SettingsError` where values, each valid by itself, do not go together; asked before anything runs."""
+
 
 @dataclass(frozen=True)
 class Parameter:

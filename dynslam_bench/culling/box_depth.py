@@ -29,7 +29,7 @@ class BoxDepthFilter(DynamicFilter):
 
     def __init__(self, settings: BoxDepthSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -39,7 +39,7 @@ class BoxDepthFilter(DynamicFilter):
         mask = np.zeros(frame.depth.shape, bool)
         depth = np.nan_to_num(frame.depth)
         ignored = 0
-        boxes = dynamic_boxes(frame, self._segmentation)
+        boxes = dynamic_boxes(frame, self.segmentation)
         for box in boxes:
             person = self._cut(box, depth)
             if person is None:

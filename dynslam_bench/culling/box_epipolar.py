@@ -31,7 +31,7 @@ class BoxEpipolarFilter(DynamicFilter):
 
     def __init__(self, settings: BoxEpipolarSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -40,7 +40,7 @@ class BoxEpipolarFilter(DynamicFilter):
         """Test the flow of this frame's keypoints to the previous image."""
         keep = np.ones(len(frame), dtype=bool)
         flow = state.flow
-        boxes = dynamic_boxes(frame, self._segmentation)
+        boxes = dynamic_boxes(frame, self.segmentation)
         stats = {"matches": 0.0, "boxes": float(len(boxes)), "failed": 0.0}
         if flow is None or state.previous is None:
             return FilterResult.of(keep, stats)
@@ -67,5 +67,5 @@ class BoxEpipolarFilter(DynamicFilter):
             return np.zeros(len(inside), dtype=bool)
         if self.settings.fit == "outside" or state.previous is None or state.flow is None:
             return inside
-        boxes = dynamic_boxes(state.previous, self._segmentation)
+        boxes = dynamic_boxes(state.previous, self.segmentation)
         return np.asarray(in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), boxes).any(axis=0))

@@ -36,13 +36,13 @@ class BoxFilter(DynamicFilter):
 
     def __init__(self, settings: BoxSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop what lies in the boxes."""
-        boxes = dynamic_boxes(frame, self._segmentation)
+        boxes = dynamic_boxes(frame, self.segmentation)
         inside = in_boxes(frame.keypoints.xy, boxes, self.settings.margin_px).any(axis=0)
         return FilterResult.of(~inside, {"objects": float(len(boxes))})

@@ -27,7 +27,7 @@ class ClassRuleFilter(DynamicFilter):
 
     def __init__(self, settings: ClassRuleSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -38,10 +38,10 @@ class ClassRuleFilter(DynamicFilter):
         stats = dict.fromkeys(("on_people", "on_movable", "moving_objects"), 0.0)
         if frame.instances is None or not len(frame.instances):
             return FilterResult.of(keep, stats)
-        people = dynamic_mask(frame.instances, self._segmentation, frame.depth)
+        people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
         keep &= ~inside(people, frame.keypoints.xy)
         stats["on_people"] = float(np.count_nonzero(~keep))
-        movable = select(frame.instances, self._segmentation.model_copy(update={"classes": self.settings.movable}))
+        movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
         off_line, tested = self._off_line(frame, state, keep & ~inside(movable.union(), frame.keypoints.xy))
         for mask in movable.masks:
             on = inside(mask, frame.keypoints.xy) & keep

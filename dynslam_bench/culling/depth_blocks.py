@@ -31,7 +31,7 @@ class DepthBlockFilter(DynamicFilter):
 
     def __init__(self, settings: DepthBlockSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -44,15 +44,15 @@ class DepthBlockFilter(DynamicFilter):
         mask, stats["objects"], stats["touched"] = self._semantic_mask(frame.instances)
         if mask.any():
             whole, stats["blocks"] = covered_blocks(mask, frame.depth, self.settings)
-            mask = dilate(mask | whole, self._segmentation.dilation_px)
+            mask = dilate(mask | whole, self.segmentation.dilation_px)
         stats["mask_fraction"] = float(mask.mean())
         return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
 
     def _semantic_mask(self, instances: Instances) -> tuple[NDArray[np.bool_], float, float]:
         """People and the movable things whose masks touch theirs, bool ``[H, W]``, and how many of each."""
-        people = select(instances, self._segmentation)
+        people = select(instances, self.segmentation)
         mask = people.union()
-        movable = select(instances, self._segmentation.model_copy(update={"classes": self.settings.movable}))
+        movable = select(instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
         reach = dilate(mask, 1) if len(movable) else mask
         touched = [each for each in movable.masks if (each & reach).any() and (each & ~mask).any()]
         return np.logical_or.reduce([mask, *touched]), float(len(people)), float(len(touched))

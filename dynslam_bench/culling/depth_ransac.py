@@ -66,7 +66,7 @@ class DepthRansacFilter(DynamicFilter):
 
     def __init__(self, settings: DepthRansacSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -74,7 +74,7 @@ class DepthRansacFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Find the person among the features of every box; features without depth go with it."""
         keep = np.ones(len(frame), dtype=bool)
-        boxes = dynamic_boxes(frame, self._segmentation)
+        boxes = dynamic_boxes(frame, self.segmentation)
         member = in_boxes(frame.keypoints.xy, boxes)
         for number, in_box in enumerate(member):
             measured = np.flatnonzero(in_box & (frame.z > 0))

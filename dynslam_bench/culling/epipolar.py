@@ -148,7 +148,7 @@ class EpipolarFilter(DynamicFilter):
         degenerate = stats["parallax_px"] < needed
         if not degenerate:
             stats["homography_share"] = homography_share(before[fit], frame.xy[fit])
-            degenerate = stats["homography_share"] >= self.settings.homography_share
+            degenerate = stats["homography_share"] > self.settings.homography_share
         matrix = None if degenerate else fundamental_matrix(before[fit], frame.xy[fit], self.settings)
         if matrix is None:
             return FilterResult.of(keep, {**stats, "degenerate": 1.0})

@@ -30,7 +30,7 @@ class FreeSpaceFilter(DynamicFilter):
 
     def __init__(self, settings: FreeSpaceSettings) -> None:
         self.settings = settings
-        self._nearest: dict[float, NDArray[np.float32]] = {}
+        self._nearest: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
 
     def reset(self, camera: Camera) -> None:
         """Forget the keyframes of the previous sequence."""
@@ -53,7 +53,7 @@ class FreeSpaceFilter(DynamicFilter):
             violated, observed = self._saw_past(view, points, state.camera)
             votes += violated
             seen |= observed
-        self._forget({view.timestamp for view in keyframes})
+        self._forget({id(view.depth) for view in keyframes})
         violating, tested = np.zeros(len(frame), dtype=bool), np.zeros(len(frame), dtype=bool)
         violating[known] = votes >= min(self.settings.min_votes, len(keyframes))
         tested[known] = seen
@@ -78,10 +78,10 @@ class FreeSpaceFilter(DynamicFilter):
     def _nearest_depth(self, view: KeyframeView) -> NDArray[np.float32]:
         """Smallest depth around each pixel of the keyframe, 0 where any depth of the patch is missing."""
         assert view.depth is not None
-        if view.timestamp not in self._nearest:
-            self._nearest[view.timestamp] = np.asarray(cv2.erode(view.depth, PATCH), dtype=np.float32)
-        return self._nearest[view.timestamp]
+        if id(view.depth) not in self._nearest:  # the image is kept, so that its id stays its own
+            self._nearest[id(view.depth)] = view.depth, np.asarray(cv2.erode(view.depth, PATCH), dtype=np.float32)
+        return self._nearest[id(view.depth)][1]
 
-    def _forget(self, asked: set[float]) -> None:
-        for timestamp in self._nearest.keys() - asked:
-            del self._nearest[timestamp]
+    def _forget(self, asked: set[int]) -> None:
+        for image in self._nearest.keys() - asked:
+            del self._nearest[image]

@@ -80,7 +80,7 @@ def nearest_depth(
     Depth edges and sub-pixel flow errors so never count as motion.
 
     Args:
-        depth: float32 ``[H, W]`` metres, 0 missing.
+        depth: float32 ``[H, W]`` metres, 0 or not finite where missing.
         xy: Raw pixels ``[N, 2]``.
         expected: Depths ``[N]``, metres.
 
@@ -93,6 +93,7 @@ def nearest_depth(
     column, row = pixels[..., 0], pixels[..., 1]
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     patch = np.where(inside, depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0).astype(np.float64)
+    patch[~np.isfinite(patch)] = 0
     gap = np.where(patch > 0, np.abs(patch - np.asarray(expected)[:, None]), np.inf)
     return np.asarray(np.take_along_axis(patch, gap.argmin(axis=1)[:, None], axis=1)[:, 0])
 

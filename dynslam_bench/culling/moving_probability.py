@@ -42,7 +42,7 @@ class ProbabilityFilter(DynamicFilter):
         self, settings: ProbabilitySettings, segmentation: SegmentationSettings, evidence: str = "masks"
     ) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
         self._boxes = evidence == "boxes"
         self._probability = np.zeros(0)
 
@@ -73,8 +73,8 @@ class ProbabilityFilter(DynamicFilter):
     def _observe(self, frame: FrameBundle) -> NDArray[np.bool_]:
         assert frame.instances is not None
         if self._boxes:
-            return np.asarray(in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self._segmentation)).any(axis=0))
-        return inside(dynamic_mask(frame.instances, self._segmentation, frame.depth), frame.keypoints.xy)
+            return np.asarray(in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self.segmentation)).any(axis=0))
+        return inside(dynamic_mask(frame.instances, self.segmentation, frame.depth), frame.keypoints.xy)
 
     def _update(self, prior: NDArray[np.float64], on_mask: NDArray[np.bool_]) -> NDArray[np.float64]:
         if self.settings.rule == "average":

@@ -33,7 +33,7 @@ class MovingVoteFilter(DynamicFilter):
 
     def __init__(self, settings: MovingVoteSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -44,7 +44,7 @@ class MovingVoteFilter(DynamicFilter):
         stats = {"corners": 0.0, "moving": 0.0, "votes": 0.0}
         if state.previous is None or frame.instances is None:
             return FilterResult.of(keep, stats)
-        people = select(frame.instances, self._segmentation).union()
+        people = select(frame.instances, self.segmentation).union()
         moving, stats["corners"] = self._moving_corners(state.previous.gray, frame.gray, state.camera)
         stats["moving"] = float(len(moving))
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code

@@ -49,7 +49,7 @@ class MultiViewFilter(DynamicFilter):
         pose = light_track(frame, state)
         assert pose is not None
         references = self._choose(state.keyframes, pose)
-        depth = np.nan_to_num(frame.depth)
+        depth = np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0)
         seeds = self._hiding(references, depth, pose, state.camera)
         stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
         if not len(seeds):

@@ -38,7 +38,7 @@ class ResidualFilter(DynamicFilter):
 
     def __init__(self, settings: ResidualSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
 
     def reset(self, camera: Camera) -> None:
         """Nothing to forget."""
@@ -59,7 +59,7 @@ class ResidualFilter(DynamicFilter):
         label = self._cluster(xy, z[valid], state.seed)
         people = np.zeros(len(xy), bool)
         if frame.instances is not None:
-            people = inside(select(frame.instances, self._segmentation).union(), xy)
+            people = inside(select(frame.instances, self.segmentation).union(), xy)
         moving = self._judge(residual, label, people)
         picture = np.zeros(rows.size, dtype=np.uint8)
         picture[valid] = moving[label]

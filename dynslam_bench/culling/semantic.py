@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.postprocess import dynamic_mask
+from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
@@ -43,5 +43,5 @@ class SemanticFilter(DynamicFilter):
             return FilterResult.of(np.ones(len(frame), bool), {"objects": 0.0, "mask_fraction": 0.0})
         mask = dynamic_mask(frame.instances, self.settings, depth=frame.depth)
         keep = ~inside(mask, frame.keypoints.xy)
-        stats = {"objects": float(len(frame.instances)), "mask_fraction": float(mask.mean())}
+        stats = {"objects": float(len(select(frame.instances, self.settings))), "mask_fraction": float(mask.mean())}
         return FilterResult.of(keep, stats, mask)

@@ -11,8 +11,9 @@ class GuardSettings(Settings):
     """The starvation guard: no filter may leave tracking without features (SG-SLAM restores below 10 %)."""
 
     min_features: int = tunable(
-        40, low=10, high=200, limits=(0, 2000), meaning="fewest keypoints that culling must leave", online=True
-    )
+        60, low=10, high=200, limits=(0, 2000), online=True,
+        meaning="fewest keypoints that culling must leave: as many as the back end needs to begin a map",
+    )  # fmt: skip
     min_fraction: float = tunable(
         0.05, low=0.0, high=0.3, limits=(0.0, 1.0), meaning="smallest share of the keypoints that culling must leave"
     )

@@ -28,7 +28,7 @@ class TemplateFilter(DynamicFilter):
 
     def __init__(self, settings: TemplateSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings
-        self._segmentation = segmentation
+        self.segmentation = segmentation
         self._window: deque[tuple[NDArray[np.uint8], NDArray[np.float64]]] = deque()
 
     def reset(self, camera: Camera) -> None:
@@ -41,7 +41,7 @@ class TemplateFilter(DynamicFilter):
             self._window.appendleft((state.previous.gray, state.T_world_prev))
         while len(self._window) > self.settings.window:
             self._window.pop()
-        boxed = in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self._segmentation)).any(axis=0)
+        boxed = in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
         keep = np.asarray(~boxed)
         rows = np.flatnonzero(boxed & (frame.z > 0))
         stats = {"in_boxes": float(np.count_nonzero(boxed)), "tested": 0.0, "median_zncc": 0.0}

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from .estimator import FlowResult
 
+FLAT_RANGE = 2
+"""Grey levels between the darkest and the brightest pixel up to which an image has no texture."""
+
 
 def flow_stats(points: int, valid: int = 0, evaluations: int = 0, *, degenerate: bool = False) -> dict[str, float]:
     """The stats of all our flows, the same keys in every result.
@@ -41,9 +44,20 @@ def unseen_result(points: NDArray[np.float32]) -> FlowResult:
     return FlowResult(xy, np.zeros(n, np.bool_), np.ones(n, np.float32), stats)
 
 
-def same_image(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bool:
-    """Whether two images are equal pixel by pixel: such a pair says nothing about motion."""
-    return reference is target or (reference.shape == target.shape and bool(np.array_equal(reference, target)))
+def says_nothing(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bool:
+    """Whether a pair of images says nothing about motion: equal pixel by pixel, or one of them without texture.
+
+    Raises:
+        ValueError: They differ in size, or are no uint8 ``[H, W]`` images.
+    """
+    if reference.shape != target.shape:
+        raise ValueError(f"images differ in size: {reference.shape} and {target.shape}")
+    if reference.dtype != np.uint8 or target.dtype != np.uint8 or reference.ndim != 2:
+        raise ValueError(f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}")
+    if reference is target or not reference.size:
+        return True
+    flat = any(int(image.max()) - int(image.min()) <= FLAT_RANGE for image in (reference, target))
+    return flat or bool(np.array_equal(reference, target))
 
 
 def usable_points(points: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -73,7 +87,7 @@ def request(
     points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
     if not len(points):
         return empty_result()
-    if same_image(reference, target):
+    if says_nothing(reference, target):
         return unseen_result(points)
     usable = usable_points(points, reference.shape)
     return Request(np.where(usable[:, None], points, 0).astype(np.float32), usable)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._jit import kernel
-from .checks import same_image
+from .checks import says_nothing
 from .fill import fill_and_smooth, fit_regional_motion
 from .guided_filter import filter_patch
 from .maps import OrientationMaps
@@ -82,16 +82,15 @@ class DenseDaisyFlow:
     def flow(self, reference: OrientationMaps, target: OrientationMaps, *, seed: int = 0) -> DenseFlow:
         """Flow from the reference to the target; see `DenseFlow`.
 
-        Identical images give zero flow that is not valid, as in the sparse mode.
+        Identical images and images without texture give zero flow that is not valid, as in the sparse mode; the stat
+        ``degenerate`` is 1 then.
         """
         height, width = reference.gray.shape
-        if target.gray.shape != (height, width):
-            raise ValueError(f"images differ in size: {reference.gray.shape} and {target.gray.shape}")
-        if same_image(reference.gray, target.gray):
+        if says_nothing(reference.gray, target.gray):
             shape = (height, width)
             return DenseFlow(
                 np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_), np.zeros(shape, np.float32),
-                {"identical": 1.0, "evaluations": 0.0, "valid": 0.0},
+                {"evaluations": 0.0, "valid": 0.0, "degenerate": 1.0},
             )  # fmt: skip
         forward = self._one_way(reference, target, seed)
         valid = np.ones((height, width), dtype=np.bool_)
@@ -110,7 +109,8 @@ class DenseDaisyFlow:
             flow = flows[0] if fitted is None else fill_and_smooth(flows[0], valid, fitted)
         else:
             flow = forward.flow()
-        stats = {"evaluations": float(sum(r.evaluations for r in rounds)), "valid": float(valid.sum())}
+        evaluations = float(sum(r.evaluations for r in rounds))
+        stats = {"evaluations": evaluations, "valid": float(valid.sum()), "degenerate": 0.0}
         return DenseFlow(flow, valid, forward.cost(), stats)
 
     def _one_way(self, reference: OrientationMaps, target: OrientationMaps, seed: int) -> _OneWay:

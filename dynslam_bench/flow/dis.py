@@ -52,8 +52,6 @@ class DisFlow:
         clean, usable = asked
         if min(reference.shape) < SMALLEST_SIDE:
             return unseen_result(clean)
-        if reference.max() == reference.min() or target.max() == target.min():
-            return unseen_result(clean)
         xy = clean + _read(self.dense(reference, target), clean)
         valid = usable & usable_points(xy, target.shape)
         cost = np.zeros(len(clean), dtype=np.float32)

@@ -24,7 +24,14 @@ def guided_filter(
 
     Returns:
         float32 ``[H, W]``.
+
+    Raises:
+        ValueError: The images differ in size, or radius or epsilon is negative.
     """
+    if guide.ndim != 2 or guide.shape != values.shape:
+        raise ValueError(f"guide and values must be images of one size, got {guide.shape} and {values.shape}")
+    if radius < 0 or not epsilon >= 0:
+        raise ValueError(f"radius and epsilon must not be negative, got {radius} and {epsilon}")
     out = np.empty(guide.shape, dtype=np.float32)
     height, width = guide.shape
     work = np.empty((6, height * width), dtype=np.float32)
@@ -52,8 +59,8 @@ def filter_patch(guide, values, height, width, radius, epsilon, work, out):  # t
     box_mean(out, height, width, radius, line, square)
     slope, offset = product, square
     for k in range(n):
-        variance = square[k] - mean_guide[k] * mean_guide[k]
-        a = (product[k] - mean_guide[k] * mean_value[k]) / (variance + epsilon)
+        spread = max(square[k] - mean_guide[k] * mean_guide[k], np.float32(0)) + epsilon
+        a = (product[k] - mean_guide[k] * mean_value[k]) / spread if spread > 0 else np.float32(0)
         slope[k] = a
         offset[k] = mean_value[k] - a * mean_guide[k]
     box_mean(slope, height, width, radius, line, mean_guide)

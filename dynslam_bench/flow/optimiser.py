@@ -56,7 +56,7 @@ def emfoa_minimise(
         budget: Function evaluations a problem; never exceeded.
         population: Moths (N of Eq. 4); reduced to what the budget allows.
         seed: Of all random numbers.
-        start: ``[M, D]`` or ``[B, M, D]``, positions that join the first population.
+        start: ``[M, D]`` or ``[B, M, D]``, positions that join the first population; what is not finite is drawn.
         steps: ``[D]`` or ``[B, D]``, scale of the Cauchy steps of Eq. 13; None takes 1 % of the box.
         rules: Which equations are in force.
 
@@ -79,7 +79,8 @@ def emfoa_minimise(
     if start is not None:
         given = np.asarray(start, dtype=np.float64)
         given = np.broadcast_to(given, (problems, *given.shape[-2:]))[:, :population]
-        moths[:, : given.shape[1]] = np.clip(given, low, high)
+        joined = moths[:, : given.shape[1]]
+        moths[:, : given.shape[1]] = np.where(np.isfinite(given), np.clip(given, low, high), joined)
     flames = np.empty((problems, 0, dimensions))
     values = np.empty((problems, 0))
     history: list[Floats] = []

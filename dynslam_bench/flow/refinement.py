@@ -185,7 +185,9 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
                 sum_of_w = np.float64(total(sum_w))
                 mean = sum_of_w / n
                 variance = total(ww) - mean * sum_of_w
-                score = np.float32(total(wt) / np.sqrt(max(variance * energy, 1e-3)))
+                score = np.float32(-1)  # a flat target looks like anything
+                if variance >= n * FLAT_VARIANCE:
+                    score = np.float32(total(wt) / np.sqrt(variance * energy))
                 if warp == 0 and iteration == 0:
                     first = score
                 if score > best:

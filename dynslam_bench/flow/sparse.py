@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import layout
 from .buffers import BufferPool
-from .checks import empty_result, flow_stats, same_image, unseen_result, usable_points
+from .checks import empty_result, flow_stats, says_nothing, unseen_result, usable_points
 from .consensus import dissenting_labels
 from .estimator import FlowResult
 from .maps import OrientationMaps, orientation_maps
@@ -66,12 +66,10 @@ class SparseDaisyFlow:
         seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`."""
-        if reference.gray.shape != target.gray.shape:
-            raise ValueError(f"images differ in size: {reference.gray.shape} and {target.gray.shape}")
         points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
         if not len(points):
             return empty_result()
-        if same_image(reference.gray, target.gray):
+        if says_nothing(reference.gray, target.gray):
             return unseen_result(points)
         usable = usable_points(points, reference.gray.shape)
         if not usable.all():

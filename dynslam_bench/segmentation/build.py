@@ -64,6 +64,7 @@ def build_segmenter(
     device: str = "cpu",
     threads: int = 1,
     deferred: bool = False,
+    also: frozenset[str] = frozenset(),
 ) -> ConfiguredSegmenter | None:
     """The segmenter that the settings ask for; None for source ``none``.
 
@@ -73,6 +74,7 @@ def build_segmenter(
         masks: Exact masks of the sequence, for ``oracle``.
         device: ``cpu`` or ``cuda:N``, for networks that run in torch.
         threads: Threads a network may use.
+        also: Names of further classes whose objects are wanted, though nobody holds them for dynamic by themselves.
         deferred: Load a network whose file is there only once a frame needs it; with the stage cache none may.
 
     Raises:
@@ -103,7 +105,7 @@ def build_segmenter(
         return built
 
     waits = deferred and prefix in ("embedded", "coco", "onnx", "weights") and weights_digest(settings, sequence_id)
-    return ConfiguredSegmenter(DeferredSegmenter(load) if waits else load(), settings, source)
+    return ConfiguredSegmenter(DeferredSegmenter(load) if waits else load(), settings, source, also)
 
 
 class DeferredSegmenter:
@@ -139,15 +141,19 @@ class ConfiguredSegmenter:
         inner: Finds objects.
         settings: Selects among them; the attribute `settings` may be replaced while a run lasts.
         source: Label stored with results.
+        also: Names of further classes that are let through.
     """
 
-    def __init__(self, inner: Segmenter, settings: SegmentationSettings, source: str) -> None:
+    def __init__(
+        self, inner: Segmenter, settings: SegmentationSettings, source: str, also: frozenset[str] = frozenset()
+    ) -> None:
         self.inner = inner
         self.settings = settings
         self.source = source
+        self.also = also
 
     def segment(self, frame: Frame) -> Instances:
-        """The dynamic objects of the frame.
+        """The objects of the frame that count: see `select`.
 
         Raises:
             SegmentationError: The segmenter gave masks of another size than the frame.
@@ -158,7 +164,7 @@ class ConfiguredSegmenter:
                 f"{self.source} gave {len(found)} objects with masks of shape {found.masks.shape}, the frame is "
                 f"{frame.rgb.shape[1]}x{frame.rgb.shape[0]}", "masks must be [K, H, W] at the frame's size"
             )  # fmt: skip
-        return select(found, self.settings)
+        return select(found, self.settings, self.also)
 
 
 def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:

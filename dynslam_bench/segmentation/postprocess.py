@@ -15,9 +15,9 @@ HOLE_RADIUS_PX = 3
 """Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is our assumption)."""
 
 
-def select(instances: Instances, settings: SegmentationSettings) -> Instances:
-    """The objects that count: confident enough, large enough, of a dynamic class or (oracles) known to move."""
-    names = settings.class_names()
+def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
+    """The objects that count: confident and large enough, of a dynamic class or one of `also`, or known to move."""
+    names = settings.class_names() | also
     wanted = np.array([name in names for name in instances.class_names], dtype=bool)
     if instances.moving is not None:
         wanted |= instances.moving

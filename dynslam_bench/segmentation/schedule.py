@@ -105,15 +105,17 @@ def build_mask_stage(
     device: str = "cpu",
     threads: int = 1,
     deferred: bool = False,
+    also: frozenset[str] = frozenset(),
 ) -> MaskScheduler | None:
     """The segmentation stage that the settings ask for; None for source ``none``.
 
-    `deferred` loads a network only once a frame needs it; the rest as for `build_segmenter`.
+    The arguments are those of `build_segmenter`.
 
     Raises:
         SegmentationError: The source is not available here.
     """
     segmenter = build_segmenter(
-        settings, sequence_id=sequence_id, masks=masks, device=device, threads=threads, deferred=deferred
-    )
+        settings, sequence_id=sequence_id, masks=masks, device=device, threads=threads, deferred=deferred,
+        also=also,
+    )  # fmt: skip
     return None if segmenter is None else MaskScheduler(settings, segmenter)

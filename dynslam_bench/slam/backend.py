@@ -21,6 +21,7 @@ from .mapping import LocalMapper
 from .motion import MotionState, pose_covariance, smooth
 from .observation import Observations, observe
 from .outputs import KeyframeRecord, MapOutputs
+from .pose import PoseEstimate
 from .relocalisation import locate
 from .result import TrackResult
 from .settings import BackendSettings
@@ -41,6 +42,9 @@ State = Literal["initialising", "ok", "lost"]
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
+TRUSTED_FIRST = 50
+TRUSTED_SHARE = 0.5
+"""Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
 MIN_KEYFRAME = 15
 """Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
 
@@ -244,12 +248,14 @@ class RgbdBackend:
     def _first_pose(
         self, seen: Observations, last: Tracked, prediction: Array, stats: dict[str, float]
     ) -> tuple[Matches | None, Array]:
-        """A first pose: from the last frame; else from the reference keyframe; else from any keyframe.
+        """A first pose: from the last frame; else from the reference keyframe or any keyframe.
 
-        The last frame's map points come first. Where they are few, what only its depth image gives helps as well.
+        The last frame's map points come first. Where they are few, what only its depth gives helps as well. A pose
+        that few matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'.
         """
         s = self.settings.tracking
         close_m = self.mapper.close_m
+        best: tuple[Matches, PoseEstimate] | None = None
         for widen, depth_m, enough in (
             (1.0, 0.0, s.mapped_matches), (1.0, close_m, ENOUGH_FIRST), (2.5, close_m, ENOUGH_FIRST)
         ):  # fmt: skip
@@ -257,17 +263,24 @@ class RgbdBackend:
             if len(matches) < enough:
                 continue
             estimate = solve(self.world, seen, matches, prediction, rounds=3)
-            if estimate.count >= ENOUGH_FIRST // 2:
-                return matches.select(estimate.inliers), estimate.T_cam_world
-        rng = stream(self.seed, "relocalisation", self._frame)
-        tries = [[self._reference]] if self.state == "ok" else []
-        tries.append(self.world.keyframes.tolist())
-        for keyframes in tries:
-            found = locate(self.world, keyframes, seen, self.settings.relocalisation, rng, s.min_inliers)
-            if found is not None and found.estimate.count >= ENOUGH_FIRST // 2:
-                stats["relocalised"] = 1.0
-                return found.matches.select(found.estimate.inliers), found.estimate.T_cam_world
-        return None, prediction
+            if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
+                best = matches, estimate
+            if estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
+                break
+        else:
+            rng = stream(self.seed, "relocalisation", self._frame)
+            tries = [[self._reference]] if self.state == "ok" else []
+            tries.append(self.world.keyframes.tolist())
+            for keyframes in tries:
+                found = locate(self.world, keyframes, seen, self.settings.relocalisation, rng, s.min_inliers)
+                least = ENOUGH_FIRST // 2 if best is None else best[1].count + 1
+                if found is not None and found.estimate.count >= least:
+                    stats["relocalised"] = 1.0
+                    best = found.matches, found.estimate
+                    break
+        if best is None:
+            return None, prediction
+        return best[0].select(best[1].inliers), best[1].T_cam_world
 
     # ------------------------------------------------------------------ keyframes
 

@@ -181,18 +181,28 @@ class SlamPipeline:
         )
 
     def finalize(self) -> Trajectory:
-        """The trajectory after the last optimisation of the map."""
+        """The trajectory after the last optimisation of the map.
+
+        Raises:
+            TrackerError: `reset` was never called.
+        """
+        self._begun("finalize")
         return self._backend.finalize()
 
     def map_outputs(self) -> MapOutputs:
-        """Keyframes and map points, for ``keyframes.csv``, ``map.ply`` and the sheet."""
+        """Keyframes and map points, for ``keyframes.csv``, ``map.ply`` and the sheet.
+
+        Raises:
+            TrackerError: `reset` was never called.
+        """
+        self._begun("map_outputs")
         return self._backend.outputs()
 
     def update_settings(self, settings: Settings) -> None:
         """Put new values of online settings into force from the next frame on.
 
         Each part takes the group of the settings that bears its name: filters their own, ``features``, ``flow``,
-        ``backend``, ``guard`` and ``segmentation``.
+        ``backend``, ``guard`` and ``segmentation``, which also goes to the filters that have a ``segmentation``.
         """
         self._guard = getattr(settings, "guard", self._guard)
         parts: list[tuple[str, Any]] = [(getattr(each, "group", each.name), each) for each in self._filters]
@@ -205,26 +215,45 @@ class SlamPipeline:
         for group, part in parts:
             if part is not None and hasattr(part, "settings") and hasattr(settings, group):
                 part.settings = getattr(settings, group)
+        for each in self._filters:
+            if hasattr(each, "segmentation") and hasattr(settings, "segmentation"):
+                each.segmentation = settings.segmentation
+
+    def _begun(self, method: str) -> Camera:
+        if self._camera is None:
+            raise TrackerError(f"{method}() was called before reset()")
+        return self._camera
 
     def _check(self, frame: Frame) -> Camera:
-        if self._camera is None:
-            raise TrackerError("track() was called before reset()")
-        expected = (self._camera.height, self._camera.width)
+        camera = self._begun("track")
+        for what, image, kind, form in (
+            ("colour", frame.rgb, "u1", "uint8"), ("depth", frame.depth, "f", "float32 in metres")
+        ):  # fmt: skip
+            found = getattr(image, "dtype", None)
+            if found is None or not (found.kind == kind[0] and (kind == "f" or found == np.uint8)):
+                raise TrackerError(
+                    f"frame {frame.index} has {what} of type {found or type(image).__name__}, not {form}"
+                )
+        if not np.isfinite(frame.timestamp):
+            raise TrackerError(f"frame {frame.index} has the timestamp {frame.timestamp}")
+        expected = (camera.height, camera.width)
         if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
             raise TrackerError(
                 f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
-                f"the camera is {self._camera.width}x{self._camera.height}"
+                f"the camera is {camera.width}x{camera.height}"
             )
-        return self._camera
+        return camera
 
     def _extract(self, frame: Frame, camera: Camera) -> FrameBundle:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         keypoints = self._extractor.extract(gray)
+        depth = np.array(frame.depth, dtype=np.float32)  # kept for the next frames: the caller may reuse its buffer
+        if not np.isfinite(depth).all():
+            depth[~np.isfinite(depth)] = 0
         column, row = np.rint(keypoints.xy).astype(np.intp).T
-        z = frame.depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
-        z = np.where(np.isfinite(z) & (z > 0), z, 0).astype(np.float32)
+        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         return FrameBundle(
-            index=frame.index, timestamp=frame.timestamp, rgb=frame.rgb, gray=gray, depth=frame.depth,
+            index=frame.index, timestamp=frame.timestamp, rgb=frame.rgb, gray=gray, depth=depth,
             keypoints=keypoints, xy=camera.undistort_points(keypoints.xy), z=z,
         )  # fmt: skip
 

@@ -87,7 +87,8 @@ class TrackerSpec:
         citation: What to cite.
         assumptions: What was assumed where the source is silent.
         requires: Modules that must be importable, each with the command that installs it.
-        reported: Published numbers: sequence id to metric to value.
+        reported: Numbers that its authors report: sequence id to metric to value.
+        published_as: Names under which the product's own table of published numbers lists it, each with its source.
         remarks: Name collisions and known limits, e.g. "marks nothing as lost".
         parameter: Name of the setting that takes what follows the id in ``id:value`` (``replay:FILE``); empty if the
             tracker takes none.
@@ -112,6 +113,7 @@ class TrackerSpec:
     assumptions: tuple[str, ...] = ()
     requires: Mapping[str, str] = field(default_factory=dict)
     reported: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    published_as: tuple[str, ...] = ()
     remarks: str = ""
     parameter: str = ""
     bound: Mapping[str, Any] = field(default_factory=dict)

@@ -68,10 +68,12 @@ def resolve_settings(spec: TrackerSpec, overrides: Mapping[str, Any] | None = No
     """The tracker's default settings with what its name has bound, then the overrides (dotted name to value) applied.
 
     Raises:
-        SettingsError: Unknown name or unfit value.
+        SettingsError: Unknown name, unfit value, or values that do not go together.
     """
     bound = {name: json.dumps(value) for name, value in spec.bound.items()}  # as text, so that "5" stays a file's name
-    return apply_overrides(spec.settings(), {**bound, **(overrides or {})})
+    settings = apply_overrides(spec.settings(), {**bound, **(overrides or {})})
+    settings.verify()
+    return settings
 
 
 def build_tracker(

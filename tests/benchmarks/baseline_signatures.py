@@ -41,21 +41,6 @@ from dynslam_bench.runs.scoring import DEFAULT_PROTOCOL
 from dynslam_bench.trackers.registry import TRACKERS
 
 FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
-PUBLISHED_AS = {
-    "orb-slam2": ("ORB-SLAM2",),
-    "mask-rcnn": ("DynaSLAM N",),
-    "dynaslam-n": ("DynaSLAM N",),
-    "dynaslam": ("DynaSLAM N+G", "DynaSLAM"),
-    "dynaslam-code": ("DynaSLAM N+G", "DynaSLAM"),
-    "dynaslam-g": ("DynaSLAM G",),
-    "ds-slam": ("DS-SLAM",),
-    "blitz-slam": ("Blitz-SLAM",),
-    "yolo-slam": ("YOLO-SLAM",),
-    "dai-slam": ("Dai et al. DSLAM",),
-    "cfp-slam": ("CFP-SLAM",),
-    "ngd-slam": ("NGD-SLAM",),
-}
-"""Our systems under the names that their numbers are published under."""
 YARDSTICKS = (("DynaSLAM N",), ("DynaSLAM N+G", "DynaSLAM"))
 FAITHFUL = ("faithful-code", "faithful-paper")
 
@@ -117,7 +102,7 @@ def published_never_move() -> dict[str, float]:
 
 def published_class(tracker: str, sequence: str) -> str | None:
     """The class that published figures put a system in; `between` if they are not clear, None if there are none."""
-    values = published_values(PUBLISHED_AS.get(tracker, ()), sequence)
+    values = published_values(TRACKERS.get(tracker).published_as, sequence)
     if not values:
         return None
     standstill = published_never_move().get(sequence)

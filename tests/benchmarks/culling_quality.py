@@ -45,23 +45,23 @@ from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 from dynslam_bench.trackers.registry import TRACKERS  # noqa: E402
 
 SEQUENCES = [f"synthetic/walking_{motion}?frames=300" for motion in ("xyz", "static", "halfsphere", "rpy")]
-NO_DEPTH = {"motion.enabled": False, "free_space.enabled": False}
 ROWS: dict[str, tuple[str, dict[str, object]]] = {
     "emfoa-oft": ("emfoa-oft", {}),
     "emfoa-oft-no-flow": ("emfoa-oft-no-flow", {}),
     "emfoa-oft-paper": ("emfoa-oft-paper", {}),
-    "emfoa-oft without depth tests": ("emfoa-oft", NO_DEPTH),
+    "emfoa-oft-no-depth-test": ("emfoa-oft-no-depth-test", {}),
     "emfoa-oft-lk": ("emfoa-oft-lk", {}),
     "emfoa-oft-patchmatch": ("emfoa-oft-patchmatch", {}),
     "emfoa-oft-literal": ("emfoa-oft-literal", {}),
     "emfoa-oft-object": ("emfoa-oft-object", {}),
-    "emfoa-oft-object with depth tests": ("emfoa-oft-object", {"motion.enabled": True, "free_space.enabled": True}),
+    "emfoa-oft-object-depth-test": ("emfoa-oft-object-depth-test", {}),
     "emfoa-oft-no-masks": ("emfoa-oft-no-masks", {}),
     "emfoa-oft-no-masks, Lucas-Kanade": ("emfoa-oft-no-masks", {"flow.method": "lucas-kanade"}),
     "emfoa-oft-no-masks, PatchMatch": ("emfoa-oft-no-masks", {"flow.search": "patchmatch"}),
     "emfoa-oft-no-masks, literal EMFOA": ("emfoa-oft-no-masks", {"flow.search": "emfoa-literal"}),
     "emfoa-oft-no-masks without motion test": ("emfoa-oft-no-masks", {"motion.enabled": False}),
     "emfoa-oft-no-masks without free space": ("emfoa-oft-no-masks", {"free_space.enabled": False}),
+    "emfoa-oft-no-masks-no-depth-test": ("emfoa-oft-no-masks-no-depth-test", {}),
     "emfoa-oft-paper-no-masks": ("emfoa-oft-paper-no-masks", {}),
     "orb-slam2": ("orb-slam2", {}),
 }

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Parameter, parameters, settings_table
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
@@ -75,9 +75,9 @@ def test_masks_cull_the_people_and_little_else(walking) -> None:
     np.testing.assert_array_equal(~result.keypoints_keep, on_person | moving)
 
 
-@pytest.mark.parametrize("name", ["mask-rcnn", "yolo-slam", "seg-slam"])
+@pytest.mark.parametrize("name", ["mask-rcnn", "dynaslam", "yolo-slam", "seg-slam", "emfoa-oft"])
 def test_no_masks_where_a_system_needs_them_is_a_clear_error(name: str, walking) -> None:
-    with pytest.raises(SegmentationError, match=r"needs masks.*none.*oracle.*onnx:PATH"):
+    with pytest.raises(SettingsError, match=r"needs masks.*none.*oracle.*onnx:PATH.*weights:PATH"):
         run(TRACKERS.get(name), walking, **{"segmentation.source": "none"})
 
 

@@ -44,6 +44,7 @@ SPEC = TrackerSpec(
     summary="masks repaired by depth, epipolar test of 0.5 px inside person boxes",
     provenance="faithful-paper",
     ranked=True,
+    published_as=("Blitz-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Fan et al., Blitz-SLAM, Pattern Recognition 2022",
     assumptions=(

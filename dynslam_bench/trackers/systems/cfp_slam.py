@@ -38,6 +38,7 @@ SPEC = TrackerSpec(
     summary="static probability as weight of the pose optimiser, points below 0.3 dropped",
     provenance="inspired",
     ranked=False,
+    published_as=("CFP-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Hu et al., CFP-SLAM, IROS 2022",
     assumptions=(

@@ -6,17 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.classes import expand_classes
+from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings
 
 from ..protocol import TrackerContext
 
+SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
+"""Where masks can come from, as `segmentation.source` names it."""
 SHARED_MASKS = "masks come from the stage that all systems share: scores above 0.3, missed detections bridged"
 """An assumption of every system with a semantic source."""
 
@@ -35,9 +38,24 @@ class SystemSettings(Settings):
 
 
 class SemanticSystemSettings(SystemSettings):
-    """A system that uses masks or boxes."""
+    """A system that uses masks or boxes; one whose own default is the source ``none`` does without."""
 
     segmentation: SegmentationSettings = SegmentationSettings()
+
+    def verify(self) -> None:
+        """A system that lives on masks does not quietly become another one without them."""
+        default: SegmentationSettings = type(self).model_fields["segmentation"].get_default(call_default_factory=True)
+        if self.segmentation.source == "none" != default.source:
+            raise SettingsError(
+                "this system needs masks, but segmentation.source is 'none'",
+                f"sources: {SOURCES}; without masks run dynaslam-g, emfoa-oft-no-masks, opf-slam or orb-slam2",
+            )
+
+
+def movable_classes(filters: Sequence[DynamicFilter]) -> frozenset[str]:
+    """The classes that filters watch though they are not held for dynamic by themselves: their setting ``movable``."""
+    named = (getattr(getattr(each, "settings", None), "movable", "") for each in filters)
+    return frozenset().union(*(expand_classes(names) for names in named if names))
 
 
 def compose(
@@ -74,14 +92,14 @@ def compose(
     if isinstance(settings, SemanticSystemSettings):
         masks = build_mask_stage(
             settings.segmentation, sequence_id=context.sequence_id, masks=context.masks, device=context.device,
-            threads=context.threads, deferred=cache is not None,
+            threads=context.threads, deferred=cache is not None, also=movable_classes(filters),
         )  # fmt: skip
     if masks is None:
         needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
         if needing:
             raise SegmentationError(
                 f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'",
-                "sources: auto, oracle, embedded, coco, onnx:PATH, recorded:DIR",
+                f"sources: {SOURCES}",
             )
     elif cache is not None:
         segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)

@@ -36,6 +36,7 @@ SPEC = TrackerSpec(
     summary="cuts inconsistent edges of a Delaunay graph, keeps the largest rigid component",
     provenance="faithful-paper",
     ranked=True,
+    published_as=("Dai et al. DSLAM",),
     license="MIT (re-implemented from the description)",
     citation="Dai et al., RGB-D SLAM in Dynamic Environments Using Point Correlations, TPAMI 2020",
     assumptions=(

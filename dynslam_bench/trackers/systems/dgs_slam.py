@@ -34,6 +34,7 @@ SPEC = TrackerSpec(
     summary="residual clusters of the warped image with a semantic prior",
     provenance="inspired",
     ranked=False,
+    published_as=("DGS-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
     assumptions=(

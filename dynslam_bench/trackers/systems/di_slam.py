@@ -46,6 +46,7 @@ SPEC = TrackerSpec(
     summary="epipolar test of 0.2 px inside and 1 px outside boxes, then multi-view depth",
     provenance="inspired",
     ranked=False,
+    published_as=("DI-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
     assumptions=(

@@ -36,6 +36,7 @@ SPEC = TrackerSpec(
     summary="moving-consistency check on Lucas-Kanade tracks, one vote for all people",
     provenance="faithful-code",
     ranked=True,
+    published_as=("DS-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Yu et al., DS-SLAM, IROS 2018",
     assumptions=(SHARED_MASKS,),

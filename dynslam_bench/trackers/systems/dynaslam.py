@@ -57,7 +57,8 @@ def build_masks_only(settings: DynaSlamSettings, context: TrackerContext) -> Sla
 
 
 GEOMETRY = (
-    "regions grow around the depth of their seed, not around a running mean",
+    "regions grow around the depth of their seed, not around a running mean, at half the resolution",
+    "a seed needs a neighbourhood of nearly one depth (variance below 0.001 m^2), as in the code",
     "the search window is sampled on every fourth pixel",
     "the low-cost tracking matches the last frame, not the local map",
     "parallax is taken between camera centres (the code's translation is in another frame)",
@@ -66,7 +67,12 @@ UNION = "the masks of N and G are united, as in the code (the paper keeps G's wh
 
 
 def _spec(
-    suffix: str, variant: str, settings: type[DynaSlamSettings], factory: str, faithful_code: bool
+    suffix: str,
+    variant: str,
+    settings: type[DynaSlamSettings],
+    factory: str,
+    faithful_code: bool,
+    published_as: tuple[str, ...],
 ) -> TrackerSpec:
     return TrackerSpec(
         id=f"dynaslam{suffix}",
@@ -75,6 +81,7 @@ def _spec(
         settings=settings,
         summary=f"DynaSLAM, variant {variant}",
         provenance="faithful-code" if faithful_code else "faithful-paper",
+        published_as=published_as,
         license="MIT (re-implemented from the description; the authors' code is GPL-3.0)",
         citation="Bescos et al., DynaSLAM, IEEE RA-L 2018",
         assumptions=(
@@ -87,8 +94,8 @@ def _spec(
 
 
 SPECS = [
-    _spec("", "N+G", DynaSlamSettings, "build", False),
-    _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", True),
-    _spec("-n", "N", DynaSlamSettings, "build_masks_only", True),
-    _spec("-g", "G", DynaSlamGeometrySettings, "build", False),
+    _spec("", "N+G", DynaSlamSettings, "build", False, ("DynaSLAM N+G", "DynaSLAM")),
+    _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", True, ("DynaSLAM N+G", "DynaSLAM")),
+    _spec("-n", "N", DynaSlamSettings, "build_masks_only", True, ("DynaSLAM N",)),
+    _spec("-g", "G", DynaSlamGeometrySettings, "build", False, ("DynaSLAM G",)),
 ]

@@ -34,6 +34,7 @@ SPEC = TrackerSpec(
     summary="inside boxes, keeps what is found where the camera's motion predicts it",
     provenance="inspired",
     ranked=False,
+    published_as=("DynaTM-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., DynaTM-SLAM, Robotics and Autonomous Systems 174, 2024",
     assumptions=(

@@ -53,7 +53,7 @@ def _build(
     from dynslam_bench.culling.semantic import SemanticFilter
 
     filters: list[DynamicFilter] = []
-    if semantic and settings.segmentation.source != "none":
+    if semantic and settings.segmentation.source != "none":  # the ablation without masks
         filters.append(SemanticFilter(settings.segmentation))
     if geometry:
         filters.append(EpipolarFilter(settings.epipolar))
@@ -64,7 +64,14 @@ def _build(
     return compose(settings, context, filters, settings.flow if geometry else None)
 
 
+OURS = (
+    "a failing point goes only where its neighbours fail too, and an F that depth contradicts is not used (both ours)",
+)
+DEPTH_TESTS = ("rigid motion in depth and free space seen before are tested as well (both ours, no part of the paper)",)
+
+
 def _spec(name: str, summary: str, defaults: dict[str, Any], factory: str = "build") -> TrackerSpec:
+    geometry = factory != "build_without_flow"
     settings = EmfoaOftSettings
     if defaults:
         settings = _variant(name, defaults)
@@ -78,10 +85,14 @@ def _spec(name: str, summary: str, defaults: dict[str, Any], factory: str = "bui
         ranked=name == "emfoa-oft",
         license="MIT",
         citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/method.md",
+        published_as=("EMFOA-OFT-SLAM",) if name == "emfoa-oft" else (),
         assumptions=(
             "epipolar threshold 1 px and RANSAC (not stated in the paper)",
             "weights and truncations of Eq. 1 (not stated)",
             "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)",
+            "the epipolar test is skipped where F means nothing: too little parallax, one plane (not in the paper)",
+            *(() if "epipolar.min_share" in defaults else OURS),
+            *(() if "motion.enabled" in defaults or not geometry else DEPTH_TESTS),
         ),
     )
 
@@ -111,8 +122,15 @@ AS_PRINTED = {
 
 SPECS = [
     _spec("emfoa-oft", "the paper's system: masks, EMFOA-optimised DAISY Filter Flow, epipolar culling", {}),
-    _spec("emfoa-oft-paper", "as printed: no depth-consistency test, every failing point goes", AS_PRINTED),
+    _spec(
+        "emfoa-oft-paper", "as printed but for the guard against a degenerate F: every failing point goes", AS_PRINTED
+    ),
+    _spec("emfoa-oft-no-depth-test", "ablation: without the tests of depth, which are ours", NO_DEPTH_TEST),
     _spec("emfoa-oft-no-masks", "ablation: geometry alone", {"segmentation.source": "none"}),
+    _spec(
+        "emfoa-oft-no-masks-no-depth-test", "ablation: the guarded epipolar test alone",
+        {"segmentation.source": "none", **NO_DEPTH_TEST},
+    ),
     _spec(
         "emfoa-oft-paper-no-masks", "ablation: the paper's epipolar test alone",
         {"segmentation.source": "none", **AS_PRINTED},
@@ -124,5 +142,9 @@ SPECS = [
     _spec(
         "emfoa-oft-object", "ablation: objects go by the vote of their points, not by class",
         {"epipolar.mode": "object", **NO_DEPTH_TEST}, "build_object_mode",
+    ),
+    _spec(
+        "emfoa-oft-object-depth-test", "ablation: the vote of an object's points, and the tests of depth",
+        {"epipolar.mode": "object"}, "build_object_mode",
     ),
 ]  # fmt: skip

@@ -25,6 +25,7 @@ SPEC = TrackerSpec(
     settings=SemanticSystemSettings,
     summary="drops the features on dilated masks of people; the masks' source is a setting",
     provenance="faithful-code",
+    published_as=("DynaSLAM N",),
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
     assumptions=(SHARED_MASKS,),

@@ -44,6 +44,7 @@ SPEC = TrackerSpec(
     summary="cuts people out of their boxes by depth, detects on every third frame",
     provenance="inspired",
     ranked=False,
+    published_as=("NGD-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Zhang et al., NGD-SLAM, arXiv 2405.07392",
     assumptions=(

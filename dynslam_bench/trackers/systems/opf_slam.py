@@ -38,6 +38,7 @@ SPEC = TrackerSpec(
     summary="Lucas-Kanade flow, fundamental matrix, epipolar test; no semantics",
     provenance="assumed",
     ranked=False,
+    published_as=("OPF-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="unknown: the paper gives no reference",
     assumptions=("everything: the name alone is known",),

@@ -23,6 +23,7 @@ SPEC = TrackerSpec(
     settings=SystemSettings,
     summary="the shared RGB-D back end without dynamic handling: the reference of every ratio",
     provenance="faithful-code",
+    published_as=("ORB-SLAM2",),
     license="MIT (our code; ORB-SLAM2 itself is GPL-3.0 and not used)",
     citation="Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017",
     remarks="the identity filter on our back end, not the ORB-SLAM2 program",

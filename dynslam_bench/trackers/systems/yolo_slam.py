@@ -34,6 +34,7 @@ SPEC = TrackerSpec(
     summary="drops, in a person's box, the largest set of features of like depth",
     provenance="faithful-paper",
     ranked=True,
+    published_as=("YOLO-SLAM",),
     license="MIT (re-implemented from the description)",
     citation="Wu et al., YOLO-SLAM, Neural Computing and Applications 2022",
     assumptions=(
