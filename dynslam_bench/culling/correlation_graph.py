@@ -20,8 +20,6 @@ from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need,
 from .links import link_to_previous
 
 MIN_POINTS = 20
-MIN_COMPONENT = 4
-"""Smaller fragments are noise: they are neither the static body nor an object."""
 _NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 _WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 
@@ -95,15 +93,12 @@ class CorrelationFilter(DynamicFilter):
         graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
         _, label = connected_components(graph, directed=False)
         size = np.bincount(label)
-        bodies = np.flatnonzero(size >= MIN_COMPONENT)
-        if not len(bodies):
-            return np.ones(count, dtype=bool), 0.0
         if self.settings.largest == "count":
-            measure = size[bodies].astype(np.float64)
+            measure = size.astype(np.float64)
         else:
-            measure = np.array([_volume(points[label == body]) for body in bodies])
-        static = bodies[int(np.argmax(measure))]
-        return np.asarray((label == static) | (size[label] < MIN_COMPONENT)), float(len(bodies))
+            measure = np.array([_volume(points[label == body]) for body in range(len(size))])
+        static = int(np.lexsort((size, measure))[-1])  # the one with more points where neither has a volume
+        return np.asarray(label == static), float(len(size))
 
 
 def _follow(past: NDArray[np.float64], link: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -165,6 +160,8 @@ def point_covariance(
 
 
 def _volume(points: NDArray[np.float64]) -> float:
+    if len(points) < 4:
+        return 0.0
     try:
         return float(ConvexHull(points, qhull_options="QJ").volume)
     except QhullError:

@@ -38,6 +38,15 @@ def test_guided_filter_equals_the_direct_reference(shape, radius, epsilon):
     np.testing.assert_allclose(guided_filter(guide, values, radius, epsilon), expected, rtol=1e-3, atol=1.0)
 
 
+def test_guided_filter_without_regularisation_and_with_what_does_not_fit():
+    values = np.random.default_rng(0).random((8, 9)).astype(np.float32)
+    flat = guided_filter(np.full((8, 9), 0.5, np.float32), values, 3, 0.0)
+    assert np.isfinite(flat).all() and flat.min() >= values.min() and flat.max() <= values.max()
+    for wrong in ((values[:4], 3, 0.1), (values, -1, 0.1), (values, 3, -0.1)):
+        with pytest.raises(ValueError, match=r"size|negative"):
+            guided_filter(np.zeros((8, 9), np.float32), *wrong)
+
+
 def test_guided_filter_keeps_constants_and_the_guides_edges():
     guide = np.zeros((40, 40))
     guide[:, 20:] = 1

@@ -136,3 +136,8 @@ def test_refuses_bad_boxes_and_budgets():
         emfoa_minimise(sphere, LOW * np.nan, HIGH, budget=10)
     with pytest.raises(ValueError, match="budget"):
         emfoa_minimise(sphere, LOW, HIGH, budget=0)
+
+
+def test_a_start_that_is_not_finite_is_drawn_instead():
+    found = emfoa_minimise(lambda x: (x**2).sum(axis=-1), [-5, -5], [5, 5], budget=1, start=[[np.nan, np.inf]])
+    assert (np.abs(found.x) <= 5).all()

@@ -11,6 +11,8 @@ import pytest
 
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Parameter, parameters, settings_table
+from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.slam.result import TrackResult
@@ -92,6 +94,45 @@ def test_online_settings_come_into_force_at_once(walking) -> None:
     wider = spec.settings.model_validate({"segmentation": {"source": "oracle", "dilation_px": 60}})
     tracker.update_settings(wider)
     assert tracker.track(walking[1]).stats["mask_fraction"] > 1.2 * before
+
+
+def test_online_segmentation_settings_reach_every_filter(walking) -> None:
+    for spec in SYSTEMS:
+        semantic = issubclass(spec.settings, SemanticSystemSettings)
+        if not semantic or spec.settings().segmentation.source != "auto":
+            continue
+        tracker = build_tracker(
+            spec, {"segmentation.source": "oracle"}, TrackerContext(sequence_id=walking.id, masks=walking.masks)
+        )
+        assert isinstance(tracker, SlamPipeline)
+        changed = spec.settings.model_validate({"segmentation": {"source": "oracle", "confidence": 0.77}})
+        tracker.update_settings(changed)
+        for each in tracker._filters:
+            for held in (getattr(each, "segmentation", None), getattr(each, "settings", None)):
+                if isinstance(held, SegmentationSettings):
+                    assert held.confidence == 0.77, f"{spec.id}: {each.name}"
+
+
+@pytest.mark.parametrize("name", ["sof-slam", "seg-slam"])
+def test_movable_things_reach_the_rule_that_judges_them(name: str, walking) -> None:
+    assert any(result.stats["class_rule_on_movable"] > 0 for result in run(TRACKERS.get(name), walking))
+
+
+def test_a_networks_movable_things_pass_only_where_a_filter_wants_them(walking) -> None:
+    class Network:
+        def segment(self, frame):
+            masks = np.zeros((2, *frame.rgb.shape[:2]), bool)
+            masks[0, 100:200, 100:200] = masks[1, 250:300, 250:300] = True
+            boxes = np.array([[100, 100, 200, 200], [250, 250, 300, 300]], np.float32)
+            return Instances(masks, boxes, ("person", "chair"), np.ones(2, np.float32))
+
+    for name, wanted in (("seg-slam", ("person", "chair")), ("mask-rcnn", ("person",))):
+        tracker = build_tracker(
+            name, {"segmentation.source": "oracle"}, TrackerContext(sequence_id=walking.id, masks=walking.masks)
+        )
+        assert isinstance(tracker, SlamPipeline) and tracker._masks is not None
+        tracker._masks.segmenter.inner = Network()
+        assert tracker._masks.segmenter.segment(walking[0]).class_names == wanted
 
 
 @pytest.mark.parametrize("spec", all_specs(), ids=lambda spec: spec.id)

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.sequences.synthetic import open_synthetic
 from dynslam_bench.trackers import TrackerContext, build_tracker
@@ -85,3 +87,65 @@ def test_a_gap_of_a_second(sequence) -> None:
 def test_black_from_the_beginning_never_initialises_and_raises_nothing(sequence, tmp_path: Path) -> None:
     states, _ = track(sequence, painted(0), bad=range(FRAMES))
     assert "ok" not in states
+
+
+@pytest.mark.parametrize("degrees", [3, 5, 7])
+def test_a_sudden_turn_is_no_translation(sequence, degrees: int) -> None:
+    """From rest, one frame later turned: a chance agreement within the search window must not pass for the pose."""
+    tracker = build_tracker("orb-slam2", {}, TrackerContext(sequence_id=sequence.id))
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    frame, matrix = sequence[5], sequence.camera.matrix
+    for index in range(3):
+        tracker.track(replace(frame, index=index, timestamp=index / 30))
+    rotation = cv2.Rodrigues(np.array([0, np.deg2rad(degrees), 0]))[0]
+    warp, size = matrix @ rotation @ np.linalg.inv(matrix), (sequence.camera.width, sequence.camera.height)
+    turned = Frame(
+        3, 0.1, np.asarray(cv2.warpPerspective(frame.rgb, warp, size), np.uint8),
+        np.asarray(cv2.warpPerspective(frame.depth, warp, size, flags=cv2.INTER_NEAREST), np.float32),
+    )  # fmt: skip
+    result = tracker.track(turned)
+    assert result.state == "lost" or np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02
+
+
+def test_a_gap_of_a_second_is_bridged_or_said(sequence) -> None:
+    tracker = build_tracker("orb-slam2", {}, TrackerContext(sequence_id=sequence.id))
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    truth = sequence.ground_truth.T_world_cam
+    for index in (*range(5), *range(36, 44)):
+        result = tracker.track(sequence[index])
+        if result.state == "ok":
+            assert np.linalg.norm((truth[0] @ result.T_world_cam - truth[index])[:3, 3]) < 0.03
+
+
+def test_frames_of_another_kind_are_refused_in_one_line(sequence) -> None:
+    tracker = build_tracker("emfoa-oft-no-masks", {}, TrackerContext(sequence_id=sequence.id))
+    for method in (tracker.finalize, tracker.map_outputs):
+        with pytest.raises(TrackerError, match=r"before reset\(\)"):
+            method()
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    frame = sequence[0]
+    for wrong, text in (
+        (replace(frame, rgb=frame.rgb / 255.0), r"colour of type float64, not uint8"),
+        (replace(frame, depth=(1000 * frame.depth).astype(np.uint16)), r"depth of type uint16, not float32 in metres"),
+        (replace(frame, depth=None), r"depth of type NoneType"),
+        (replace(frame, timestamp=float("inf")), r"timestamp inf"),
+    ):
+        with pytest.raises(TrackerError, match=text):
+            tracker.track(wrong)
+
+
+def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reused(sequence) -> None:
+    def poses(missing: float, *, reuse: bool) -> bytes:
+        tracker = build_tracker("emfoa-oft-no-masks", {}, TrackerContext(sequence_id=sequence.id))
+        tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+        found, buffer = [], np.empty_like(sequence[0].depth)
+        for index in range(10):
+            frame = sequence[index]
+            depth = np.where(frame.depth > 0, frame.depth, missing).astype(np.float32)
+            buffer[:] = depth
+            found.append(tracker.track(replace(frame, depth=buffer if reuse else depth)).T_world_cam)
+        return np.array(found).tobytes()
+
+    zero = poses(0.0, reuse=False)
+    assert poses(np.inf, reuse=False) == zero and poses(np.nan, reuse=False) == zero
+    assert poses(0.0, reuse=True) == zero

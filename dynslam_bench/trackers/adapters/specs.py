@@ -21,6 +21,7 @@ NEVER_MOVE = TrackerSpec(
     label="never move",
     summary="Control: claims that the camera stands still, on every frame.",
     provenance="control",
+    ranked=False,
     license="MIT",
     remarks="Its error is the spread of the ground truth; a tracker above it is worse than none.",
 )
@@ -32,6 +33,7 @@ CONSTANT_VELOCITY = TrackerSpec(
     settings=ConstantVelocitySettings,
     summary="Control: measures the camera's velocity over the first frames, then only extrapolates it.",
     provenance="control",
+    ranked=False,
     license="MIT",
     remarks="The motion model of a SLAM system without its measurements; drifts without bound.",
 )

@@ -49,7 +49,8 @@ SPEC = TrackerSpec(
     citation="Fan et al., Blitz-SLAM, Pattern Recognition 2022",
     assumptions=(
         SHARED_MASKS,
-        "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated)",
+        "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated), refitted to its inliers",
+        "matches come from Lucas-Kanade flow; with fewer than 20 outside the boxes all kept ones count",
         "which classes are movable (not stated)",
         "the residual removal of its mapping is left out: it does not touch the pose",
     ),

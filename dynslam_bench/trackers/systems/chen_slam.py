@@ -44,7 +44,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Chen et al., Micromachines 13(11) 2006, 2022",
     assumptions=(
-        "epipolar threshold 1 px",
+        "epipolar threshold 1 px; masks grown by 15 px",
         "RGB-D back end (theirs is monocular)",
     ),
 )

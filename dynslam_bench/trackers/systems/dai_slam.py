@@ -41,6 +41,8 @@ SPEC = TrackerSpec(
     citation="Dai et al., RGB-D SLAM in Dynamic Environments Using Point Correlations, TPAMI 2020",
     assumptions=(
         "only the front end's graph, against the observation a window of frames ago",
+        "the static part is the component of the largest volume, as in the back end of the paper",
+        "no Huber step on the correlations; what is not tracked through the window is never judged",
         "chi-square quantile of 0.95 and 1 px per keypoint (not stated)",
     ),
     remarks="its authors' name DSLAM also stands for Decentralised SLAM elsewhere",

@@ -43,7 +43,9 @@ SPEC = TrackerSpec(
     citation="Zhong et al., Detect-SLAM, WACV 2018",
     assumptions=(
         "rate 0.3 and threshold 0.75 (no readable source)",
-        "between keyframes boxes are carried by optical flow",
+        "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection at "
+        "least on every tenth frame",
+        "GrabCut inside boxes is left out",
         "matching point expansion: nearest sure feature within 32 px, with a Gaussian of half that",
     ),
 )

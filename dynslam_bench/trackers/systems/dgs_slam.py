@@ -38,7 +38,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
     assumptions=(
-        "clusters, mixture and priors",
+        "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",
+        "its classes of features with priority in tracking are left out",
         "segmentation on every frame instead of selected ones",
     ),
     remarks="not the Gaussian-splatting DGS-SLAM of Kong et al. 2024",

@@ -51,6 +51,8 @@ SPEC = TrackerSpec(
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
     assumptions=(
         "the published code of SG-SLAM stands in for the epipolar half",
+        "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",
+        "seeds of the multi-view test are grown by 15 px",
         "multi-view depth without growing regions; the guard undoes it before the epipolar verdict",
     ),
 )

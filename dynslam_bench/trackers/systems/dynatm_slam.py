@@ -38,7 +38,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., DynaTM-SLAM, Robotics and Autonomous Systems 174, 2024",
     assumptions=(
-        "patch, window and correlation threshold",
+        "patch, window and correlation threshold; the patch is shifted, not warped",
+        "a feature in a box without depth or history goes with the box",
         "no object constraints in bundle adjustment",
     ),
 )

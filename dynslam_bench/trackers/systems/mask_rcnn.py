@@ -28,5 +28,5 @@ SPEC = TrackerSpec(
     published_as=("DynaSLAM N",),
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
-    assumptions=(SHARED_MASKS,),
+    assumptions=(SHARED_MASKS, "no further drop of features at the border of the grown mask"),
 )

@@ -45,5 +45,8 @@ SPEC = TrackerSpec(
     ranked=False,
     license="MIT (re-implemented from the description)",
     citation="Yao et al., MOR-SLAM, Mathematics 11(19) 4037, 2023",
-    assumptions=("closing of 7 px, depth step 0.1 m, 1 px",),
+    assumptions=(
+        "closing of 7 px, depth step 0.1 m, 1 px",
+        "depth decides within 8 px of a mask's border; holes inside are filled whatever their depth",
+    ),
 )

@@ -50,6 +50,7 @@ SPEC = TrackerSpec(
     assumptions=(
         "detection on every third frame stands in for its asynchronous detector",
         "masks are carried by our sparse flow, not by its clustering of corners",
+        "its tracking of static corners with a PnP of its own between keyframes is left out",
         "a person's depth is the median in the box alone (its code adds a second order statistic)",
         "at most 1,000 of its 1,500 features are used, so that others have as many",
     ),

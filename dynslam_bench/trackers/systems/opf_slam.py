@@ -42,4 +42,5 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="unknown: the paper gives no reference",
     assumptions=("everything: the name alone is known",),
+    remarks="perhaps OFM-SLAM or the optical-flow system of Chen et al. 2022 is meant",
 )

@@ -38,5 +38,9 @@ SPEC = TrackerSpec(
     ranked=False,
     license="MIT (re-implemented from the description)",
     citation="Yang et al., SGC-VSLAM, Sensors 2020",
-    assumptions=("RANSAC 1 px, 0.99; distance 1 px",),
+    assumptions=(
+        "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
+        "with fewer than 20 matches outside the boxes F is fitted to all kept ones",
+        "its improved quadtree of features is left out",
+    ),
 )

@@ -40,6 +40,7 @@ SPEC = TrackerSpec(
     assumptions=(
         "the set grows by the nearest depth first (order not stated)",
         "features of a box without depth go with the person",
+        "RANSAC draws at most 50 pairs for a probability of 0.99; a box with fewer than three depths keeps all",
         "boxes derive from the masks",
         SHARED_MASKS,
     ),
