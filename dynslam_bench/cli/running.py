@@ -121,7 +121,7 @@ def parse_strengths(assignments: Sequence[str]) -> dict[str, float]:
 
 
 def bench(
-    suite: Annotated[str, typer.Argument(help="A suite's name or a TOML file.")],
+    suite: Annotated[str, typer.Argument(help="dynamic, dynamic-full, real, robustness, or a TOML file.")],
     results: Results = Path("results"),
     data_root: DataRoot = None,
     tracker: Annotated[
