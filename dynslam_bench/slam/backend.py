@@ -16,6 +16,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .history import History
+from .keyframes import KeyframeRule
 from .map import Map
 from .mapping import LocalMapper
 from .motion import MotionState, pose_covariance, smooth
@@ -29,11 +30,9 @@ from .tracking import (
     ENOUGH_FIRST,
     Matches,
     Tracked,
-    established,
     local_points,
     match_last_frame,
     match_map,
-    share_in_view,
     solve,
 )
 
@@ -45,8 +44,6 @@ MIN_INITIAL = 60
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
-MIN_KEYFRAME = 15
-"""Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
 
 
 class RgbdBackend:
@@ -80,8 +77,7 @@ class RgbdBackend:
         self._motion: MotionState | None = None
         self._dt = 1.0 / 30.0
         self._reference = -1
-        self._last_keyframe_frame = -1
-        self._peak = 0
+        self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
         self._frame = -1
         self._next_stamp: float | None = None
         self._depth_images: dict[int, NDArray[np.float32]] = {}
@@ -231,7 +227,7 @@ class RgbdBackend:
         near, _ = self.world.covisible_of(points)
         if len(near):
             self._reference = int(near[0])
-        if self._wants_keyframe(tracked):
+        if self._keyframes.wants(self.world, tracked, self._frame, self._reference):
             self._make_keyframe(frame, tracked, timings)
             stats["keyframe"] = 1.0
             if self.settings.bundle_adjustment.enabled:
@@ -284,40 +280,11 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ keyframes
 
-    def _wants_keyframe(self, tracked: Tracked) -> bool:
-        """Whether too little of the map is left in this frame, and the frame has something to add.
-
-        Points that many keyframes observe are what counts: on people who walk by, young points come and go, and a
-        keyframe for each of them would only carry the map along with the people. Where the view itself moves on, the
-        young points count as well.
-        """
-        s = self.settings.keyframes
-        gap = self._frame - self._last_keyframe_frame
-        if gap <= s.min_gap:
-            return False
-        close = (tracked.seen.z > 0) & (tracked.seen.z < self.mapper.close_m)
-        known = tracked.point >= 0
-        tracked_close = int(np.count_nonzero(close & known))
-        new_close = int(np.count_nonzero(close & ~known))
-        inliers = int(np.count_nonzero(known))
-        self._peak = max(self._peak, inliers)
-        if inliers <= MIN_KEYFRAME:
-            return False
-        if tracked_close < s.min_close and new_close > s.new_close:
-            return True
-        if gap >= s.max_gap and new_close > s.new_close:
-            return True
-        if inliers < s.tracked_share * established(self.world, self._reference, s.established):
-            return True
-        view = share_in_view(self.world, int(self.world.keyframes[-1]), tracked.T_cam_world)
-        return view < s.view_share or (view < s.moved_share and inliers < s.tracked_share * self._peak)
-
     def _make_keyframe(self, frame: FrameBundle, tracked: Tracked, timings: dict[str, float]) -> None:
         slot, spent = self.mapper.insert(tracked.seen, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp)
         timings.update(spent)
         self._reference = slot
-        self._last_keyframe_frame = frame.index
-        self._peak = 0
+        self._keyframes.made(frame.index)
         self._views.clear()  # only keyframes change the map
         self._cloud = None
         for dropped, heir, relative in self.mapper.dropped:

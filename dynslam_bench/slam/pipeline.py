@@ -31,6 +31,7 @@ from dynslam_bench.segmentation.instances import Instances
 from dynslam_bench.sequences.frame import Frame
 
 from .backend import RgbdBackend
+from .checks import check_frame, own_depth
 from .outputs import MapOutputs
 from .result import TrackResult
 
@@ -117,7 +118,8 @@ class SlamPipeline:
         Raises:
             TrackerError: `reset` was not called, or the frame's size is not the camera's.
         """
-        camera = self._check(frame)
+        camera = self._begun("track")
+        check_frame(frame, camera)
         clock = _Clock(self._cached)
         with clock("features"):
             bundle = self._extract(frame, camera)
@@ -224,32 +226,10 @@ class SlamPipeline:
             raise TrackerError(f"{method}() was called before reset()")
         return self._camera
 
-    def _check(self, frame: Frame) -> Camera:
-        camera = self._begun("track")
-        for what, image, kind, form in (
-            ("colour", frame.rgb, "u1", "uint8"), ("depth", frame.depth, "f", "float32 in metres")
-        ):  # fmt: skip
-            found = getattr(image, "dtype", None)
-            if found is None or not (found.kind == kind[0] and (kind == "f" or found == np.uint8)):
-                raise TrackerError(
-                    f"frame {frame.index} has {what} of type {found or type(image).__name__}, not {form}"
-                )
-        if not np.isfinite(frame.timestamp):
-            raise TrackerError(f"frame {frame.index} has the timestamp {frame.timestamp}")
-        expected = (camera.height, camera.width)
-        if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
-            raise TrackerError(
-                f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
-                f"the camera is {camera.width}x{camera.height}"
-            )
-        return camera
-
     def _extract(self, frame: Frame, camera: Camera) -> FrameBundle:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         keypoints = self._extractor.extract(gray)
-        depth = np.array(frame.depth, dtype=np.float32)  # kept for the next frames: the caller may reuse its buffer
-        if not np.isfinite(depth).all():
-            depth[~np.isfinite(depth)] = 0
+        depth = own_depth(frame.depth)
         column, row = np.rint(keypoints.xy).astype(np.intp).T
         z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         return FrameBundle(

@@ -172,22 +172,3 @@ def local_points(world: Map, known: Matches, mode: str, limit: int = 80) -> Slot
     near = near[:limit]
     points = np.unique(world.kf_point[near])
     return points[points >= 0].astype(np.int64)
-
-
-def established(world: Map, keyframe: int, observations: int) -> int:
-    """How many of a keyframe's points at least so many keyframes observe (or all there are, in a young map)."""
-    points = world.kf_point[keyframe]
-    points = points[points >= 0]
-    return int(np.count_nonzero(world.n_obs[points] >= min(observations, world.keyframe_count)))
-
-
-def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
-    """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
-    points = world.kf_point[keyframe]
-    local = se3.transform(T_cam_world, world.position[points[points >= 0]])
-    if not len(local):
-        return 1.0
-    ahead = local[:, 2] > 0.05
-    uv = world.camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-    inside = ahead & (uv >= 0).all(axis=1) & (uv[:, 0] < world.camera.width) & (uv[:, 1] < world.camera.height)
-    return float(np.mean(inside))

@@ -125,9 +125,9 @@ def test_frames_of_another_kind_are_refused_in_one_line(sequence) -> None:
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     frame = sequence[0]
     for wrong, text in (
-        (replace(frame, rgb=frame.rgb / 255.0), r"colour of type float64, not uint8"),
-        (replace(frame, depth=(1000 * frame.depth).astype(np.uint16)), r"depth of type uint16, not float32 in metres"),
-        (replace(frame, depth=None), r"depth of type NoneType"),
+        (replace(frame, rgb=frame.rgb / 255.0), r"colour of type float64 .*uint8"),
+        (replace(frame, depth=(1000 * frame.depth).astype(np.uint16)), r"depth of type uint16 .*float32, in metres"),
+        (replace(frame, depth=None), r"depth of type object"),
         (replace(frame, timestamp=float("inf")), r"timestamp inf"),
     ):
         with pytest.raises(TrackerError, match=text):
