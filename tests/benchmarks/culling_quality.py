@@ -139,7 +139,8 @@ def row(label: str, names: list[str], part: tuple[int, int | None], masks: str |
     """One system's row of the table."""
     cv2.setNumThreads(1)
     tracker_id, settings = ROWS.get(label, (label, {}))
-    if masks is not None and hasattr(TRACKERS.get(tracker_id).settings(), "segmentation"):
+    default = getattr(TRACKERS.get(tracker_id).settings(), "segmentation", None)
+    if masks is not None and default is not None and default.source != "none":
         settings = settings | {"segmentation.source": masks}
     counts = Counts()
     runs = [measure(tracker_id, settings, name, part, cache, counts) for name in names]
@@ -157,7 +158,7 @@ def main() -> None:
     parser.add_argument("--sequences", nargs="+", default=SEQUENCES)
     parser.add_argument("--frames", default="0:", help="part of each sequence, A:B")
     parser.add_argument("--only", nargs="+", default=list(ROWS), metavar="ROW", help="rows of the table, or trackers")
-    parser.add_argument("--masks", metavar="SOURCE", help="where all systems have their masks from, e.g. oracle")
+    parser.add_argument("--masks", metavar="SOURCE", help="where systems with masks have them from, e.g. oracle")
     parser.add_argument("--cache", type=Path, help="folder of the stage cache; default: a temporary one")
     parser.add_argument("--jobs", type=int, default=1)
     chosen = parser.parse_args()
