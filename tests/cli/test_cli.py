@@ -172,6 +172,15 @@ def test_trackers_list_and_info(cli):
     assert json.loads(out)["settings"]
 
 
+def test_trackers_info_tells_what_others_report_and_where(cli):
+    reported = json.loads(cli("trackers", "info", "dynaslam", "--json")[1])["reported"]
+    row = next(r for r in reported if r["sequence"] == "tum/fr3/walking_xyz" and r["source"] == "DynaSLAM paper")
+    assert (row["metric"], row["value"]) == ("ate_rmse_m", 0.015)
+    claims = json.loads(cli("trackers", "info", "di-slam", "--json")[1])["reported"]
+    assert claims and all("claimed by the paper" in r["remarks"] for r in claims)
+    assert json.loads(cli("trackers", "info", "never-move", "--json")[1])["reported"] == []
+
+
 def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
     from dynslam_bench.trackers import TRACKERS
 
