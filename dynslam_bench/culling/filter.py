@@ -58,7 +58,7 @@ class KeyframeView:
         xy: float64 ``[N, 2]`` undistorted pixels.
         z: float32 ``[N]`` depth at the keypoints in metres, 0 missing.
         depth: float32 ``[H, W]`` metres, or None where the keyframe no longer keeps its image.
-        timestamp: Seconds; also the keyframe's identity for filters that cache.
+        timestamp: Seconds.
     """
 
     T_world_cam: NDArray[np.float64]

@@ -23,7 +23,7 @@ from .motion import MotionState, pose_covariance, smooth
 from .observation import Observations, observe
 from .outputs import KeyframeRecord, MapOutputs
 from .pose import PoseEstimate
-from .relocalisation import locate
+from .relocalisation import Relocalised, locate
 from .result import TrackResult
 from .settings import BackendSettings
 from .tracking import (
@@ -264,19 +264,25 @@ class RgbdBackend:
             if estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
                 break
         else:
-            rng = stream(self.seed, "relocalisation", self._frame)
-            tries = [[self._reference]] if self.state == "ok" else []
-            tries.append(self.world.keyframes.tolist())
-            for keyframes in tries:
-                found = locate(self.world, keyframes, seen, self.settings.relocalisation, rng, s.min_inliers)
-                least = ENOUGH_FIRST // 2 if best is None else best[1].count + 1
-                if found is not None and found.estimate.count >= least:
-                    stats["relocalised"] = 1.0
-                    best = found.matches, found.estimate
-                    break
+            found = self._from_keyframes(seen, ENOUGH_FIRST // 2 if best is None else best[1].count + 1)
+            if found is not None:
+                stats["relocalised"] = 1.0
+                best = found.matches, found.estimate
         if best is None:
             return None, prediction
         return best[0].select(best[1].inliers), best[1].T_cam_world
+
+    def _from_keyframes(self, seen: Observations, least: int) -> Relocalised | None:
+        """A pose with at least so many inliers by descriptors: from the reference keyframe, else from any."""
+        s = self.settings
+        rng = stream(self.seed, "relocalisation", self._frame)
+        tries = [[self._reference]] if self.state == "ok" else []
+        tries.append(self.world.keyframes.tolist())
+        for keyframes in tries:
+            found = locate(self.world, keyframes, seen, s.relocalisation, rng, s.tracking.min_inliers)
+            if found is not None and found.estimate.count >= least:
+                return found
+        return None
 
     # ------------------------------------------------------------------ keyframes
 

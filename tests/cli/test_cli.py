@@ -7,59 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_errors import one_line
 
-from dynslam_bench.cli.app import expand_lists, start
+from dynslam_bench.cli.app import expand_lists
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.testing import CornerSequence
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared"
 needs_shared = pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")
-
-
-@pytest.fixture
-def cli(capsys, monkeypatch, tmp_path):
-    """Runs the program in an empty folder; returns exit code, output and errors."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as ended:
-            start([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return ended.value.code or 0, captured.out, captured.err
-
-    return call
-
-
-@pytest.fixture(scope="module")
-def walk(tmp_path_factory):
-    """The conformance scene as a folder in TUM layout."""
-    import cv2
-
-    from dynslam_bench.geometry.tum_file import write_tum
-    from dynslam_bench.sequences.cameras import write_camera
-
-    scene, folder = CornerSequence(4), tmp_path_factory.mktemp("data") / "walk"
-    lists = {"rgb": [], "depth": []}
-    for kind in lists:
-        (folder / kind).mkdir(parents=True)
-    for frame in (scene[i] for i in range(len(scene))):
-        images = {"rgb": frame.rgb[..., ::-1], "depth": np.round(frame.depth * 5000).astype(np.uint16)}
-        for kind, image in images.items():
-            cv2.imwrite(str(folder / kind / f"{frame.index}.png"), image)
-            lists[kind].append(f"{frame.timestamp:.6f} {kind}/{frame.index}.png")
-    for kind, lines in lists.items():
-        (folder / f"{kind}.txt").write_text("\n".join(lines))
-    write_tum(folder / "groundtruth.txt", scene.ground_truth)
-    write_camera(folder / "camera.toml", scene.camera, fps=30)
-    return folder
-
-
-def one_line(err):
-    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
-    return err
 
 
 @pytest.mark.parametrize(
@@ -160,68 +115,6 @@ def test_sequences_render(cli, tmp_path):
     code, out, _ = cli("sequences", "render", "synthetic/sitting_static@1?frames=2", "--data-root", tmp_path / "data")
     assert code == 0 and Path(out.strip()).is_relative_to(tmp_path / "data")
     assert len(open_sequence("synthetic/sitting_static@1?frames=2", data_root=tmp_path / "data")) == 2
-
-
-def test_trackers_list_and_info(cli):
-    _, out, _ = cli("trackers", "list", "--json")
-    ids = {each["id"]: each for each in json.loads(out)}
-    assert {"never-move", "orb-slam2", "mask-rcnn", "emfoa-oft", "orbslam3"} <= set(ids)
-    _, out, _ = cli("trackers", "info", "orb-slam2")
-    assert "| setting | default |" in out and "provenance" in out
-    _, out, _ = cli("trackers", "info", "orb-slam2", "--json")
-    assert json.loads(out)["settings"]
-
-
-def test_trackers_info_tells_what_others_report_and_where(cli):
-    reported = json.loads(cli("trackers", "info", "dynaslam", "--json")[1])["reported"]
-    row = next(r for r in reported if r["sequence"] == "tum/fr3/walking_xyz" and r["source"] == "DynaSLAM paper")
-    assert (row["metric"], row["value"]) == ("ate_rmse_m", 0.015)
-    claims = json.loads(cli("trackers", "info", "di-slam", "--json")[1])["reported"]
-    assert claims and all("claimed by the paper" in r["remarks"] for r in claims)
-    assert json.loads(cli("trackers", "info", "never-move", "--json")[1])["reported"] == []
-
-
-def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
-    from dynslam_bench.trackers import TRACKERS
-
-    (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
-    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "broken.py:SPEC")
-    TRACKERS.refresh()
-    try:
-        code, out, _ = cli("trackers", "doctor")
-        assert code == 0 and "broken.py:SPEC" in out and "No module named 'nothing_of_this_name'" in out
-        assert cli("trackers", "list")[0] == 0
-    finally:
-        monkeypatch.undo()
-        TRACKERS.refresh()
-
-
-def test_a_new_tracker_passes_its_checks_and_runs(cli, walk):
-    code, out, _ = cli("trackers", "new", "My SLAM-2")
-    assert code == 0 and Path("my_slam_2.py").is_file() and "trackers test ./my_slam_2.py:SPEC" in out
-    code, out, _ = cli("trackers", "test", "./my_slam_2.py:SPEC", "--frames", "4")
-    assert code == 0, out
-    assert "0 of 16 checks failed" in out
-    code, out, _ = cli("run", "./my_slam_2.py:SPEC", walk, "--set", "features=300", "--json")
-    (row,) = json.loads(out)
-    assert code == 0 and row["status"] == "ok" and row["ate_rmse_m"] < 0.01
-    assert "exists already" in one_line(cli("trackers", "new", "my-slam-2")[2])
-    assert "is no name" in one_line(cli("trackers", "new", "../evil")[2])
-
-
-def test_a_faulty_tracker_fails_with_4(cli, tmp_path):
-    (tmp_path / "faulty.py").write_text(
-        "from dynslam_bench.trackers import TrackerSpec\n"
-        "class Faulty:\n"
-        "    def __init__(self, settings): pass\n"
-        "    def reset(self, camera, *, rng): pass\n"
-        "    def track(self, frame): return None\n"
-        "SPEC = TrackerSpec('faulty', f'{__file__}:Faulty', 'Faulty')\n"
-    )
-    code, out, _ = cli("trackers", "test", "faulty.py:SPEC")
-    assert code == 4 and "gave a NoneType, not a TrackResult" in out
-    code, out, _ = cli("trackers", "test", "faulty.py:SPEC", "--json")
-    assert code == 4 and json.loads(out)["ok"] is False
 
 
 def test_run_show_report_compare_and_remove(cli, walk, tmp_path):

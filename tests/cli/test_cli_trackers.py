@@ -1,0 +1,68 @@
+"""The command line's verbs for trackers: list, info, doctor, new, test."""
+
+import json
+from pathlib import Path
+
+from cli_errors import one_line
+
+
+def test_trackers_list_and_info(cli):
+    _, out, _ = cli("trackers", "list", "--json")
+    ids = {each["id"]: each for each in json.loads(out)}
+    assert {"never-move", "orb-slam2", "mask-rcnn", "emfoa-oft", "orbslam3"} <= set(ids)
+    _, out, _ = cli("trackers", "info", "orb-slam2")
+    assert "| setting | default |" in out and "provenance" in out
+    _, out, _ = cli("trackers", "info", "orb-slam2", "--json")
+    assert json.loads(out)["settings"]
+
+
+def test_trackers_info_tells_what_others_report_and_where(cli):
+    reported = json.loads(cli("trackers", "info", "dynaslam", "--json")[1])["reported"]
+    row = next(r for r in reported if r["sequence"] == "tum/fr3/walking_xyz" and r["source"] == "DynaSLAM paper")
+    assert (row["metric"], row["value"]) == ("ate_rmse_m", 0.015)
+    claims = json.loads(cli("trackers", "info", "di-slam", "--json")[1])["reported"]
+    assert claims and all("claimed by the paper" in r["remarks"] for r in claims)
+    assert json.loads(cli("trackers", "info", "never-move", "--json")[1])["reported"] == []
+
+
+def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
+    from dynslam_bench.trackers import TRACKERS
+
+    (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "broken.py:SPEC")
+    TRACKERS.refresh()
+    try:
+        code, out, _ = cli("trackers", "doctor")
+        assert code == 0 and "broken.py:SPEC" in out and "No module named 'nothing_of_this_name'" in out
+        assert cli("trackers", "list")[0] == 0
+    finally:
+        monkeypatch.undo()
+        TRACKERS.refresh()
+
+
+def test_a_new_tracker_passes_its_checks_and_runs(cli, walk):
+    code, out, _ = cli("trackers", "new", "My SLAM-2")
+    assert code == 0 and Path("my_slam_2.py").is_file() and "trackers test ./my_slam_2.py:SPEC" in out
+    code, out, _ = cli("trackers", "test", "./my_slam_2.py:SPEC", "--frames", "4")
+    assert code == 0, out
+    assert "0 of 16 checks failed" in out
+    code, out, _ = cli("run", "./my_slam_2.py:SPEC", walk, "--set", "features=300", "--json")
+    (row,) = json.loads(out)
+    assert code == 0 and row["status"] == "ok" and row["ate_rmse_m"] < 0.01
+    assert "exists already" in one_line(cli("trackers", "new", "my-slam-2")[2])
+    assert "is no name" in one_line(cli("trackers", "new", "../evil")[2])
+
+
+def test_a_faulty_tracker_fails_with_4(cli, tmp_path):
+    (tmp_path / "faulty.py").write_text(
+        "from dynslam_bench.trackers import TrackerSpec\n"
+        "class Faulty:\n"
+        "    def __init__(self, settings): pass\n"
+        "    def reset(self, camera, *, rng): pass\n"
+        "    def track(self, frame): return None\n"
+        "SPEC = TrackerSpec('faulty', f'{__file__}:Faulty', 'Faulty')\n"
+    )
+    code, out, _ = cli("trackers", "test", "faulty.py:SPEC")
+    assert code == 4 and "gave a NoneType, not a TrackResult" in out
+    code, out, _ = cli("trackers", "test", "faulty.py:SPEC", "--json")
+    assert code == 4 and json.loads(out)["ok"] is False
