@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
-import click
 import pytest
 import typer.main
 
@@ -33,17 +33,15 @@ def documented() -> list[str]:
 @pytest.mark.parametrize("line", documented())
 def test_the_documented_command_parses(line: str) -> None:
     words = expand_lists(shlex.split(line, comments=True)[1:])
-    command: click.Command = typer.main.get_command(app)
-    context = None
-    while isinstance(command, click.Group):
-        name = words.pop(0)
-        found = command.get_command(click.Context(command), name)
-        assert found is not None, f"there is no '{name}'"
-        command = found
+    command: Any = typer.main.get_command(app)
+    while commands := getattr(command, "commands", None):  # a group, of whichever click typer brings
+        name = words.pop(0) if words and words[0] in commands else "make"  # the default verb of `DefaultGroup`
+        assert name in commands, f"there is no '{words[:1]}' below '{command.name}'"
+        command = commands[name]
     context = command.make_context(command.name, words, resilient_parsing=False)
     if command.name == "run" and "tracker" in context.params:
         tracker = context.params["tracker"]
-        assert ":" in tracker or tracker in TRACKERS.ids(), f"no tracker '{tracker}'"
+        assert ":" in tracker or tracker in {found.spec.id for found in TRACKERS.all()}, f"no tracker '{tracker}'"
         for sequence in context.params["sequences"]:
             known = sequence.startswith(("synthetic/", *MADE_UP)) or entry_of(sequence) is not None
             assert known, f"'{sequence}' is no sequence"

@@ -1,0 +1,106 @@
+"""What pages and docstrings name in backticks, and everything that the code knows by a name."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("dynslam_bench", "envs", "tuning", "reports")
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+SUFFIXES = r"(?:py|toml|md|jsonl|json|csv|txt|html|png|mp4|ply|yml|yaml|xz|tex)"
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Mention:
+    """A text in backticks.
+
+    Attributes:
+        where: File and line.
+        text: What stands between the backticks.
+    """
+
+    where: str
+    text: str
+
+
+def sources() -> list[Path]:
+    """All Python files of the package."""
+    return [file for room in ROOMS for file in sorted((ROOT / room).rglob("*.py"))]
+
+
+@cache
+def words() -> frozenset[str]:
+    """Every identifier of the code, and every word of its string constants that are no docstrings."""
+    found: set[str] = set()
+    for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]:
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        texts = {id(node) for node in _docstrings(tree)}
+        for node in ast.walk(tree):
+            found.update(_names_of(node, texts))
+        found.add(file.stem)
+        found.update(file.parent.relative_to(ROOT).parts)
+    data = [file for room in ROOMS for kind in ("toml", "csv") for file in (ROOT / room).rglob(f"*.{kind}")]
+    for file in [*data, ROOT / "pyproject.toml"]:
+        found.update(re.findall(r"[A-Za-z_][A-Za-z0-9_-]*", file.read_text(encoding="utf-8")))
+    return frozenset(found)
+
+
+def _names_of(node: ast.AST, docstrings: set[int]) -> Iterator[str]:
+    match node:
+        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name):
+            yield name
+        case ast.keyword(arg=str(name)):
+            yield name
+        case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+            yield name
+        case ast.Import(names=names) | ast.ImportFrom(names=names):
+            for alias in names:
+                yield from (alias.asname or alias.name).split(".")
+        case ast.Constant(value=str(text)) if id(node) not in docstrings:
+            yield text
+            yield from re.findall(r"[A-Za-z0-9_][A-Za-z0-9_-]*", text)
+
+
+def _docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
+    """The docstrings of a module: of itself, its classes and functions, and those below assignments."""
+    for node in ast.walk(tree):
+        for statement in getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []:
+            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+                if isinstance(statement.value.value, str):
+                    yield statement.value
+
+
+def in_pages() -> Iterator[Mention]:
+    """Inline code of all pages (fenced blocks are commands, which are tested elsewhere, or made-up files)."""
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```", lambda m: "\n" * m.group().count("\n"), page.read_text(), flags=re.S | re.M)
+        for found in re.finditer(r"`([^`\n]+)`", text):
+            line = text.count("\n", 0, found.start()) + 1
+            yield Mention(f"{page.relative_to(ROOT)}:{line}", found.group(1).replace("\\|", "|"))
+
+
+def in_docstrings() -> Iterator[Mention]:
+    """Single and double backticks of all docstrings of the package."""
+    for file in sources():
+        for node in _docstrings(ast.parse(file.read_text(encoding="utf-8"))):
+            for found in re.finditer(r"(`+)([^`\n]+)\1", str(node.value)):
+                yield Mention(f"{file.relative_to(ROOT)}:{node.lineno}", found.group(2))
+
+
+def links() -> Iterator[Mention]:
+    """Targets of relative links in all pages."""
+    for page in PAGES:
+        for found in re.finditer(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+            if "://" not in found.group(1) and not found.group(1).startswith("mailto:"):
+                yield Mention(str(page.relative_to(ROOT)), str((page.parent / found.group(1)).resolve()))
+
+
+def exists(path: str) -> bool:
+    """Whether a path is there, from the root, from the package, or from a room (``culling/epipolar.py``)."""
+    return any((base / path).exists() for base in (ROOT, ROOT / "dynslam_bench", ROOT / "docs", ROOT.parent))

@@ -1,0 +1,120 @@
+"""What the pages and docstrings name exists: files, settings, symbols, options, ids."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import typer.main
+from documented_names import IDENTIFIER, SUFFIXES, Mention, exists, in_docstrings, in_pages, links, words
+
+from dynslam_bench.cli.app import app
+from dynslam_bench.core.settings import field_names
+from dynslam_bench.evaluation import PROTOCOLS
+from dynslam_bench.trackers import TRACKERS
+
+MENTIONS = [*in_pages(), *in_docstrings()]
+OF_USERS = ("results/", "path/", "~/", "videos/")
+"""How paths begin that are made by runs or by the reader."""
+FOREIGN = {
+    "concurrent",
+    "onnx",
+    "ModelProto",
+    "TensorShapeProto",
+    "TypeProto",
+    "GraphProto",
+    "ValueInfoProto",
+    "Dimension",
+}
+"""First parts of names that belong to other libraries and that our code never spells."""
+FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--fixed_delta"}
+"""Options of the help, of pip, and of the TUM benchmark's scripts."""
+POSE = re.compile(r"[TR]_[a-z]+_[a-z]+")
+"""Poses by their frames of reference; the notation, not a variable."""
+
+
+@cache
+def setting_names() -> frozenset[str]:
+    """Dotted names of all settings of all trackers, and of every group of them."""
+    names = {name for found in TRACKERS.all() for name in field_names(found.spec.settings)}
+    return frozenset(names | {name.rpartition(".")[0] for name in names})
+
+
+@cache
+def options() -> frozenset[str]:
+    """Every option of every verb, and those that the benchmark scripts take."""
+    found = set(FOREIGN_OPTIONS)
+    waiting: list[Any] = [typer.main.get_command(app)]
+    while waiting:
+        command = waiting.pop()
+        found.update(name for taken in command.params for name in (*taken.opts, *taken.secondary_opts))
+        waiting += getattr(command, "commands", {}).values()
+    scripts = Path(__file__).resolve().parents[1] / "benchmarks"
+    return frozenset(found.union(*(re.findall(r'"(--[a-z-]+)"', file.read_text()) for file in scripts.glob("*.py"))))
+
+
+def missing(mentions: list[Mention], known: object) -> list[str]:
+    assert mentions, "nothing was looked at"
+    return sorted({f"{mention.where}: {mention.text}" for mention in mentions if not known(mention.text)})  # type: ignore[operator]
+
+
+def test_files_and_folders_exist() -> None:
+    path = re.compile(r"(?:[\w.-]+/)+(?:[\w.-]+\.(?:py|toml|md|jsonl))?")
+    named = [m for m in MENTIONS if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
+    assert not missing(named, lambda text: exists(text) or (text.endswith("/") and text.strip("/") in words()))
+
+
+def test_links_lead_somewhere() -> None:
+    assert not missing(list(links()), lambda text: Path(text).exists())
+
+
+def test_scripts_in_commands_exist() -> None:
+    named = [Mention(m.where, s) for m in MENTIONS for s in re.findall(r"python (tests/[\w/]+\.py)", m.text)]
+    assert not missing(named, exists)
+
+
+def test_settings_exist() -> None:
+    groups = {name.partition(".")[0] for name in setting_names() if "." in name}
+    dotted = re.compile(r"([a-z_]+(?:\.[a-z0-9_]+)+)(?: ?=.*)?")
+    named = [
+        Mention(m.where, found.group(1))
+        for m in MENTIONS
+        if (found := dotted.fullmatch(m.text)) and found.group(1).partition(".")[0] in groups
+        and not re.search(rf"\.{SUFFIXES}$", found.group(1))
+    ]  # fmt: skip
+    assert not missing(named, lambda text: text in setting_names() or _is_symbol(text))
+
+
+def _is_symbol(text: str) -> bool:
+    return exists(text.replace(".", "/") + ".py") or exists(text.rpartition(".")[0].replace(".", "/") + ".py")
+
+
+def test_identifiers_exist() -> None:
+    identifier = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?:\(\))?")
+    named = [Mention(m.where, found.group(1)) for m in MENTIONS if (found := identifier.fullmatch(m.text))]
+    assert not missing(named, lambda text: text in words() or POSE.fullmatch(text) is not None)
+
+
+def test_dotted_symbols_exist() -> None:
+    dotted = re.compile(r"[A-Za-z_][\w]*(?:\.[A-Za-z_]\w*)+(?:\(.*\))?")
+    named = [m for m in MENTIONS if dotted.fullmatch(m.text)]
+    assert not missing(named, lambda text: _is_known(IDENTIFIER.findall(text.partition("(")[0])))
+
+
+def _is_known(parts: list[str]) -> bool:
+    return parts[0] in FOREIGN or all(part in words() for part in parts)
+
+
+def test_options_exist() -> None:
+    named = [Mention(m.where, option) for m in MENTIONS for option in re.findall(r"(?<![\w-])--[a-z][a-z_-]*", m.text)]
+    assert not missing(named, lambda text: text in options())
+
+
+def test_hyphenated_ids_exist() -> None:
+    hyphenated = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+")
+    named = [m for m in MENTIONS if hyphenated.fullmatch(m.text)]
+    assert not missing(
+        named, lambda text: text in words() or text in {found.spec.id for found in TRACKERS.all()} or text in PROTOCOLS
+    )
