@@ -12,6 +12,7 @@ which `dynslam-bench trackers info` shows.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 from pathlib import Path
@@ -31,9 +32,7 @@ TRACKERS_WITH_F = (
     "emfoa-oft", "emfoa-oft-paper", "emfoa-oft-no-masks", "emfoa-oft-paper-no-masks", "opf-slam", "chen-slam",
     "blitz-slam", "mor-slam", "sgc-slam", "di-slam", "ds-slam", "sof-slam", "seg-slam",
 )  # fmt: skip
-HEADER = """# Share of the tracked frames on which no fundamental matrix judged, as tests/benchmarks/epipolar_share.py measured it.
-# Rewritten by its option --write, one row at a time; `dynslam-bench trackers info` shows them.
-"""
+SEQUENCES = ("synthetic/walking_xyz@100", "synthetic/walking_halfsphere@100")
 
 
 def measure(tracker: str, sequence: str, frames: tuple[int, int | None], masks: str, cache: str | None) -> np.ndarray:
@@ -58,33 +57,24 @@ def measure(tracker: str, sequence: str, frames: tuple[int, int | None], masks: 
     )  # fmt: skip
 
 
-def write(path: Path, tracker: str, sequence: str, share: float, frames: int) -> None:
+def write(path: Path, tracker: str, sequence: str, share: float) -> None:
     """Put one share into the table, in place of an older one."""
-    import tomllib
-
-    table = tomllib.loads(path.read_text()) if path.exists() else {}
-    table.setdefault(tracker, {})[sequence] = {"share": round(share, 3), "frames": frames}
-    lines = [HEADER]
-    for name, rows in sorted(table.items()):
-        lines.append(f'["{name}"]')
-        lines += [f'"{key}" = {{ share = {row["share"]}, frames = {row["frames"]} }}' for key, row in rows.items()]
-        lines.append("")
-    path.write_text("\n".join(lines).rstrip() + "\n")
+    table = json.loads(path.read_text()) if path.exists() else {}
+    table.setdefault(tracker, {})[sequence] = round(share, 3)
+    path.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n")
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", nargs="+", default=list(TRACKERS_WITH_F))
-    parser.add_argument(
-        "--sequences", nargs="+", default=["synthetic/walking_xyz@100", "synthetic/walking_halfsphere@100"]
-    )
+    parser.add_argument("--sequences", nargs="+", default=list(SEQUENCES))
     parser.add_argument("--frames", default="0:60")
     parser.add_argument("--offsets", type=int, nargs="+", default=[0])
     parser.add_argument("--masks", default="")
     parser.add_argument("--label", default="", help="name of the sequence in the table, where it is a folder")
     parser.add_argument("--cache")
-    parser.add_argument("--write", type=Path)
+    parser.add_argument("--write", type=Path, metavar="dynslam_bench/trackers/epipolar_skipped.json")
     options = parser.parse_args()
     first, last = (int(part) if part else None for part in options.frames.split(":"))
     print(
@@ -94,12 +84,8 @@ def main() -> None:
     )
     for sequence in options.sequences:
         for tracker in options.only:
-            found = np.array(
-                [
-                    measure(tracker, sequence, ((first or 0) + k, last), options.masks, options.cache)
-                    for k in options.offsets
-                ]
-            )
+            parts = [((first or 0) + offset, last) for offset in options.offsets]
+            found = np.array([measure(tracker, sequence, part, options.masks, options.cache) for part in parts])
             share, ate, coverage, flow, total = found.mean(axis=0)
             each = ", ".join(f"{1000 * value:.1f}" for value in found[:, 1])
             print(
@@ -107,7 +93,7 @@ def main() -> None:
                 f"{100 * coverage:.0f} % | {1000 * flow:.1f} | {1000 * total:.0f} |", flush=True,
             )  # fmt: skip
             if options.write and np.isfinite(share):
-                write(options.write, tracker, options.label or sequence, share, (last or 0) - (first or 0))
+                write(options.write, tracker, f"{options.label or sequence}, frames {options.frames}", share)
 
 
 if __name__ == "__main__":
