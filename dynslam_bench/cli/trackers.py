@@ -66,8 +66,6 @@ def info(
         return
     if skipped:
         facts["epipolar_skipped"] = [f"{100 * share:.0f} % of {where}" for where, share in skipped.items()]
-            f"{100 * share:.0f} % of the frames of {where}" for where, share in skipped.items()
-        ]
     write_fields(facts)
     write()
     write(settings_table(spec.settings).rstrip())
