@@ -49,6 +49,7 @@ ROWS: dict[str, tuple[str, dict[str, object]]] = {
     "emfoa-oft": ("emfoa-oft", {}),
     "emfoa-oft-no-flow": ("emfoa-oft-no-flow", {}),
     "emfoa-oft-paper": ("emfoa-oft-paper", {}),
+    "emfoa-oft-paper-sparse": ("emfoa-oft-paper-sparse", {}),
     "emfoa-oft-no-depth-test": ("emfoa-oft-no-depth-test", {}),
     "emfoa-oft-lk": ("emfoa-oft-lk", {}),
     "emfoa-oft-patchmatch": ("emfoa-oft-patchmatch", {}),
@@ -63,6 +64,7 @@ ROWS: dict[str, tuple[str, dict[str, object]]] = {
     "emfoa-oft-no-masks without free space": ("emfoa-oft-no-masks", {"free_space.enabled": False}),
     "emfoa-oft-no-masks-no-depth-test": ("emfoa-oft-no-masks-no-depth-test", {}),
     "emfoa-oft-paper-no-masks": ("emfoa-oft-paper-no-masks", {}),
+    "emfoa-oft-paper-no-masks, sparse": ("emfoa-oft-paper-no-masks", {"flow.mode": "sparse", "flow.terms": 1}),
     "orb-slam2": ("orb-slam2", {}),
 }
 
