@@ -13,5 +13,5 @@ def epipolar_skipped(tracker: str) -> dict[str, float]:
 
     Written by ``tests/benchmarks/epipolar_share.py --write``; a run's own share is `RunRecord.epipolar_skipped`.
     """
-    table = json.loads((files(__package__) / FILE).read_text(encoding="utf-8"))
+    table = json.loads((files("dynslam_bench.trackers") / FILE).read_text(encoding="utf-8"))
     return {sequence: float(share) for sequence, share in table.get(tracker, {}).items()}

@@ -95,8 +95,10 @@ def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
     """Mask culling, flow and epipolar culling, depth consistency: those of them that the settings have a group for."""
     from dynslam_bench.culling.semantic import SemanticFilter
 
-    masked = isinstance(settings, SemanticSystemSettings)
-    return _with_geometry(settings, context, [SemanticFilter(settings.segmentation)] if masked else [])
+    filters: list[DynamicFilter] = []
+    if isinstance(settings, SemanticSystemSettings):
+        filters.append(SemanticFilter(settings.segmentation))
+    return _with_geometry(settings, context, filters)
 
 
 def build_object_mode(settings: MaskedEpipolarTestSettings, context: TrackerContext) -> SlamPipeline:
