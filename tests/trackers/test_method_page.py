@@ -61,4 +61,6 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch) 
         tracker.reset(sequence.camera, rng=np.random.default_rng(0))
         results = [tracker.track(sequence[index]) for index in range(2)]
         assert results[1].stats["flow_valid"] > 100
+        assert results[1].stats["epipolar_f_asked"] == 1
+        assert terms == 1 or results[1].stats["epipolar_f_judged"] == 1, "the paper knows no guard"
         assert len(calls) == (4 if terms == 3 else 0) and all(calls)  # there and back, two rounds

@@ -75,10 +75,12 @@ class ObjectVoteDepthTestSettings(EmfoaOftSettings):
 
 
 class PaperTestSettings(EpipolarTestSettings):
-    """The paper's flow, dense and with all terms, and its test: every failing point goes."""
+    """The paper's flow, dense and with all terms, and its test: F judges every frame, every failing point goes."""
 
     flow: FlowSettings = FlowSettings(mode="dense", terms=3)
-    epipolar: EpipolarSettings = EpipolarSettings(min_share=0.0, parallax_share=0.0, max_contradiction=1.0)
+    epipolar: EpipolarSettings = EpipolarSettings(
+        min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
+    )
 
 
 class PaperSettings(PaperTestSettings, SemanticSystemSettings):
@@ -126,9 +128,9 @@ WHOSE = (
     "points alone without aggregated costs, the conditions under which the epipolar test may cull, and the tests of "
     "motion and free space in depth"
 )
-SKIPPED = "the epipolar test is skipped where F means nothing: too little parallax, one plane (not in the paper)"
+SKIPPED = "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"
 SENSOR = "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"
-NOT_STATED = ("epipolar threshold 1 px and RANSAC (not stated in the paper)", SENSOR, SKIPPED)
+NOT_STATED = ("epipolar threshold 1 px and RANSAC (not stated in the paper)", SENSOR)
 GUARDS = "a failing point goes only where its neighbours fail too, and an F that depth contradicts is not used (ours)"
 SPARSE = "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; no Eq. 2 and 3 (ours)"
 DENSE = (
@@ -150,7 +152,7 @@ def _assumptions(name: str, settings: type[SystemSettings]) -> tuple[str, ...]:
     if defaults.flow.method == "daisy":
         said += DENSE if defaults.flow.mode == "dense" else [SPARSE]
     if not issubclass(settings, PaperTestSettings):
-        said.append(GUARDS)
+        said += [SKIPPED, GUARDS]
     if issubclass(settings, DepthTestSettings):
         said.append(DEPTH)
     return tuple(said)
