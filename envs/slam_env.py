@@ -178,7 +178,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return self.episode.trajectory()
 
     def final_trajectory(self) -> Trajectory | None:
-        """The tracker's trajectory after loop closing and final optimisation; None if it has no ``finalize``.
+        """The tracker's trajectory after its last optimisation of the map; None if it has no ``finalize``.
 
         Raises:
             TrackerContractError: ``finalize`` returned something else.

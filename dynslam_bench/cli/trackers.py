@@ -49,6 +49,7 @@ def info(
     """Show a tracker's description, its settings and its published numbers."""
     from dynslam_bench.core.settings import flatten, settings_table
     from dynslam_bench.trackers import TRACKERS
+    from dynslam_bench.trackers.measured import epipolar_skipped
 
     spec = TRACKERS.get(tracker)
     numbers = _published(spec)
@@ -59,9 +60,12 @@ def info(
         "install": spec.missing(), "presets": list(spec.presets), "assumptions": list(spec.assumptions),
         "remarks": spec.remarks,
     }  # fmt: skip
+    skipped = epipolar_skipped(spec.id)
     if as_json:
-        write_json({**facts, "settings": flatten(spec.settings()), "reported": numbers})
+        write_json({**facts, "epipolar_skipped": skipped, "settings": flatten(spec.settings()), "reported": numbers})
         return
+    if skipped:
+        facts["epipolar_skipped"] = [f"{100 * share:.0f} % of {where}" for where, share in skipped.items()]
     write_fields(facts)
     write()
     write(settings_table(spec.settings).rstrip())

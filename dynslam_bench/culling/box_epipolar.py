@@ -42,8 +42,10 @@ class BoxEpipolarFilter(DynamicFilter):
         flow = state.flow
         boxes = dynamic_boxes(frame, self.segmentation)
         stats = {"matches": 0.0, "boxes": float(len(boxes)), "failed": 0.0}
+        stats |= {"f_asked": 0.0, "f_judged": 0.0}
         if flow is None or state.previous is None:
             return FilterResult.of(keep, stats)
+        stats["f_asked"] = 1.0
         inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
         before = state.camera.undistort_points(flow.xy)
         fit = flow.valid & state.keep & ~self._left_out(inside, state)
@@ -56,6 +58,7 @@ class BoxEpipolarFilter(DynamicFilter):
             matrix = fundamental_matrix(before[fit], frame.xy[fit], options)
         if matrix is None:
             return FilterResult.of(keep, {**stats, "failed": 1.0})
+        stats["f_judged"] = 1.0
         distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
         limit = np.where(inside[flow.valid], self.settings.inside_px, self.settings.outside_px)
         keep[flow.valid] = distance <= limit

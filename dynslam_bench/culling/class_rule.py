@@ -36,6 +36,7 @@ class ClassRuleFilter(DynamicFilter):
         """Judge by class first, then movable things by geometry."""
         keep = np.ones(len(frame), dtype=bool)
         stats = dict.fromkeys(("on_people", "on_movable", "moving_objects"), 0.0)
+        stats |= {"f_asked": float(state.flow is not None and state.previous is not None), "f_judged": 0.0}
         if frame.instances is None or not len(frame.instances):
             return FilterResult.of(keep, stats)
         people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
@@ -43,6 +44,7 @@ class ClassRuleFilter(DynamicFilter):
         stats["on_people"] = float(np.count_nonzero(~keep))
         movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
         off_line, tested = self._off_line(frame, state, keep & ~inside(movable.union(), frame.keypoints.xy))
+        stats["f_judged"] = float(tested.any())
         for mask in movable.masks:
             on = inside(mask, frame.keypoints.xy) & keep
             stats["on_movable"] += float(np.count_nonzero(on))

@@ -114,7 +114,7 @@ class EpipolarFilter(DynamicFilter):
     F comes from the flow of the points that earlier filters kept; the test covers all points with a valid flow.
     Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``, ``homography_share`` (0 where
     the parallax had decided already), ``contradiction`` (see `contradiction`), ``degenerate`` (1 where the guard
-    skipped the test), ``moving_objects``.
+    skipped the test), ``moving_objects``, ``f_asked`` and ``f_judged`` (see `filter.FilterResult`).
     """
 
     name = "epipolar"
@@ -130,13 +130,17 @@ class EpipolarFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
         stats = dict.fromkeys(
-            ("matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate", "moving_objects"),
+            (
+                "matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate",
+                "moving_objects", "f_asked", "f_judged",
+            ),
             0.0,
-        )
+        )  # fmt: skip
         keep = np.ones(len(frame), dtype=bool)
         flow = state.flow
         if flow is None or state.previous is None:
             return FilterResult.of(keep, stats)
+        stats["f_asked"] = 1.0
         before = state.camera.undistort_points(flow.xy)
         fit = flow.valid & state.keep
         stats["matches"] = float(np.count_nonzero(fit))
@@ -160,6 +164,7 @@ class EpipolarFilter(DynamicFilter):
             stats["contradiction"] = contradiction(frame, state, failing, before)
             if stats["contradiction"] > self.settings.max_contradiction:
                 return FilterResult.of(keep, {**stats, "degenerate": 1.0})
+        stats["f_judged"] = 1.0
         if self.settings.mode == "point":
             moving = coherent(failing, flow.valid, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
             return FilterResult.of(~moving, stats)

@@ -41,11 +41,13 @@ class MovingVoteFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Vote, and drop the points on people if the vote says that they move."""
         keep = np.ones(len(frame), dtype=bool)
-        stats = {"corners": 0.0, "moving": 0.0, "votes": 0.0}
+        stats = dict.fromkeys(("corners", "moving", "votes", "f_judged"), 0.0)
+        stats["f_asked"] = float(state.previous is not None)
         if state.previous is None or frame.instances is None:
             return FilterResult.of(keep, stats)
         people = select(frame.instances, self.segmentation).union()
-        moving, stats["corners"] = self._moving_corners(state.previous.gray, frame.gray, state.camera)
+        moving, stats["corners"], judged = self._moving_corners(state.previous.gray, frame.gray, state.camera)
+        stats["f_judged"] = float(judged)
         stats["moving"] = float(len(moving))
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
         around = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
@@ -57,12 +59,12 @@ class MovingVoteFilter(DynamicFilter):
 
     def _moving_corners(
         self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
-    ) -> tuple[NDArray[np.float32], float]:
-        """Raw pixels ``[M, 2]`` of the corners off their epipolar line in the current image, and how many tracked."""
+    ) -> tuple[NDArray[np.float32], float, bool]:
+        """Raw pixels ``[M, 2]`` of the corners off their line in the current image; how many tracked; whether F was."""
         nothing = np.zeros((0, 2), np.float32)
         corners = cv2.goodFeaturesToTrack(previous, self.settings.corners, 0.01, 8)
         if corners is None or len(corners) < 8:
-            return nothing, 0.0
+            return nothing, 0.0, False
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
         corners = cv2.cornerSubPix(previous, corners, (10, 10), (-1, -1), criteria)
         guess = corners.copy()
@@ -76,16 +78,16 @@ class MovingVoteFilter(DynamicFilter):
         good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
         before, after = before[good], after[good]
         if len(before) < 8:
-            return nothing, float(len(before))
+            return nothing, float(len(before)), False
         first, second = camera.undistort_points(before), camera.undistort_points(after)
         try:
             matrix, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, self.settings.inlier_px, 0.99)
         except cv2.error:
             matrix = None
         if matrix is None or matrix.shape != (3, 3):
-            return nothing, float(len(before))
+            return nothing, float(len(before)), False
         distance = epipolar_distance(np.asarray(matrix, np.float64), first, second)
-        return after[distance > self.settings.threshold_px], float(len(before))
+        return after[distance > self.settings.threshold_px], float(len(before)), True
 
 
 def _patch_difference(

@@ -37,7 +37,11 @@ def build_flow(settings: FlowSettings | None = None, *, device: str = "cpu", thr
 
 
 def build_daisy(settings: FlowSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
-    """Sparse DAISY Filter Flow."""
+    """DAISY Filter Flow, sparse or dense; the dense one on the processor, whatever the device."""
+    if settings.mode == "dense":
+        from .dense_points import DensePointFlow
+
+        return DensePointFlow(settings, threads=threads)
     from .sparse import SparseDaisyFlow
 
     if device != "cpu":

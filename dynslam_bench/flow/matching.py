@@ -79,11 +79,12 @@ def side(maps: OrientationMaps) -> Side:
 
 
 def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
-    """The tables of an image's shape ``(H, W)`` under the settings' weights of Eq. 1."""
+    """The tables of an image's shape ``(H, W)`` under the settings' terms and weights of Eq. 1."""
     height, width = shape[:2]
+    alpha, beta = (settings.intensity_weight, settings.gradient_weight) if settings.terms == 3 else (0.0, 0.0)
     return cost_tables(
-        height, width, settings.truncation, settings.intensity_weight, settings.intensity_limit,
-        settings.gradient_weight, settings.gradient_limit, settings.support, settings.support_spacing_px,
+        height, width, settings.truncation, alpha, settings.intensity_limit, beta, settings.gradient_limit,
+        settings.support, settings.support_spacing_px,
     )  # fmt: skip
 
 

@@ -92,10 +92,7 @@ class SparseDaisyFlow:
         evaluations = state.used.copy()
         n = len(points)
         if settings.refinement != "none":
-            run_stripes(
-                parabola, n, self.threads, self.pool, labels, np.float32(PARABOLA_STEP_PX), described, side(target),
-                tables, evaluations,
-            )  # fmt: skip
+            self.parabola(described, labels, target, tables, evaluations)
         valid = (cost < settings.max_cost * tables.ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
             correlation = self.refine(points, labels, reference, target)
@@ -105,7 +102,7 @@ class SparseDaisyFlow:
         xy = points + labels[:, :2]
         height, width = target.gray.shape
         valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
-        if settings.forward_backward_px > 0 and settings.refinement == "lucas-kanade":
+        if settings.forward_backward_px > 0:
             going = np.flatnonzero(valid)
             back = self._way_back(points[going], xy[going], labels[going], reference, target)
             valid[going] = back <= settings.forward_backward_px
@@ -123,9 +120,13 @@ class SparseDaisyFlow:
         return Reference(points, descriptors, appearance)
 
     def neighbours(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Indices ``[N, K]`` of each point's nearest others; none for searches without propagation."""
+        """Indices ``[N, K]`` of the points whose labels the search exchanges; none for searches without propagation."""
+        return self.nearest(points) if self.settings.search in PROPAGATING else np.empty((len(points), 0), np.int64)
+
+    def nearest(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Indices ``[N, K]`` of each point's nearest others."""
         n = len(points)
-        count = min(MOST_NEIGHBOURS, n - 1) if self.settings.search in PROPAGATING else 0
+        count = min(MOST_NEIGHBOURS, n - 1)
         found = np.empty((n, count), dtype=np.int64)
         if count:
             order = np.argsort(points[:, 0], kind="stable")
@@ -182,6 +183,16 @@ class SparseDaisyFlow:
                 )  # fmt: skip
                 run(number, candidates)
         return state
+
+    def parabola(
+        self, described: Reference, labels: NDArray[np.float32], target: OrientationMaps, tables: CostTables,
+        evaluations: NDArray[np.int64],
+    ) -> None:  # fmt: skip
+        """Move labels in place to the lowest point of a parabola through the costs around them; counts evaluations."""
+        run_stripes(
+            parabola, len(labels), self.threads, self.pool, labels, np.float32(PARABOLA_STEP_PX), described,
+            side(target), tables, evaluations,
+        )  # fmt: skip
 
     def refine(
         self, points: NDArray[np.float32], labels: NDArray[np.float32], reference: OrientationMaps,

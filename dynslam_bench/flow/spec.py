@@ -28,7 +28,7 @@ class FlowSpec:
 BUILT_IN = (
     FlowSpec(
         "daisy", "dynslam_bench.flow.build:build_daisy",
-        "DAISY Filter Flow at sparse points, with an interchangeable label search", "MIT",
+        "DAISY Filter Flow, sparse or dense, with an interchangeable label search", "MIT",
     ),
     FlowSpec(
         "lucas-kanade", "dynslam_bench.flow.build:build_lucas_kanade", "pyramidal Lucas-Kanade (OpenCV)", "Apache-2.0"

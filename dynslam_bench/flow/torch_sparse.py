@@ -41,14 +41,15 @@ class TorchSparseFlow(SparseDaisyFlow):
         threads: For the part on the processor.
 
     Raises:
-        SettingsError: The settings ask for appearance terms, or the device cannot be used.
+        SettingsError: The settings ask for the terms of appearance, or the device cannot be used.
     """
 
     def __init__(self, settings: FlowSettings | None = None, *, device: str = "cpu", threads: int = 1) -> None:
         super().__init__(settings, threads=threads)
-        if self.settings.intensity_weight > 0 or self.settings.gradient_weight > 0:
+        if self.settings.terms != 1:
             raise SettingsError(
-                "intensity_weight and gradient_weight must be 0 on a torch device", "use device='cpu' for these terms"
+                f"flow.terms is {self.settings.terms}: a torch device computes the first term of Eq. 1 only",
+                "flow.terms=1, or device='cpu' for all three",
             )
         try:
             self.device = torch.device(device)

@@ -134,6 +134,7 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         segmentation=resolved.segmentation, n_frames=total, n_processed=len(frames.rows) - dropped, n_tracked=tracked,
         n_lost=frames.count("lost"), n_initialising=frames.count("initialising"), n_dropped=dropped,
         coverage=tracked / total, keyframes=final.get("keyframes"), map_points=final.get("map_points"),
+        epipolar_skipped=frames.epipolar_skipped(),
         mask_iou=frames.mask_iou(), timings=frames.timings(), finalize_s=final.get("finalize_s"), started=started,
         wall_s=wall_s, peak_memory_mb=verdict.peak_memory_mb or None, peak_gpu_memory_mb=final.get("gpu_memory_mb"),
         machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}), versions=versions(),

@@ -79,6 +79,18 @@ class FrameLog:
         overlaps = [overlap for overlap in map(_overlap, self.rows) if overlap is not None]
         return float(np.mean(overlaps)) if overlaps else None
 
+    def epipolar_skipped(self) -> float | None:
+        """Share of the tracked frames on which no fundamental matrix judged, of those with an image to compare with.
+
+        Asks the stats ``*_f_asked`` and ``*_f_judged`` of the filters; None for systems without such a filter.
+        """
+        tracked = [row["stats"] for row in self.rows if row["state"] == "ok"]
+        asked, judged = (
+            sum(any(value for name, value in stats.items() if name.endswith(ending)) for stats in tracked)
+            for ending in ("_f_asked", "_f_judged")
+        )
+        return 1 - judged / asked if asked else None
+
     def write(self, folder: Path, comment: str) -> None:
         """Write `frames.csv` and `trajectory_online.txt`."""
         write_tum(folder / ONLINE_FILE, self.trajectory(), comment=comment)

@@ -105,6 +105,8 @@ class RunRecord(Record):
         coverage: ``n_tracked / n_frames``.
         keyframes: Keyframes at the end, None if the tracker does not say.
         map_points: Map points at the end, None if the tracker does not say.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
             where either is missing.
         timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded.
@@ -150,6 +152,7 @@ class RunRecord(Record):
     coverage: float = 0.0
     keyframes: int | None = None
     map_points: int | None = None
+    epipolar_skipped: float | None = None
     mask_iou: float | None = None
     timings: dict[str, StageTime] = Field(default_factory=dict)
     finalize_s: float | None = None

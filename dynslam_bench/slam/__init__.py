@@ -1,1 +1,1 @@
-"""The back end that all trackers share: map, tracking, local mapping, loop closing, relocalisation."""
+"""The back end that all trackers share: map, tracking, local mapping, relocalisation. It closes no loops."""

@@ -22,7 +22,7 @@ Provenance = Literal["own", "faithful-code", "faithful-paper", "inspired", "assu
 class Tracker(Protocol):
     """A SLAM or odometry system that is fed one frame at a time.
 
-    Optional methods, found by name: ``finalize() -> Trajectory`` (after loop closure and final optimisation),
+    Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last optimisation of the map),
     ``map_outputs() -> slam.outputs.MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``)
     and ``close()``.
     """

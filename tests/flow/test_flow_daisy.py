@@ -154,13 +154,13 @@ def test_right_scale_and_rotation_cost_least():
 def test_appearance_terms_add_truncated_differences():
     flat = np.full((100, 120), 100, np.uint8)
     points, labels = np.array([[50, 50]], np.float32), np.zeros((1, 4), np.float32)
-    weights = {"intensity_weight": 55.0, "intensity_limit": 7 / 255}
+    weights = {"terms": 3, "gradient_weight": 0.0, "intensity_weight": 55.0, "intensity_limit": 7 / 255}
     for step, expected in ((0, 0), (3, 55 * 3 / 255), (7, 55 * 7 / 255), (60, 55 * 7 / 255)):
         cost, _ = compiled_cost(flat, flat + np.uint8(step), points, labels, **weights)
         assert cost[0] == pytest.approx(255 * expected, abs=1)
     ramp = np.tile(np.arange(0, 240, 2, dtype=np.uint8), (100, 1))
     without, _ = compiled_cost(flat, ramp, points, labels)
-    having, _ = compiled_cost(flat, ramp, points, labels, gradient_weight=190.0, gradient_limit=2 / 255)
+    having, _ = compiled_cost(flat, ramp, points, labels, terms=3, intensity_weight=0.0)
     assert having[0] - without[0] == pytest.approx(255 * 190 * 2 / 255, abs=1)
 
 

@@ -108,8 +108,8 @@ def test_finds_what_the_kernels_find():
 def test_says_which_device_is_missing():
     with pytest.raises(SettingsError, match="cannot be used"):
         build_flow(device="cuda:77")
-    with pytest.raises(SettingsError, match="intensity_weight"):
-        TorchSparseFlow(FlowSettings(intensity_weight=1.0))
+    with pytest.raises(SettingsError, match=r"flow\.terms is 3"):
+        TorchSparseFlow(FlowSettings(terms=3))
 
 
 @needs_gpu

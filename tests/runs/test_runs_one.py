@@ -17,6 +17,7 @@ from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_one, score
+from dynslam_bench.runs.frames import FrameLog
 
 
 def leftovers(store: RunStore) -> list[str]:
@@ -220,6 +221,26 @@ def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
     assert record.keyframes >= 1 and record.map_points > 10
     rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
     assert np.mean([float(row["mask_iou"]) for row in rows]) == pytest.approx(record.mask_iou)
+
+
+def test_the_record_says_how_often_the_fundamental_matrix_was_not_used(store: RunStore) -> None:
+    spec = RunSpec(tracker="emfoa-oft", sequence="synthetic/walking_xyz", frames=(0, 5))
+    oracle = {"segmentation.source": "oracle"}
+    never = run_one(spec.model_copy(update={"settings": {**oracle, "epipolar.min_parallax_px": 50.0}}), store)
+    always = run_one(spec.model_copy(update={"tracker": "sof-slam", "settings": oracle}), store)
+    without = run_one(spec.model_copy(update={"tracker": "mask-rcnn", "settings": oracle}), store)
+    assert (never.epipolar_skipped, always.epipolar_skipped, without.epipolar_skipped) == (1.0, 0.0, None)
+    rows = list(csv.DictReader((store.folder(never.run_id) / "frames.csv").open()))
+    assert [float(row["stat_epipolar_f_asked"]) for row in rows] == [0, 1, 1, 1, 1]
+
+
+def test_frames_without_an_image_to_compare_with_do_not_count_as_skipped() -> None:
+    def frame(state: str, asked: float, judged: float) -> dict:
+        return {"state": state, "stats": {"epipolar_f_asked": asked, "epipolar_f_judged": judged, "other": 1.0}}
+
+    log = FrameLog([frame("ok", 0, 0), frame("ok", 1, 1), frame("ok", 1, 0), frame("lost", 1, 0), frame("ok", 1, 0)])
+    assert log.epipolar_skipped() == pytest.approx(2 / 3)
+    assert FrameLog([{"state": "ok", "stats": {"other": 1.0}}]).epipolar_skipped() is None
 
 
 def test_a_fresh_interpreter_does_the_same(store: RunStore, toy_folder: str, monkeypatch, tmp_path: Path) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Parameter, parameters, settings_table
+from dynslam_bench.core.settings import Parameter, Settings, parameters, settings_table
 from dynslam_bench.segmentation.instances import Instances
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -23,6 +25,7 @@ from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, S
 FRAMES = 9
 SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)]
 IDENTITY = {"orb-slam2"}
+QUICK_DENSE = {"flow.dense_budget": 16, "flow.dense_sweeps": 1, "flow.dense_candidates": 2}
 SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
 """Need five keyframes, or a window of frames, before they judge."""
 
@@ -36,14 +39,48 @@ def run(spec: TrackerSpec, sequence, seed: int = 0, **settings: object) -> list[
     semantic = issubclass(spec.settings, SemanticSystemSettings)
     if semantic and spec.settings().segmentation.source == "auto":
         settings.setdefault("segmentation.source", "oracle")
+    if "flow" in spec.settings.model_fields and spec.settings().flow.mode == "dense":
+        settings = QUICK_DENSE | settings
     tracker = build_tracker(spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
     tracker.reset(sequence.camera, rng=np.random.default_rng(seed))
     return [tracker.track(sequence[index]) for index in range(FRAMES)]
 
 
+@contextmanager
+def fields_read() -> Iterator[set[tuple[type, str]]]:
+    """Which fields of which settings classes anything reads meanwhile."""
+    read: set[tuple[type, str]] = set()
+
+    def spy(self: Settings, name: str) -> object:
+        if not name.startswith(("_", "model_")) and name in type(self).model_fields:
+            read.add((type(self), name))
+        return object.__getattribute__(self, name)
+
+    Settings.__getattribute__ = spy  # type: ignore[assignment]
+    try:
+        yield read
+    finally:
+        del Settings.__getattribute__
+
+
+def unread_groups(settings: type[Settings], read: set[tuple[type, str]]) -> list[str]:
+    """The groups of which nobody read a single tunable setting."""
+    seen = dict.fromkeys(settings.model_fields, False)
+    for parameter in parameters(settings):
+        node: object = settings()
+        *groups, leaf = parameter.name.split(".")
+        for group in groups:
+            node = getattr(node, group)
+        seen[groups[0]] |= (type(node), leaf) in read
+    return [group for group, acts in seen.items() if not acts]
+
+
 @pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
 def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) -> None:
-    results = run(spec, walking)
+    with fields_read() as read:
+        results = run(spec, walking)
+    # images are prepared before a tracker sees them, by the environment
+    assert unread_groups(spec.settings, read) in ([], ["preprocessing"]), "groups of settings that nothing consumes"
     assert [result.state for result in results] == ["ok"] * FRAMES
     keys = [set(result.stats) for result in results[2:]]
     assert all(each == keys[0] for each in keys), "the same stats on every frame"
@@ -145,6 +182,26 @@ def test_specs_are_complete(spec: TrackerSpec) -> None:
         assert not spec.ranked and spec.assumptions
     if issubclass(spec.settings, SystemSettings):
         assert spec.citation and ("our back end" in spec.label or "ablation" in spec.label)
+
+
+def test_the_paper_is_ranked_as_the_paper_and_ours_as_ours() -> None:
+    paper, ours, back_end = (TRACKERS.get(name) for name in ("emfoa-oft-paper", "emfoa-oft", "orb-slam2"))
+    assert (paper.provenance, paper.ranked, paper.published_as) == ("faithful-paper", True, ("EMFOA-OFT-SLAM",))
+    assert (ours.provenance, ours.ranked, ours.published_as) == ("own", True, ()) and "own" in ours.label
+    assert back_end.provenance == "own" and "no loop closing" in back_end.assumptions[0]
+    flow = paper.settings().flow
+    assert flow.mode == "dense" and flow.terms == 3 and flow.intensity_weight > 0 < flow.gradient_weight
+    wanted = ("emfoa-oft", "emfoa-oft-no-flow", "emfoa-oft-no-masks", "emfoa-oft-no-depth-test", "emfoa-oft-object")
+    names = {name: {each.name for each in parameters(TRACKERS.get(name).settings)} for name in wanted}
+    groups = {name: {each.split(".")[0] for each in found} for name, found in names.items()}
+    assert not groups["emfoa-oft-no-flow"] & {"flow", "epipolar", "motion", "free_space"}
+    assert "segmentation" not in groups["emfoa-oft-no-masks"]
+    assert not groups["emfoa-oft-no-depth-test"] & {"motion", "free_space"}
+    assert "segmentation.dilation_px" in names["emfoa-oft"] - names["emfoa-oft-object"]
+    for spec in all_specs():
+        assert spec.id == paper.id or "EMFOA-OFT-SLAM" not in spec.published_as
+        if spec.id.startswith("emfoa-oft-") and spec.id != paper.id:
+            assert spec.provenance == "own" and not spec.ranked
 
 
 def test_listing_trackers_loads_nothing_heavy() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
 
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.settings import Settings
@@ -22,10 +24,19 @@ SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Where masks can come from, as `segmentation.source` names it."""
 SHARED_MASKS = "masks come from the stage that all systems share: scores above 0.3, missed detections bridged"
 """An assumption of every system with a semantic source."""
+CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
+"""The paper's improved mask branch, as far as it is there."""
 
 if TYPE_CHECKING:
     from dynslam_bench.culling.filter import DynamicFilter
     from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class ObjectSettings(SegmentationSettings):
+    """Segmentation for systems that look at objects or their boxes: nothing grows or repairs a mask there."""
+
+    dilation_px: Literal[0] = Field(0, description="masks are not grown: objects and boxes count as they were found")
+    repair: Literal["none"] = Field("none", description="masks are not repaired")
 
 
 class SystemSettings(Settings):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.culling.baseline_settings import ResidualSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 class DgsSlamSettings(SemanticSystemSettings):
     """Residual clusters with a semantic prior."""
 
+    segmentation: ObjectSettings = ObjectSettings()
     residual: ResidualSettings = ResidualSettings()
 
 
@@ -38,6 +39,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
     assumptions=(
+        "the warp: every eighth pixel of the frame goes to the nearest one of the previous image by the motion model's "
+        "prediction, before the frame's own pose is known",
         "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",
         "its classes of features with priority in tracking are left out",
         "segmentation on every frame instead of selected ones",

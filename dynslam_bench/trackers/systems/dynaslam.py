@@ -8,17 +8,22 @@ from dynslam_bench.culling.baseline_settings import MultiViewSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SHARED_MASKS, SemanticSystemSettings, compose
+from .composition import SHARED_MASKS, SemanticSystemSettings, SystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.culling.filter import DynamicFilter
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
-class DynaSlamSettings(SemanticSystemSettings):
-    """Masks of nineteen classes and multi-view geometry, constants of the paper."""
+class DynaSlamMasksSettings(SemanticSystemSettings):
+    """Masks of nineteen classes."""
 
     segmentation: SegmentationSettings = SegmentationSettings(classes="dynaslam19")
+
+
+class DynaSlamSettings(DynaSlamMasksSettings):
+    """Masks and multi-view geometry, constants of the paper."""
+
     multiview: MultiViewSettings = MultiViewSettings()
 
 
@@ -28,14 +33,14 @@ class DynaSlamCodeSettings(DynaSlamSettings):
     multiview: MultiViewSettings = MultiViewSettings(tau_m=0.6, order="farthest")
 
 
-class DynaSlamGeometrySettings(DynaSlamSettings):
+class DynaSlamGeometrySettings(SystemSettings):
     """Without semantics."""
 
-    segmentation: SegmentationSettings = SegmentationSettings(source="none")
+    multiview: MultiViewSettings = MultiViewSettings()
 
 
-def build(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """N+G: B1, then B4 and B5; without a semantic source G alone.
+def build(settings: DynaSlamSettings | DynaSlamGeometrySettings, context: TrackerContext) -> SlamPipeline:
+    """N+G: B1, then B4 and B5; without a semantic stage G alone.
 
     The code takes the union of both masks. The paper keeps the geometric mask where both find an object; the union
     stands for both here.
@@ -44,12 +49,12 @@ def build(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
     from dynslam_bench.culling.semantic import SemanticFilter
 
     filters: list[DynamicFilter] = [MultiViewFilter(settings.multiview)]
-    if settings.segmentation.source != "none":
+    if isinstance(settings, SemanticSystemSettings):
         filters.insert(0, SemanticFilter(settings.segmentation))
     return compose(settings, context, filters)
 
 
-def build_masks_only(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
+def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -> SlamPipeline:
     """N: B1 alone."""
     from dynslam_bench.culling.semantic import SemanticFilter
 
@@ -69,7 +74,7 @@ UNION = "the masks of N and G are united, as in the code (the paper keeps G's wh
 def _spec(
     suffix: str,
     variant: str,
-    settings: type[DynaSlamSettings],
+    settings: type[SystemSettings],
     factory: str,
     faithful_code: bool,
     published_as: tuple[str, ...],
@@ -96,6 +101,6 @@ def _spec(
 SPECS = [
     _spec("", "N+G", DynaSlamSettings, "build", False, ("DynaSLAM N+G", "DynaSLAM")),
     _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", True, ("DynaSLAM N+G", "DynaSLAM")),
-    _spec("-n", "N", DynaSlamSettings, "build_masks_only", True, ("DynaSLAM N",)),
+    _spec("-n", "N", DynaSlamMasksSettings, "build_masks_only", True, ("DynaSLAM N",)),
     _spec("-g", "G", DynaSlamGeometrySettings, "build", False, ("DynaSLAM G",)),
 ]

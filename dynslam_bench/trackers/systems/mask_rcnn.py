@@ -1,11 +1,11 @@
-"""Mask R-CNN as a SLAM filter: cull the features on people (DynaSLAM's variant N)."""
+"""Masks of people as the only filter; `dynaslam-n` is the published system with the same rule."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SHARED_MASKS, SemanticSystemSettings, compose
+from .composition import CFPN, SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -24,9 +24,13 @@ SPEC = TrackerSpec(
     label="Mask R-CNN culling (our back end)",
     settings=SemanticSystemSettings,
     summary="drops the features on dilated masks of people; the masks' source is a setting",
-    provenance="faithful-code",
-    published_as=("DynaSLAM N",),
+    provenance="own",
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
-    assumptions=(SHARED_MASKS, "no further drop of features at the border of the grown mask"),
+    assumptions=(
+        SHARED_MASKS,
+        CFPN,
+        "masks of people alone; DynaSLAM, whose rule it is, culls nineteen classes (dynaslam-n)",
+        "no further drop of features at the border of the grown mask",
+    ),
 )

@@ -1,4 +1,7 @@
-"""ORB-SLAM2 (Mur-Artal and Tardos 2017), RGB-D: no dynamic handling beyond RANSAC and the robust kernel."""
+"""The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), RGB-D.
+
+No dynamic handling beyond the robust kernel and the chi-square tests of the pose optimiser.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +22,18 @@ def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
 SPEC = TrackerSpec(
     id="orb-slam2",
     entry_point=f"{__name__}:build",
-    label="ORB-SLAM2 (our back end)",
+    label="ORB-SLAM2 style (our back end)",
     settings=SystemSettings,
     summary="the shared RGB-D back end without dynamic handling: the reference of every ratio",
-    provenance="faithful-code",
+    provenance="own",
     published_as=("ORB-SLAM2",),
     license="MIT (our code; ORB-SLAM2 itself is GPL-3.0 and not used)",
     citation="Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017",
-    remarks="the identity filter on our back end, not the ORB-SLAM2 program",
+    assumptions=(
+        "no loop closing and no global bundle adjustment",
+        "features spread by the cells of a grid, not by a quadtree",
+        "relocalisation and matching without a bag of words",
+        "mapping in step with tracking, in one thread",
+    ),
+    remarks="the identity filter on our own back end, not the ORB-SLAM2 program",
 )
