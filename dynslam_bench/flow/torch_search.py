@@ -163,7 +163,7 @@ def random_phase(state: TorchState, candidates: Tensor, end: int, shrink: float)
     state.evaluate(candidates, end)
     state.widen()
     window, extent = 0.5, state.upper - state.lower
-    while int(state.used.min()) < end:
+    while shrink > 0 and int(state.used.min()) < end:
         draw = state.random(len(state.points), 1, 4)
         if shrink == 1:
             labels = state.lower + extent * draw

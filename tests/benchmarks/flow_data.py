@@ -22,13 +22,19 @@ RECORDINGS = {
 
 @dataclass
 class Pair:
-    """Two images and where points of the first lie in the second."""
+    """Two images and where points of the first lie in the second.
+
+    `guess` is where the motion of the gap before the first image, kept up, takes the points; NaN where depth is missing.
+    `start` is the first image's number in its recording.
+    """
 
     name: str
     reference: np.ndarray
     target: np.ndarray
     points: np.ndarray
     truth: np.ndarray
+    guess: np.ndarray | None = None
+    start: int = 0
 
 
 def corners(gray: np.ndarray, count: int = 1000) -> np.ndarray:
@@ -176,10 +182,13 @@ def _refine_pose(
     return motion, float(np.median(np.linalg.norm(r[good], axis=1))) if good.any() else np.inf
 
 
-def real(name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000) -> list[Pair]:
+def real(
+    name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000, starts: tuple[int, ...] | None = None
+) -> list[Pair]:
     """Pairs of real frames; truth is depth and the relative pose, refined on ORB matches near the raw ground truth.
 
-    Points whose depth in the second image contradicts the prediction (occluded, moved) are left out.
+    Points whose depth in the second image contradicts the prediction (occluded, moved) are left out. The first images
+    are `starts`, or every `every`-th (further apart for wide gaps).
     """
     folder, camera = RECORDINGS[name]
     colour, depth = _stamped(folder, "rgb"), _stamped(folder, "depth")
@@ -194,7 +203,7 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000) ->
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
     pairs = []
     for gap in gaps:
-        for start in range(0, len(frames) - gap, every * max(1, gap // 2)):
+        for start in starts or range(0, len(frames) - gap, every * max(1, gap // 2)):
             (path1, depth1, pose1), (path2, depth2, pose2) = frames[start], frames[start + gap]
             first, second = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in (path1, path2))
             z1, z2 = (cv2.imread(str(p), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000 for p in (depth1, depth2))
@@ -234,7 +243,11 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000) ->
             there = z2[row, column]
             seen &= (there > 0) & (abs(there - moved[:, 2]) < 0.04 * moved[:, 2])
             if seen.sum() >= 50:
-                pairs.append(Pair(f"{name} +{gap}", first, second, points[seen], truth[seen]))
+                guess = None
+                if start >= gap:  # the motion model's: the camera moves on as it did over the gap before
+                    kept_up = space[seen] @ (kept := np.linalg.inv(pose1) @ frames[start - gap][2])[:3, :3].T
+                    guess = camera.distort_points(camera.project(kept_up + kept[:3, 3])).astype(np.float32)
+                pairs.append(Pair(f"{name} +{gap}", first, second, points[seen], truth[seen], guess, start))
     return pairs
 
 
