@@ -32,7 +32,7 @@ def rendered(instance: int, start: int, strides: Sequence[int], count: int, moti
     """
     motion = motion or MOTIONS[instance % len(MOTIONS)]
     sequence = open_sequence(f"synthetic/{motion}@{instance}?frames={start + max(strides) + 1}")
-    frame, camera, poses = sequence[start], sequence.camera, sequence.ground_truth.poses
+    frame, camera, poses = sequence[start], sequence.camera, sequence.ground_truth.T_world_cam
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     points = np.unique(np.rint(corners(gray, count)), axis=0).astype(np.float32)
     column, row = points.astype(int).T
