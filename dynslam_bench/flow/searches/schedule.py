@@ -103,14 +103,13 @@ def phase_runner(
             )  # fmt: skip
 
         return random_phase
-    rules = plan.rules
-    flames = rule_book.flame_counts(plan.population, plan.iterations, rules)
+    table = rule_book.flight_table(plan.population, plan.iterations, plan.rules)
     steps = cauchy_steps(settings)
 
     def moth_flame(number: int, candidates: NDArray[np.float32]) -> None:
         run_stripes(
             moth_flame_phase, count, threads, pool, reference, target, tables, state, candidates, plan.ends[number],
-            number, np.uint64(seed), rules, flames, rule_book.spiral_table(), rule_book.cauchy_table(), steps,
+            number, np.uint64(seed), table, rule_book.spiral_table(), rule_book.cauchy_table(), steps,
         )  # fmt: skip
 
     return moth_flame
