@@ -74,11 +74,11 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         flames = moths[order[: self._population]]
         index = trial.number % self._population
         position = moths[[i for i, each in enumerate(finished) if each.number % self._population == index][-1:] or [-1]]
-        flown = self._fly(position[0], flames, index, min(trial.number, self._n_trials))
+        landed = self._fly(position[0], flames, index, min(trial.number, self._n_trials))
         best = [finished[i] for i in order[: self._population]]
         return {
             name: self._land(value, search_space[name], best[min(index, len(best) - 1)].params[name])
-            for name, value in zip(names, flown, strict=True)
+            for name, value in zip(names, landed, strict=True)
         }
 
     def sample_independent(
