@@ -1,6 +1,6 @@
 """What each part of the label search is worth: every search at equal budgets, with and without a guess, over strides.
 
-    PYTHONPATH=. python tests/benchmarks/flow_share.py [--instances 9] [--starts 40 100] [--budget 64] [--sets ...]
+    PYTHONPATH=. python tests/benchmarks/flow_share.py [--instances 12] [--starts 40 100] [--budget 64] [--sets ...]
 
 Every row uses the default settings but for the search (and the budget). A cell is the share of all points, valid or
 not, within `--within` pixels of the truth: mean +- standard deviation over the units; then the mean paired difference
@@ -97,14 +97,14 @@ def rendered_sets(instances: int, starts: Sequence[int], strides: Sequence[int],
     return columns
 
 
-def recorded_sets(names: Sequence[str], points: int) -> dict[str, Units]:
+def recorded_sets(names: Sequence[str], points: int, every: int) -> dict[str, Units]:
     """First images of recordings by stride."""
     lengths = {"fr1_xyz": 100, "fr1_rpy": 40, "bonn": 180}
     columns: dict[str, Units] = {}
     for stride in STRIDES:
         units = columns.setdefault(f"stride {stride}", {})
         for name in names:
-            starts = tuple(range(stride, lengths[name] - stride - 3, 6))
+            starts = tuple(range(stride, lengths[name] - stride - 3, every))
             for pair in real(name, (stride,), limit=points, starts=starts):
                 units[f"{name} {pair.start}"] = [pair]
     return columns
@@ -113,11 +113,12 @@ def recorded_sets(names: Sequence[str], points: int) -> dict[str, Units]:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--instances", type=int, default=9)
+    parser.add_argument("--instances", type=int, default=12)
     parser.add_argument("--starts", type=int, nargs="+", default=[40, 100])
+    parser.add_argument("--every", type=int, default=10, help="first images of recordings are so many frames apart")
     parser.add_argument("--points", type=int, default=400)
     parser.add_argument("--budget", type=int, default=FlowSettings().budget)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--within", type=float, default=3.0)
     parser.add_argument("--sets", nargs="+", default=["rendered", "fr1", "bonn", "kitti"])
     options = parser.parse_args()
@@ -127,9 +128,9 @@ def main() -> None:
     if "rendered" in options.sets:
         sets["Rendered"] = rendered_sets(options.instances, options.starts, STRIDES, options.points)
     if "fr1" in options.sets:
-        sets["TUM fr1_xyz, fr1_rpy"] = recorded_sets(("fr1_xyz", "fr1_rpy"), options.points)
+        sets["TUM fr1_xyz, fr1_rpy"] = recorded_sets(("fr1_xyz", "fr1_rpy"), options.points, options.every)
     if "bonn" in options.sets:
-        sets["Bonn crowd, static points"] = recorded_sets(("bonn",), options.points)
+        sets["Bonn crowd, static points"] = recorded_sets(("bonn",), options.points, options.every)
     for title, columns in sets.items():
         table(f"{title}, guess given", rows, columns, True, options)
         table(f"{title}, no guess", rows, columns, False, options)
