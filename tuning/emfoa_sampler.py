@@ -14,7 +14,11 @@ from optuna.study import Study
 from optuna.study._study_direction import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
+from dynslam_bench.flow.searches.rules import EMFOA, flames_left, flight, flown, opposites
+
 Array = NDArray[np.float64]
+CAUCHY_SHARE = 0.05
+"""Scale of the Cauchy steps of Eq. 13, as a share of the unit interval."""
 
 
 class EmfoaSampler(optuna.samplers.BaseSampler):
@@ -69,13 +73,12 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         order = np.argsort([each[0] for each in _ranked(study, finished)], kind="stable")
         flames = moths[order[: self._population]]
         index = trial.number % self._population
-        progress = min(trial.number / self._n_trials, 1.0)
         position = moths[[i for i, each in enumerate(finished) if each.number % self._population == index][-1:] or [-1]]
-        flown = self._fly(position[0], flames, index, progress)
+        landed = self._fly(position[0], flames, index, min(trial.number, self._n_trials))
         best = [finished[i] for i in order[: self._population]]
         return {
             name: self._land(value, search_space[name], best[min(index, len(best) - 1)].params[name])
-            for name, value in zip(names, flown, strict=True)
+            for name, value in zip(names, landed, strict=True)
         }
 
     def sample_independent(
@@ -91,25 +94,14 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         if len(finished) >= self._population // 2:
             members = np.array([[_to_unit(each.params[n], space[n]) for n in names] for each in finished])
             low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
-            opposite = self._rng.random() * (low + high) - members[len(finished) % len(members)]  # Eq. 19
-            outside = (opposite < low) | (opposite > high)
-            unit = np.where(outside, low + (high - low) * self._rng.random(len(names)), opposite)  # Eq. 21-22
+            unit = opposites(np, members[len(finished) % len(members)], low, high, low, high, self._rng.random)
         return {name: _from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
 
-    def _fly(self, moth: Array, flames: Array, index: int, progress: float) -> Array:
-        count = round(self._population - progress * (self._population - 1))  # Eq. 11
-        flame = flames[min(index, count - 1)]
-        r = -1.0 - progress  # Eq. 9
-        t = (r - 1.0) * self._rng.random(len(moth)) + 1.0  # Eq. 10
-        distance = np.abs(flames[index] - moth)
-        target = flame
-        if progress > 0.5:
-            a = 0.6 - 0.4 * progress  # Eq. 18
-            target = a * flame + (1 - a) * flames[0]  # Eq. 17, as a convex combination
-        flown = distance * np.exp(t) * np.cos(2 * np.pi * t) + target  # Eq. 12
-        if progress <= 0.5:
-            flown = flown + 0.05 * np.tan(np.pi * (self._rng.random(len(moth)) - 0.5))  # Eq. 13, 16
-        return np.asarray(flown)
+    def _fly(self, moth: Array, flames: Array, index: int, trial: int) -> Array:
+        """Where the moth of that index lands in a trial of the budget; `flames` best first."""
+        left = flames_left(self._population, trial, self._n_trials)
+        around, now = flames[min(index, left - 1)], flight(trial / self._n_trials, EMFOA)
+        return np.asarray(flown(np, moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random))
 
     def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
         if isinstance(distribution, CategoricalDistribution):

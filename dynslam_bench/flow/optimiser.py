@@ -1,7 +1,8 @@
 """The enhanced moth-flame optimiser over a box, batched over many independent problems (numpy).
 
-The same algorithm as the label search (Eq. 4-22, corrected Algorithm 1), for any function; `searches.moth_flame` is its
-compiled form for matching costs. Fitness is evaluated for whole populations of all problems at once.
+The same algorithm as the label search (Eq. 4-22, corrected Algorithm 1), for any function, and the same equations
+(`searches.rules`); `searches.moth_flame` is its compiled form for matching costs. Fitness is evaluated for whole
+populations of all problems at once.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .searches.rules import EMFOA, MothFlameRules, flame_counts
+from .searches.rules import EMFOA, MothFlameRules, flame_counts, flight, flown, opposites
 
 Floats = NDArray[np.float64]
 CAUCHY_SHARE = 0.01
@@ -63,16 +64,16 @@ def emfoa_minimise(
     Raises:
         ValueError: The bounds are not finite or crossed, or the budget is not positive.
     """
-    least: Floats = np.atleast_2d(np.asarray(lower, dtype=np.float64))
-    most: Floats = np.atleast_2d(np.asarray(upper, dtype=np.float64))
-    least, most = least + np.zeros_like(most), most + np.zeros_like(least)
-    if not (np.isfinite(least).all() and np.isfinite(most).all() and (least <= most).all()):
+    low: Floats = np.atleast_2d(np.asarray(lower, dtype=np.float64))
+    high: Floats = np.atleast_2d(np.asarray(upper, dtype=np.float64))
+    low, high = low + np.zeros_like(high), high + np.zeros_like(low)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
         raise ValueError("bounds must be finite, and lower <= upper")
     if budget < 1:
         raise ValueError(f"budget must be positive, got {budget}")
-    problems, dimensions = least.shape
+    problems, dimensions = low.shape
     rng = np.random.default_rng(seed)
-    low, high = least[:, None], most[:, None]
+    low, high = low[:, None], high[:, None]
     scale = CAUCHY_SHARE * (high - low) if steps is None else np.atleast_2d(steps)[:, None]
     population = max(1, min(population, budget))
     moths = low + (high - low) * rng.random((problems, population, dimensions))
@@ -103,43 +104,14 @@ def emfoa_minimise(
 
     evaluate(moths)
     if rules.opposition and spent < budget:
-        moths_opposite = _opposites(moths, low, high, rng)
-        evaluate(moths_opposite)
+        least, greatest = moths.min(axis=1, keepdims=True), moths.max(axis=1, keepdims=True)  # Eq. 20
+        evaluate(opposites(np, moths, least, greatest, low, high, rng.random))
         moths = flames.copy()  # the best N of X and its opposites
     iterations = -(-(budget - spent) // population)
     counts = flame_counts(population, iterations, rules)
     for iteration in range(1, iterations + 1):
-        moths = np.clip(_fly(moths, flames, iteration, iterations, counts, scale, rules, rng), low, high)
+        around = flames[:, np.minimum(np.arange(population), counts[iteration - 1] - 1)]  # Eq. 8, 11
+        now = flight(iteration / iterations, rules)
+        moths = np.clip(flown(np, moths, flames, around, flames[:, :1], now, scale, rng.random), low, high)
         evaluate(moths)
     return Minimum(flames[:, 0], values[:, 0], spent, np.asarray(history))
-
-
-def _opposites(moths: Floats, low: Floats, high: Floats, rng: np.random.Generator) -> Floats:
-    """Elite opposition-based learning (Eq. 19-22) with the population's dynamic bounds."""
-    least, greatest = moths.min(axis=1, keepdims=True), moths.max(axis=1, keepdims=True)
-    factor = rng.random((*moths.shape[:2], 1))
-    opposite = factor * (least + greatest) - moths
-    outside = (opposite < low) | (opposite > high)
-    return np.where(outside, low + (high - low) * rng.random(moths.shape), opposite)
-
-
-def _fly(
-    moths: Floats, flames: Floats, iteration: int, iterations: int, counts: NDArray[np.int64], scale: Floats,
-    rules: MothFlameRules, rng: np.random.Generator,
-) -> Floats:  # fmt: skip
-    """Move every moth once (Eq. 8-18)."""
-    progress = iteration / iterations
-    r = 1 + progress if rules.as_printed else -1 - progress  # Eq. 9
-    t = (r - 1) * rng.random(moths.shape) + 1  # Eq. 10
-    index = np.minimum(np.arange(moths.shape[1]), counts[iteration - 1] - 1)  # Eq. 8, 11
-    goal = flames[:, index]
-    first_half = 2 * iteration <= iterations
-    if rules.best_flame and not first_half:
-        a = 0.6 - 0.4 * progress  # Eq. 18
-        goal = a * goal + (1 - a) * flames[:, :1]  # Eq. 17
-        if rules.half:
-            goal = goal / 2
-    position = np.abs(flames - moths) * np.exp(t) * np.cos(2 * np.pi * t) + goal  # Eq. 8 with b = 1
-    if rules.cauchy and first_half:
-        position = position + np.tan(np.pi * (rng.random(moths.shape) - 0.5)) * scale  # Eq. 13-16
-    return np.asarray(position, dtype=np.float64)

@@ -9,8 +9,16 @@ from pydantic import Field
 from dynslam_bench.core.settings import Scalar, Settings, tunable
 
 _DAISY = {"method": ["daisy"]}
-_EMFOA = {"method": ["daisy"], "search": ["emfoa+propagation", "emfoa", "emfoa-literal"]}
-_PROPAGATING = {"method": ["daisy"], "search": ["emfoa+propagation", "patchmatch"]}
+_EMFOA = {
+    "method": ["daisy"],
+    "search": ["emfoa+propagation", "emfoa-literal+propagation", "emfoa", "emfoa-literal"],
+}
+_PROPAGATING = {
+    "method": ["daisy"],
+    "search": [
+        "emfoa+propagation", "emfoa-literal+propagation", "patchmatch", "random+propagation", "none+propagation",
+    ],
+}  # fmt: skip
 _LUCAS_KANADE = {"method": ["lucas-kanade"]}
 _REFINED = {"method": ["daisy"], "refinement": ["lucas-kanade"]}
 _MOTHS = {"method": ["daisy"], "search": [*_EMFOA["search"], "mfo"]}
@@ -18,7 +26,10 @@ _SPARSE = {"method": ["daisy"], "mode": ["sparse"]}
 _DENSE = {"method": ["daisy"], "mode": ["dense"]}
 _THREE_TERMS: dict[str, list[Scalar]] = {"method": ["daisy"], "terms": [3]}
 
-SearchName = Literal["emfoa+propagation", "emfoa", "mfo", "emfoa-literal", "patchmatch", "random"]
+SearchName = Literal[
+    "emfoa+propagation", "emfoa-literal+propagation", "patchmatch", "random+propagation", "none+propagation",
+    "emfoa", "mfo", "emfoa-literal", "random",
+]  # fmt: skip
 
 
 class FlowSettings(Settings):
@@ -42,8 +53,8 @@ class FlowSettings(Settings):
     search: SearchName = tunable(
         "emfoa+propagation",
         when=_DAISY,
-        meaning="label search: enhanced moth-flame with or without propagation, plain moth-flame, the paper's "
-        "equations as printed, PatchMatch, or uniform random",
+        meaning="label search: enhanced moth-flame, its equations as printed, PatchMatch, random or none (only labels "
+        "known beforehand), with neighbours exchanging labels; or moth-flame and random without that",
     )
     budget: int = tunable(
         64, low=24, high=384, limits=(8, 4096), scale="log", online=True, when=_SPARSE,

@@ -164,7 +164,7 @@ class SparseDaisyFlow:
         state = new_state(n, plan.population, lower, upper, tables.ceiling)
         state.flames[:, :] = start
         run = self._runner(plan, described, reference, target, tables, state, seed)
-        run(0, start)
+        run(0, start if plan.shrink > 0 else _with_zero_flow(start))
         if settings.search in PROPAGATING:
             neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
             motions = np.full((2, 4), np.nan, dtype=np.float32)
@@ -265,6 +265,13 @@ class SparseDaisyFlow:
         )  # fmt: skip
         distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
         return distance
+
+
+def _with_zero_flow(start: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Start labels ``[N, 1, 4]`` and, where they are no zero flow, that too: ``[N, 2, 4]``, NaN means none."""
+    zero = np.zeros_like(start)
+    zero[~start.any(axis=2)] = np.nan
+    return np.concatenate([start, zero], axis=1)
 
 
 def _scatter(inner: FlowResult, points: NDArray[np.float32], usable: NDArray[np.bool_]) -> FlowResult:

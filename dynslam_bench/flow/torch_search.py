@@ -15,7 +15,7 @@ from torch import Tensor
 
 from . import layout
 from .matching import OUTSIDE, CostTables
-from .searches.rules import MothFlameRules, flame_counts
+from .searches.rules import MothFlameRules, flame_counts, flight, flown, opposites
 
 
 class TorchTables(NamedTuple):
@@ -133,7 +133,7 @@ class TorchState:
         self.used = torch.zeros(count, dtype=torch.int64, device=device)
         self._generator = torch.Generator().manual_seed(seed % 2**63)
 
-    def random(self, *shape: int) -> Tensor:
+    def random(self, shape: tuple[int, ...]) -> Tensor:
         """Uniform float32 in [0, 1), equal on all devices."""
         return torch.rand(shape, generator=self._generator).to(self.points.device)
 
@@ -163,8 +163,8 @@ def random_phase(state: TorchState, candidates: Tensor, end: int, shrink: float)
     state.evaluate(candidates, end)
     state.widen()
     window, extent = 0.5, state.upper - state.lower
-    while int(state.used.min()) < end:
-        draw = state.random(len(state.points), 1, 4)
+    while shrink > 0 and int(state.used.min()) < end:
+        draw = state.random((len(state.points), 1, 4))
         if shrink == 1:
             labels = state.lower + extent * draw
         else:
@@ -187,34 +187,20 @@ def moth_flame_phase(
     state.widen()
     if phase == 0:
         placed = min(candidates.shape[1], population)
-        state.moths = state.lower + (state.upper - state.lower) * state.random(count, population, 4)
+        state.moths = state.lower + (state.upper - state.lower) * state.random((count, population, 4))
         state.evaluate(state.moths[:, placed:], end)
         known = candidates[:, :placed].isfinite().all(-1, keepdim=True)
         state.moths[:, :placed] = torch.where(known, candidates[:, :placed], state.moths[:, :placed])
         if rules.opposition:
-            low, high = state.moths.amin(1, keepdim=True), state.moths.amax(1, keepdim=True)  # Eq. 20
-            opposite = state.random(count, population, 1) * (low + high) - state.moths  # Eq. 19
-            anew = state.lower + (state.upper - state.lower) * state.random(count, population, 4)
-            outside = (opposite < state.lower) | (opposite > state.upper)
-            state.evaluate(torch.where(outside, anew, opposite), end)  # Eq. 21-22
+            least, greatest = state.moths.amin(1, keepdim=True), state.moths.amax(1, keepdim=True)  # Eq. 20
+            state.evaluate(opposites(torch, state.moths, least, greatest, state.lower, state.upper, state.random), end)
             state.moths = torch.where((state.costs < state.tables.ceiling)[..., None], state.flames, state.moths)
     founding = population * (2 if rules.opposition else 1)
     scale = torch.as_tensor(steps, device=device)
     while int(state.used.min()) < end:
         iteration = min(max((int(state.used.min()) - founding) // population, 0), iterations - 1)
-        progress = (iteration + 1) / iterations
-        r = 1 + progress if rules.as_printed else -1 - progress  # Eq. 9
-        t = (r - 1) * state.random(count, population, 4) + 1  # Eq. 10
-        index = torch.arange(population, device=device).clamp(max=int(counts[iteration]) - 1)  # Eq. 8, 11
-        goal = state.flames[:, index]
-        first_half = 2 * (iteration + 1) <= iterations
-        if rules.best_flame and not first_half:
-            a = 0.6 - 0.4 * progress  # Eq. 18
-            goal = a * goal + (1 - a) * state.flames[:, :1]  # Eq. 17
-            if rules.half:
-                goal = goal / 2
-        position = (state.flames - state.moths).abs() * t.exp() * (2 * np.pi * t).cos() + goal
-        if rules.cauchy and first_half:
-            position = position + (np.pi * (state.random(count, population, 4) - 0.5)).tan() * scale  # Eq. 13-16
+        flames = state.flames[:, torch.arange(population, device=device).clamp(max=int(counts[iteration]) - 1)]  # Eq. 8
+        now = flight((iteration + 1) / iterations, rules)
+        position = flown(torch, state.moths, state.flames, flames, state.flames[:, :1], now, scale, state.random)
         state.moths = position.maximum(state.lower).minimum(state.upper)
         state.evaluate(state.moths, end)

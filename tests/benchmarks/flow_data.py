@@ -22,13 +22,19 @@ RECORDINGS = {
 
 @dataclass
 class Pair:
-    """Two images and where points of the first lie in the second."""
+    """Two images and where points of the first lie in the second.
+
+    `guess` is where the motion over the gap before the first image, kept up, takes the points; NaN without depth.
+    `start` is the first image's number in its recording.
+    """
 
     name: str
     reference: np.ndarray
     target: np.ndarray
     points: np.ndarray
     truth: np.ndarray
+    guess: np.ndarray | None = None
+    start: int = 0
 
 
 def corners(gray: np.ndarray, count: int = 1000) -> np.ndarray:
@@ -176,12 +182,17 @@ def _refine_pose(
     return motion, float(np.median(np.linalg.norm(r[good], axis=1))) if good.any() else np.inf
 
 
-def real(name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000) -> list[Pair]:
-    """Pairs of real frames; truth is depth and the relative pose, refined on ORB matches near the raw ground truth.
+@dataclass
+class _Shot:
+    """A recorded frame: grey image, depth in metres, pose of the motion capture."""
 
-    Points whose depth in the second image contradicts the prediction (occluded, moved) are left out.
-    """
-    folder, camera = RECORDINGS[name]
+    gray: np.ndarray
+    depth: np.ndarray
+    pose: np.ndarray
+
+
+def _shots(folder: Path) -> list[tuple[Path, Path, np.ndarray]]:
+    """Colour image, depth image and pose of every frame that has all three."""
     colour, depth = _stamped(folder, "rgb"), _stamped(folder, "depth")
     stamps, poses = _poses(folder)
     depth_stamps = np.array([stamp for stamp, _ in depth])
@@ -190,51 +201,82 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000) ->
         near, pose = int(np.argmin(abs(depth_stamps - stamp))), int(np.argmin(abs(stamps - stamp)))
         if abs(depth_stamps[near] - stamp) < 0.02 and abs(stamps[pose] - stamp) < 0.02:
             frames.append((path, depth[near][1], poses[pose]))
+    return frames
+
+
+def _read(frame: tuple[Path, Path, np.ndarray]) -> _Shot:
+    gray = cv2.imread(str(frame[0]), cv2.IMREAD_GRAYSCALE)
+    return _Shot(gray, cv2.imread(str(frame[1]), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000, frame[2])
+
+
+def _lift(xy: np.ndarray, z: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Points in space (metres, camera frame), and whether the depth around them is known and smooth."""
+    column, row = np.rint(xy).astype(int).T
+    offsets = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    patch = np.stack([z[np.clip(row + dy, 0, 479), np.clip(column + dx, 0, 639)] for dy, dx in offsets])
+    smooth = (patch.min(0) > 0.2) & (patch.max(0) - patch.min(0) < 0.03 * patch.max(0))
+    return camera.unproject(camera.undistort_points(xy), z[row, column]), smooth
+
+
+def _motion(first: _Shot, second: _Shot, camera: Camera) -> np.ndarray | None:
+    """``T_second_first`` of the camera: the ground truth's, refined on ORB matches; None where these contradict it."""
     orb = cv2.ORB.create(2000, fastThreshold=7)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    (k1, d1), (k2, d2) = (orb.detectAndCompute(shot.gray, None) for shot in (first, second))
+    if d1 is None or d2 is None:
+        return None
+    found = [m for m in cv2.BFMatcher(cv2.NORM_HAMMING).match(d1, d2) if m.distance < 50]
+    xy1 = np.array([k1[m.queryIdx].pt for m in found], np.float32).reshape(-1, 2)
+    xy2 = np.array([k2[m.trainIdx].pt for m in found], np.float32).reshape(-1, 2)
+    if len(xy1) < 50:
+        return None
+    space, smooth = _lift(xy1, first.depth, camera)
+    observed = camera.undistort_points(xy2)[smooth]
+    motion, residual = _refine_pose(np.linalg.inv(second.pose) @ first.pose, space[smooth], observed, camera)
+    return motion if residual < 1.0 else None
+
+
+def real(
+    name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000, starts: tuple[int, ...] = ()
+) -> list[Pair]:
+    """Pairs of real frames; truth is depth and the relative pose, refined on ORB matches near the raw ground truth.
+
+    Points whose depth in the second image contradicts the prediction (occluded, moved) are left out.
+
+    Args:
+        name: Of `RECORDINGS`.
+        gaps: Frames between the two images.
+        every: First images are this far apart, further for wide gaps.
+        limit: Points a frame.
+        starts: First images, in place of `every`; then pairs also carry the motion model's guess, and those without
+            a known motion before are left out.
+    """
+    folder, camera = RECORDINGS[name]
+    frames = _shots(folder)
     pairs = []
     for gap in gaps:
-        for start in range(0, len(frames) - gap, every * max(1, gap // 2)):
-            (path1, depth1, pose1), (path2, depth2, pose2) = frames[start], frames[start + gap]
-            first, second = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in (path1, path2))
-            z1, z2 = (cv2.imread(str(p), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000 for p in (depth1, depth2))
-            motion = np.linalg.inv(pose2) @ pose1
-
-            def lift(xy: np.ndarray, z: np.ndarray = z1) -> tuple[np.ndarray, np.ndarray]:
-                column, row = np.rint(xy).astype(int).T
-                patch = np.stack(
-                    [
-                        z[np.clip(row + dy, 0, 479), np.clip(column + dx, 0, 639)]
-                        for dy in (-1, 0, 1)
-                        for dx in (-1, 0, 1)
-                    ]
-                )
-                smooth = (patch.min(0) > 0.2) & (patch.max(0) - patch.min(0) < 0.03 * patch.max(0))
-                return camera.unproject(camera.undistort_points(xy), z[row, column]), smooth
-
-            k1, d1 = orb.detectAndCompute(first, None)
-            k2, d2 = orb.detectAndCompute(second, None)
-            if d1 is None or d2 is None:
+        for start in starts or range(0, len(frames) - gap, every * max(1, gap // 2)):
+            first, second = _read(frames[start]), _read(frames[start + gap])
+            motion = _motion(first, second, camera)
+            if motion is None:
                 continue
-            found = [m for m in matcher.match(d1, d2) if m.distance < 50]
-            xy1 = np.array([k1[m.queryIdx].pt for m in found], np.float32).reshape(-1, 2)
-            xy2 = np.array([k2[m.trainIdx].pt for m in found], np.float32).reshape(-1, 2)
-            if len(xy1) < 50:
-                continue
-            space, smooth = lift(xy1)
-            motion, residual = _refine_pose(motion, space[smooth], camera.undistort_points(xy2)[smooth], camera)
-            if not residual < 1.0:
-                continue
-            points = corners(first, limit)
-            space, smooth = lift(points)
+            points = corners(first.gray, limit)
+            space, smooth = _lift(points, first.depth, camera)
             moved = space @ motion[:3, :3].T + motion[:3, 3]
             truth = camera.distort_points(camera.project(moved))
             seen = smooth & (moved[:, 2] > 0.2) & ((truth >= 4) & (truth < (636, 476))).all(axis=1)
             column, row = np.clip(np.nan_to_num(np.rint(truth)), 0, (639, 479)).astype(int).T
-            there = z2[row, column]
+            there = second.depth[row, column]
             seen &= (there > 0) & (abs(there - moved[:, 2]) < 0.04 * moved[:, 2])
-            if seen.sum() >= 50:
-                pairs.append(Pair(f"{name} +{gap}", first, second, points[seen], truth[seen]))
+            if seen.sum() < 50:
+                continue
+            before = _motion(_read(frames[start - gap]), first, camera) if starts else None
+            if starts and before is None:
+                continue
+            guess = None
+            if before is not None:  # constant velocity: the camera moves on as it did over the gap before
+                kept_up = camera.project(space[seen] @ before[:3, :3].T + before[:3, 3])
+                guess = camera.distort_points(kept_up).astype(np.float32)
+            pairs.append(Pair(f"{name} +{gap}", first.gray, second.gray, points[seen], truth[seen], guess, start))
     return pairs
 
 

@@ -1,7 +1,8 @@
 """Moth-flame label search (Eq. 4-22, corrected Algorithm 1), one population a point.
 
-Positions are labels; a moth's fitness is the matching cost of its label (Eq. 5-7). Which equations are in force is
-said by `rules.MothFlameRules`: the enhanced algorithm, the plain one, or the equations as printed.
+Positions are labels; a moth's fitness is the matching cost of its label (Eq. 5-7). The equations stand in `rules`; what
+depends on the iteration alone comes from there as a table, and `fly` is `rules.flown` for one point, with looked-up
+spirals and Cauchy numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ CANDIDATES, FOUNDING, OPPOSITES, FLIGHT = 0, 1, 2, 3
 
 @kernel
 def moth_flame_phase(  # type: ignore[no-untyped-def]
-    start, stop, reference, target, tables, state, candidates, end, phase, seed, rules, counts, spiral, cauchy, steps
+    start, stop, reference, target, tables, state, candidates, end, phase, seed, table, spiral, cauchy, steps
 ):
     """Spend evaluations on points start..stop until each has used `end`.
 
@@ -33,14 +34,13 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 founds the population.
         seed: Of the frame.
-        rules: `rules.MothFlameRules`.
-        counts: int64 ``[T]``, number of flames in every iteration (Eq. 11).
+        table: `rules.FlightTable`.
         spiral: `rules.spiral_table`.
         cauchy: `rules.cauchy_table`.
         steps: float32 ``[4]``, scale of the Cauchy steps.
     """
-    population, iterations = state.costs.shape[1], len(counts)
-    founding = population * (2 if rules.opposition else 1)
+    population, iterations = state.costs.shape[1], len(table.counts)
+    founding = population * (2 if table.opposition else 1)
     moths, flames = np.empty((population, 4), dtype=np.float32), np.empty((population, 4), dtype=np.float32)
     costs = np.empty(population, dtype=np.int64)
     lower, upper = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
@@ -99,7 +99,7 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
                 if used >= end:
                     break
                 iteration = min(max((used - founding) // population, 0), iterations - 1)
-                random = fly(moths, flames, lower, upper, iteration, rules, counts, spiral, cauchy, steps, random)
+                random = fly(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random)
                 count = population
                 for m in range(population):
                     for j in range(4):
@@ -116,7 +116,7 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
                 widen(lower, upper, flames)
                 stage = FOUNDING if phase == 0 else FLIGHT
             elif stage == FOUNDING:
-                stage = OPPOSITES if rules.opposition else FLIGHT
+                stage = OPPOSITES if table.opposition else FLIGHT
             elif stage == OPPOSITES:
                 for m in range(population):  # the best N of X and its opposites
                     if costs[m] < tables.ceiling:
@@ -133,15 +133,12 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def fly(moths, flames, lower, upper, iteration, rules, counts, spiral, cauchy, steps, random):  # type: ignore[no-untyped-def]
+def fly(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random):  # type: ignore[no-untyped-def]
     """Move every moth once (Eq. 8-18); returns the next random state."""
-    population, iterations = len(moths), len(counts)
-    progress = np.float32(iteration + 1) / np.float32(iterations)
-    r = np.float32(1) + progress if rules.as_printed else np.float32(-1) - progress  # Eq. 9
-    first_half = 2 * (iteration + 1) <= iterations
-    stepping, pulling = rules.cauchy and first_half, rules.best_flame and not first_half
-    a = np.float32(0.6) - np.float32(0.4) * progress  # Eq. 18
-    fewest = counts[iteration] - 1
+    population = len(moths)
+    span, own, best = table.span[iteration], table.own[iteration], table.best[iteration]
+    stepping, pulling = table.stepping[iteration], best > 0
+    fewest = table.counts[iteration] - 1
     for m in range(population):
         flame = min(m, fewest)  # Eq. 8
         random = advance(random)
@@ -150,14 +147,12 @@ def fly(moths, flames, lower, upper, iteration, rules, counts, spiral, cauchy, s
             random = advance(random)
             jumps = scrambled(random)
         for j in range(4):
-            t = (r - np.float32(1)) * uniform(bits, j) + np.float32(1)  # Eq. 10
+            t = span * uniform(bits, j) + np.float32(1)  # Eq. 10
             turn = spiral[min(max(np.int64((t + np.float32(2)) * np.float32(1024)), 0), 4095)]
             distance = abs(flames[m, j] - moths[m, j])
             goal = flames[flame, j]
             if pulling:  # Eq. 17
-                goal = a * goal + (np.float32(1) - a) * flames[0, j]
-                if rules.half:
-                    goal = goal * np.float32(0.5)
+                goal = own * goal + best * flames[0, j]
             position = distance * turn + goal
             if stepping:  # Eq. 13
                 position += cauchy[np.int64((jumps >> np.uint64(16 * j)) & np.uint64(4095))] * steps[j]

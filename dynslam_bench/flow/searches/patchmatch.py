@@ -1,4 +1,7 @@
-"""PatchMatch's random search: windows around the best label that halve (PatchMatch Filter, DAISY Filter Flow)."""
+"""Searches without a population: PatchMatch's halving windows, uniform random draws, or no draws at all.
+
+The windows lie around the best label (PatchMatch Filter, DAISY Filter Flow).
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,8 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase.
         seed: Of the frame.
-        shrink: Factor of the window per evaluation (PatchMatch: 0.5); 1 is a uniform random search of the whole box.
+        shrink: Factor of the window per evaluation (PatchMatch: 0.5); 1 is a uniform random search of the whole box,
+            0 draws nothing: the candidates are all that is tried, and the rest of the budget is left.
     """
     label = np.empty(4, dtype=np.float32)
     flames, costs = np.empty((1, 4), dtype=np.float32), np.empty(1, dtype=np.int64)
@@ -45,6 +49,8 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
                 given += 1
                 if not np.isfinite(total):
                     continue
+            elif shrink == 0:
+                break
             else:
                 if not widened:
                     widen(lower, upper, flames)

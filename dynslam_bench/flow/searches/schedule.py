@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,34 @@ from .common import SearchState
 from .moth_flame import moth_flame_phase
 from .patchmatch import shrinking_window_phase
 
-PROPAGATING: frozenset[SearchName] = frozenset({"emfoa+propagation", "patchmatch"})
-_RULES: dict[SearchName, rule_book.MothFlameRules] = {
-    "emfoa+propagation": rule_book.EMFOA,
-    "emfoa": rule_book.EMFOA,
-    "mfo": rule_book.MFO,
-    "emfoa-literal": rule_book.EMFOA_LITERAL,
+
+class Strategy(NamedTuple):
+    """What a search spends its evaluations on.
+
+    Attributes:
+        rules: The moth-flame equations in force; None for random searches.
+        shrink: Factor of the random window an evaluation: 0.5 PatchMatch, 1 uniform random search of the whole box, 0
+            draws nothing, so that the labels known beforehand and those of the neighbours are all there is.
+        propagates: Whether neighbours exchange their labels between phases.
+    """
+
+    rules: rule_book.MothFlameRules | None
+    shrink: float
+    propagates: bool
+
+
+STRATEGIES: dict[SearchName, Strategy] = {
+    "emfoa+propagation": Strategy(rule_book.EMFOA, 0.5, True),
+    "emfoa-literal+propagation": Strategy(rule_book.EMFOA_LITERAL, 0.5, True),
+    "patchmatch": Strategy(None, 0.5, True),
+    "random+propagation": Strategy(None, 1.0, True),
+    "none+propagation": Strategy(None, 0.0, True),
+    "emfoa": Strategy(rule_book.EMFOA, 0.5, False),
+    "mfo": Strategy(rule_book.MFO, 0.5, False),
+    "emfoa-literal": Strategy(rule_book.EMFOA_LITERAL, 0.5, False),
+    "random": Strategy(None, 1.0, False),
 }
+PROPAGATING: frozenset[SearchName] = frozenset(name for name, each in STRATEGIES.items() if each.propagates)
 
 Phase = Callable[[int, NDArray[np.float32]], None]
 
@@ -37,7 +59,7 @@ class Plan:
         ends: Evaluations a point at which each phase ends; between phases labels are exchanged.
         rules: The moth-flame equations in force; None for random searches.
         iterations: Of the moth-flame algorithm (T).
-        shrink: Factor of PatchMatch's window; 1 for uniform random search.
+        shrink: Factor of the random window (`Strategy.shrink`).
     """
 
     population: int
@@ -50,14 +72,14 @@ class Plan:
 def make_plan(settings: FlowSettings) -> Plan:
     """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations."""
     budget = settings.budget
-    rules = _RULES.get(settings.search)
-    sweeps = min(settings.sweeps, max(1, budget // 16)) if settings.search in PROPAGATING else 0
+    rules, shrink, propagates = STRATEGIES[settings.search]
+    sweeps = min(settings.sweeps, max(1, budget // 16)) if propagates else 0
     population = max(2, min(settings.population, budget // 8)) if rules else 1
     # founding the population takes a double share
     ends = tuple(budget * (k + 2) // (sweeps + 2) for k in range(sweeps + 1))
     founding = population * (2 if rules and rules.opposition else 1)
     iterations = max(1, -(-(budget - founding) // population))
-    return Plan(population, ends, rules, iterations, 1.0 if settings.search == "random" else 0.5)
+    return Plan(population, ends, rules, iterations, shrink)
 
 
 def cauchy_steps(settings: FlowSettings) -> NDArray[np.float32]:
@@ -81,14 +103,13 @@ def phase_runner(
             )  # fmt: skip
 
         return random_phase
-    rules = plan.rules
-    flames = rule_book.flame_counts(plan.population, plan.iterations, rules)
+    table = rule_book.flight_table(plan.population, plan.iterations, plan.rules)
     steps = cauchy_steps(settings)
 
     def moth_flame(number: int, candidates: NDArray[np.float32]) -> None:
         run_stripes(
             moth_flame_phase, count, threads, pool, reference, target, tables, state, candidates, plan.ends[number],
-            number, np.uint64(seed), rules, flames, rule_book.spiral_table(), rule_book.cauchy_table(), steps,
+            number, np.uint64(seed), table, rule_book.spiral_table(), rule_book.cauchy_table(), steps,
         )  # fmt: skip
 
     return moth_flame

@@ -1,0 +1,181 @@
+"""The moth-flame equations: against loops that follow the paper, in every library, and as they were before."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import optuna
+import pytest
+import torch
+
+from dynslam_bench.flow.matching import tables_for
+from dynslam_bench.flow.optimiser import emfoa_minimise
+from dynslam_bench.flow.searches import rules
+from dynslam_bench.flow.searches.common import advance, scrambled
+from dynslam_bench.flow.searches.moth_flame import fly
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.sparse import SparseDaisyFlow
+from dynslam_bench.flow.torch_sparse import TorchSparseFlow
+from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
+
+FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
+POPULATION, ITERATIONS = 6, 10
+
+
+def picture(seed=0, shape=(144, 192)):
+    """Blocks of three sizes; whole numbers only, so that every machine sees the same."""
+    rng = np.random.default_rng(seed)
+    layers = [
+        np.kron(rng.integers(0, 256, (shape[0] // k, shape[1] // k)), np.ones((k, k), np.int64)) for k in (3, 8, 24)
+    ]
+    return (sum(layers) // 3).astype(np.uint8)
+
+
+def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
+    """Eq. 8-18 for one population, a number at a time; flames best first."""
+    landed, progress = np.empty_like(moths), iteration / ITERATIONS
+    left = rules.flame_counts(POPULATION, ITERATIONS, family)[iteration - 1]
+    for i in range(POPULATION):
+        for j in range(4):
+            r = 1 + progress if family.as_printed else -1 - progress
+            t = (r - 1) * uniform[i, j] + 1
+            goal = flames[min(i, left - 1), j]
+            if family.best_flame and iteration > ITERATIONS / 2:
+                a = 0.6 - 0.4 * progress
+                goal = (a * goal + (1 - a) * flames[0, j]) / (2 if family.half else 1)
+            landed[i, j] = abs(flames[i, j] - moths[i, j]) * np.exp(t) * np.cos(2 * np.pi * t) + goal
+            if family.cauchy and iteration <= ITERATIONS / 2:
+                landed[i, j] += np.tan(np.pi * (jumps[i, j] - 0.5)) * scale[j]
+    return landed
+
+
+def drawn(seed, stepping):
+    """A population, its flames, and the numbers that the compiled search would draw for them."""
+    rng = np.random.default_rng(seed)
+    moths, flames = rng.uniform(-40, 40, (2, POPULATION, 4)).astype(np.float32)
+    state, uniform, jumps = np.uint64(seed + 77), np.empty((POPULATION, 4)), np.full((POPULATION, 4), 0.5)
+    for i in range(POPULATION):
+        for numbers, levels in ((uniform, 65536), (jumps, 4096))[: 1 + stepping]:
+            state = np.uint64(advance(state))
+            bits = int(scrambled(state))
+            half = 0.5 if levels == 4096 else 0.0
+            numbers[i] = [((bits >> 16 * j & 65535) % levels + half) / levels for j in range(4)]
+    return moths, flames, uniform, jumps
+
+
+@pytest.mark.parametrize("iteration", [1, 5, 6, 10])
+@pytest.mark.parametrize("family", FAMILY.values(), ids=FAMILY)
+def test_numpy_torch_and_the_kernel_fly_as_the_equations_say(family, iteration):
+    now = rules.flight(iteration / ITERATIONS, family)
+    moths, flames, uniform, jumps = drawn(iteration, now.stepping)
+    scale = np.array([2.0, 2.0, 0.1, 0.087])
+    expected = by_hand(moths.astype(np.float64), flames.astype(np.float64), iteration, family, uniform, jumps, scale)
+    left = rules.flame_counts(POPULATION, ITERATIONS, family)[iteration - 1]
+    around = flames[np.minimum(np.arange(POPULATION), left - 1)]
+    for xp, cast in ((np, np.float64), (torch, torch.tensor)):
+        numbers = iter((uniform, jumps))
+        args = [cast(each) for each in (moths, flames, around, flames[:1])]
+        found = rules.flown(xp, *args, now, cast(scale), lambda _: cast(next(numbers)))  # noqa: B023
+        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-5, atol=1e-4)
+    table = rules.flight_table(POPULATION, ITERATIONS, family)
+    box = np.full(4, 1e9, np.float32)
+    flying, steps = moths.copy(), scale.astype(np.float32)
+    state = np.uint64(iteration + 77)
+    fly(flying, flames, -box, box, iteration - 1, table, rules.spiral_table(), rules.cauchy_table(), steps, state)
+    # the spiral is looked up in steps of 1/1024: its slope is at most 2 pi e^2 outside, 2 pi e inside t <= 1
+    looked_up = abs(flames - moths) * 2 * np.pi * np.exp(2 if family.as_printed else 1) / 1024 + 1e-3
+    assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all()
+
+
+def test_opposites_keep_to_their_bounds_in_numpy_and_torch():
+    members = np.random.default_rng(0).uniform(-3, 3, (5, 7, 4))
+    least, greatest = members.min(1, keepdims=True), members.max(1, keepdims=True)
+    numbers = [np.random.default_rng(1).random((5, 7, 1)), np.random.default_rng(2).random((5, 7, 4))]
+    found = []
+    for xp, cast in ((np, np.asarray), (torch, torch.tensor)):
+        draws = iter(numbers)
+        bounds = [cast(each) for each in (members, least, greatest, np.full(4, -2.0), np.full(4, 2.5))]
+        found.append(np.asarray(rules.opposites(xp, *bounds, lambda _: cast(next(draws)))))  # noqa: B023
+    np.testing.assert_allclose(found[0], found[1])
+    mirrored = numbers[0] * (least + greatest) - members
+    kept = (mirrored >= -2) & (mirrored <= 2.5)
+    np.testing.assert_allclose(found[0][kept], mirrored[kept])
+    assert 0.3 < kept.mean() < 1 and (found[0] >= -2).all() and (found[0] <= 2.5).all()
+
+
+def searched(kind, search):
+    """The state of a label search with a guess for every second point."""
+    image = picture()
+    target = np.roll(image, (4, -7), axis=(0, 1))
+    points = np.stack(np.meshgrid(np.arange(40, 150, 10), np.arange(40, 100, 10)), -1).reshape(-1, 2).astype(np.float32)
+    guess = points + np.float32(3)
+    guess[::2] = np.nan
+    flow = kind(FlowSettings(search=search))
+    tables = tables_for(image.shape, flow.settings)
+    first, second = flow.prepare(image), flow.prepare(target)
+    described = flow.describe(first, points, tables)
+    return flow.search(described, first, second, tables, flow.neighbours(points), guess, 9)
+
+
+STORED = {
+    "emfoa": "84f2c5ef451801d3",
+    "emfoa+propagation": "7d04e1d07384dd66",
+    "emfoa-literal": "2b9e1164b663a30e",
+    "emfoa-literal+propagation": "6aaf08bc9b17f31c",
+    "mfo": "a2001c99c423c5b4",
+    "none+propagation": "87beb52c40e16d5a",
+    "patchmatch": "9977d4603dd9c019",
+    "random": "5f5d2d8eb5727325",
+    "random+propagation": "bc28e3cc59481560",
+}
+"""Digests of flames, costs and evaluations, taken before the equations were brought together."""
+
+
+@pytest.mark.parametrize("search", sorted(STORED))
+def test_label_searches_are_as_before_to_the_bit(search):
+    state = searched(SparseDaisyFlow, search)
+    content = b"".join(np.ascontiguousarray(each).tobytes() for each in (state.flames, state.costs, state.used))
+    assert hashlib.sha256(content).hexdigest()[:16] == STORED[search]
+
+
+STORED_MEANS = {"emfoa": 1026.106, "emfoa+propagation": 374.03, "emfoa-literal": 1424.424, "mfo": 1124.894}
+"""Mean best costs of the torch search, likewise; its exp, cos and tan may differ in a last bit between machines."""
+
+
+@pytest.mark.parametrize("search", sorted(STORED_MEANS))
+def test_torch_searches_are_as_before(search):
+    assert searched(TorchSparseFlow, search).costs[:, 0].mean() == pytest.approx(STORED_MEANS[search], rel=0.01)
+
+
+STORED_MINIMA = {
+    "emfoa": [0.7810712379287393, 0.7621042184447037, 0.8084850943266072, 0.7718673756928673],
+    "mfo": [0.6470099534657902, 0.8067263490962506, 0.5343523050368495, 0.9625112407534904],
+    "printed": [-0.7461155569911946, 1.1352855134804116, -0.668580649685582, 1.2862615507342914],
+}
+
+
+@pytest.mark.parametrize("family", sorted(STORED_MINIMA))
+def test_the_optimiser_is_as_before(family):
+    def fun(x):
+        return ((x - 0.7) ** 2).sum(-1) + 3 * np.cos(4 * x).sum(-1)
+
+    found = emfoa_minimise(fun, np.full(4, -5.0), np.full(4, 5.0), budget=333, seed=2, rules=FAMILY[family])
+    np.testing.assert_allclose(found.x[0], STORED_MINIMA[family], rtol=1e-6)
+
+
+STORED_TRIALS = [5.55917746842195, 11.09892705085383, 3.4668328149598255, 2.402101848706664, 1.108279186464951]
+
+
+def test_the_sampler_is_as_before():
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+    def objective(trial):
+        x, y = trial.suggest_float("x", -5, 5), trial.suggest_float("y", 1e-3, 10, log=True)
+        kind = trial.suggest_categorical("kind", ["a", "b", "c"])
+        return (x - 1) ** 2 + np.log(y) ** 2 + abs(trial.suggest_int("k", 1, 9) - 4) + (kind != "b")
+
+    study = optuna.create_study(sampler=EmfoaSampler(seed=3, n_trials=60))
+    study.optimize(objective, n_trials=60)
+    values = [trial.value for trial in study.trials]
+    np.testing.assert_allclose(values[15::11], STORED_TRIALS, rtol=1e-6)
