@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
@@ -21,6 +21,7 @@ from dynslam_bench.envs.source import open_frames, preprocessing_of
 from dynslam_bench.segmentation.build import resolve_source
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.frame import Sequence
+from dynslam_bench.sequences.part import part_of
 from dynslam_bench.trackers.protocol import TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
@@ -74,7 +75,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         raise RunError(f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing))
     settings = resolve_settings(tracker, spec.settings)
     sequence = open_frames(
-        spec.sequence, spec.data_root, spec.camera, spec.frames, spec.stride, preprocessing_of(settings)
+        spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride, preprocessing_of(settings)
     )
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
@@ -82,6 +83,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     device = resolve_device(spec.device)
     source = _segmentation_source(settings, sequence)
     known = versions()
+    part = part_of(sequence, spec.offset)
     identity = {
         "tracker": tracker.id,
         "tracker_version": tracker.version,
@@ -90,11 +92,12 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "settings": flatten(settings),
         "segmentation": source,
         "weights": weights_of(settings, source),
-        "sequence": sequence.id,
-        "content": sequence.digest(),
-        "camera": asdict(sequence.camera),
-        "frames": spec.frames,
-        "stride": spec.stride,
+        "sequence": part.id,
+        "content": part.content,
+        "camera": part.camera,
+        "frames": [part.start, part.stop],
+        "offset": spec.offset,
+        "stride": part.stride,
         "seed": spec.seed,
         "device": device,
         "threads": spec.threads,

@@ -69,6 +69,16 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
     assert all(spec.settings == {} for spec in specs if spec.tracker == "never-move")
 
 
+def test_offsets_of_a_suite_are_repeats_beside_the_seeds(tmp_path: Path) -> None:
+    text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\nseeds = [0, 1]\noffsets = [0, 3]\n'
+    suite = load_suite(write(tmp_path / "mine.toml", text))
+    repeats = [(spec.seed, spec.offset) for spec in suite.specs()]
+    assert repeats == [(0, 0), (0, 3), (1, 0), (1, 3)]
+    assert [spec.offset for spec in suite.specs(seeds=(0,), offsets=(5,))] == [5]
+    with pytest.raises(DynslamError, match=r"offsets\.0: input should be greater than or equal to 0"):
+        load_suite(write(tmp_path / "bad.toml", text.replace("[0, 3]", "[-1]")))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
