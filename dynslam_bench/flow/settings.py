@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
-from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.settings import Settings, names, tunable
 
 _DAISY = {"method": ["daisy"]}
 _EMFOA = {"method": ["daisy"], "search": ["emfoa+propagation", "emfoa", "emfoa-literal"]}
@@ -26,8 +24,8 @@ class FlowSettings(Settings):
     method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
         "daisy", meaning="DAISY Filter Flow with a label search, pyramidal Lucas-Kanade, or dense inverse search"
     )
-    plugin: str = Field(
-        "", description="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`"
+    plugin: str = names(
+        "", "flow", meaning="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`"
     )
     search: SearchName = tunable(
         "emfoa+propagation",

@@ -58,6 +58,40 @@ def test_an_edited_plug_in_is_another_run(toy_folder: str, tmp_path: Path) -> No
     assert resolve(spec).run_id != before
 
 
+def test_an_edited_plug_in_that_a_setting_names_is_another_run(
+    toy_folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    specs = {
+        "features.extractor": "from dynslam_bench.features.registry import FeatureSpec as Spec",
+        "flow.plugin": "from dynslam_bench.flow.spec import FlowSpec as Spec",
+        "segmentation.source": "from dynslam_bench.segmentation.registry import SegmenterSpec as Spec",
+    }
+    for name, text in specs.items():
+        plugin = tmp_path / name / "mine.py"
+        plugin.parent.mkdir()
+        plugin.write_text(f'{text}\n\nSPEC = Spec("mine", f"{{__file__}}:build")\n')
+        value = f"plugin:{plugin}:SPEC" if name == "segmentation.source" else f"{plugin}:SPEC"
+        spec = RunSpec(
+            tracker="emfoa-oft", sequence=toy_folder, settings={"segmentation.source": "embedded", name: value}
+        )
+        before = resolve(spec).run_id
+        (tmp_path / name / "readme.txt").write_text("not code")
+        assert resolve(spec).run_id == before
+        plugin.write_text(plugin.read_text() + "# edited\n")
+        assert resolve(spec).run_id != before, name
+
+
+def test_a_folder_called_like_a_setting_is_no_other_run(
+    toy_folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spec = RunSpec(tracker="orb-slam2", sequence=toy_folder)
+    before = resolve(spec).run_id
+    for word in ("orb", "person", "auto", "daisy"):
+        (tmp_path / word).mkdir()
+    assert resolve(spec).run_id == before
+
+
 def test_changed_weights_are_another_run(toy_folder: str, tmp_path: Path) -> None:
     weights = tmp_path / "net.onnx"
     weights.write_bytes(b"one")
