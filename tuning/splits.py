@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def check_splits(spec: StudySpec) -> list[str]:
     parts = {name: part_of(sequence) for name, sequence in opened.items()}
     for split, names in (("tune", spec.tune), ("held_out", spec.held_out)):
         for one, other in combinations(names, 2):
-            if parts[one] == parts[other]:
+            if replace(parts[one], id="") == replace(parts[other], id=""):
                 raise StudyError(f"{split} names the same frames twice, as '{one}' and as '{other}'", "leave one out")
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
