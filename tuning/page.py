@@ -35,6 +35,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec, study = tuner.spec, tuner.study
+    summary = summary.model_copy(update={"split_notes": tuner.split_notes})  # a stored one may be older than the check
     tables = [_candidates(summary), _trials(tuner, summary)]
     figures = _figures(tuner, summary)
     settings = {**spec.space.fixed, **summary.candidates[0].params}

@@ -21,7 +21,7 @@ _COMPARED = 3
 OVERRIDE = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
 
 
-def check_splits(spec: StudySpec) -> list[str]:
+def check_splits(spec: StudySpec, *, refuse: bool = True) -> list[str]:
     """Compare the splits of a study.
 
     Two sequences overlap if they film the same content, however they are called: other frames or another draw of the
@@ -30,9 +30,10 @@ def check_splits(spec: StudySpec) -> list[str]:
 
     Args:
         spec: The study.
+        refuse: Whether to raise what the study does not accept; False to look at a study that was run before.
 
     Returns:
-        What is wrong, a line each, if the study accepts it (`StudySpec.allow_overlap`); else empty.
+        What is wrong, a line each, if the study accepts it (`StudySpec.allow_overlap`) or nothing is refused.
 
     Raises:
         StudyError: Something is wrong and not accepted, or one split names the same frames twice; names both spellings.
@@ -51,7 +52,7 @@ def check_splits(spec: StudySpec) -> list[str]:
     ]
     faults += [_misplaced(name, "tune", "held-out") for name in spec.tune if _split(opened[name]) == "held-out"]
     faults += [_misplaced(name, "held-out", "tune") for name in spec.held_out if _split(opened[name]) == "tune"]
-    if faults and not spec.allow_overlap:
+    if faults and refuse and not spec.allow_overlap:
         more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
         raise StudyError(f"the splits of study '{spec.name}' are not apart: {faults[0]}{more}", OVERRIDE)
     return faults

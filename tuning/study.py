@@ -83,7 +83,7 @@ class Tuner:
         self.base = flatten(defaults)
         sampler, pruner = build_sampler(spec), build_pruner(spec)
         check_sequences(spec)
-        self.split_notes = check_splits(spec)
+        self.split_notes = check_splits(spec, refuse=not reading)
         self.evaluator = Evaluator(spec, self.results)
         self.evaluator.store.prepare()
         self.tune_instances = self.evaluator.instances(spec.tune, list(product(spec.seeds, spec.offsets)))

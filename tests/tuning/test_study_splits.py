@@ -82,6 +82,11 @@ def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
     assert check_splits(spec([str(tmp_path / tune)], [str(tmp_path / held)])) == []
 
 
+def test_an_older_study_with_overlapping_splits_can_still_be_looked_at() -> None:
+    study = spec([f"{WALK}@1"], [f"{WALK}@5"])
+    assert len(check_splits(study, refuse=False)) == 1
+
+
 def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3)
     copy = shutil.copytree(whole, tmp_path / "copy")
