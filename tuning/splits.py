@@ -83,7 +83,7 @@ def _overlap(one: Any, part: Part, other: Any, other_part: Part) -> bool:
     _, here, there = np.intersect1d(
         np.round(one.timestamps, 6), np.round(other.timestamps, 6), assume_unique=True, return_indices=True
     )
-    picked = np.unique(np.linspace(0, len(here) - 1, min(_COMPARED, len(here))).astype(int)) if len(here) else []
+    picked = np.unique(np.linspace(0, len(here) - 1, min(_COMPARED, len(here))).astype(np.intp))
     return any(_same_images(one, int(here[k]), other, int(there[k])) for k in picked)
 
 
