@@ -1,4 +1,4 @@
-"""After the trials: the best run again with fresh seeds, the held-out check, importances, the preset."""
+"""After the trials: the best run again in fresh repeats, the held-out check, importances, the preset."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from .objective import Configuration, Instance, InstanceFailedError, Outcome, lo
 from .preset import preset_text
 from .samplers import is_feasible
 from .study import Tuner
+from .study_file import StudySpec
 
 FRESH_SEEDS = 1000
 """Seeds of the final runs: none that a trial has used."""
@@ -33,7 +34,7 @@ class Ratio(Record):
 
     Attributes:
         ratio: Below 1 is better than the default.
-        low: Lower end of the bootstrap interval over sequences and seeds.
+        low: Lower end of the bootstrap interval over sequences and repeats.
         high: Upper end.
         n: Paired runs.
         sequences: How many sequences they come from.
@@ -71,7 +72,7 @@ class Candidate(Record):
         trial: Its number.
         params: The tuned settings.
         values: What its trial had been worth.
-        tune: On the tune split with fresh seeds.
+        tune: On the tune split in fresh repeats.
         held_out: On the held-out split; None without one.
         frame_ms: Mean milliseconds a frame, timed without the stage cache.
         default_frame_ms: The same of the default settings.
@@ -100,11 +101,14 @@ class StudySummary(Record):
         trials: Trials by state.
         candidates: The best configurations, run again; the chosen one first.
         chosen: Number of the trial whose settings became the preset.
-        improves: Whether the chosen settings beat the default on the held-out split: the whole interval below 1.
+        improves: Whether the chosen settings beat the default on the held-out split: the whole interval below 1, and
+            the splits are apart.
         conclusion: One sentence.
         importances: Share of the objective's variance that each parameter explains (PED-ANOVA).
         held_out: The held-out sequences.
         tune: The tune sequences.
+        repeats: What the fresh repeats were, in words.
+        split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
     """
 
     name: str
@@ -118,12 +122,29 @@ class StudySummary(Record):
     importances: dict[str, float] = Field(default_factory=dict)
     held_out: list[str] = Field(default_factory=list)
     tune: list[str] = Field(default_factory=list)
+    repeats: str = ""
+    split_notes: list[str] = Field(default_factory=list)
+
+
+def fresh_repeats(spec: StudySpec) -> list[tuple[int, int]]:
+    """As many pairs of seed and start offset as a trial has per sequence, none of which a trial has used.
+
+    Both change at once: the offset is what makes another run for a tracker that draws nothing from its seed.
+    """
+    count = len(spec.seeds) * len(spec.offsets)
+    unused = [offset for offset in range(count + len(spec.offsets)) if offset not in spec.offsets]
+    return [(FRESH_SEEDS + index, unused[index]) for index in range(count)]
+
+
+def describe_repeats(repeats: Sequence[tuple[int, int]]) -> str:
+    """Pairs of seed and start offset in words."""
+    return ", ".join(f"seed {seed} from frame {offset}" for seed, offset in repeats)
 
 
 def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: int = 1) -> StudySummary:
     """Run the best configurations again, check them on the held-out split and write preset and summary.
 
-    The candidate that is best on the tune split with fresh seeds is chosen; the held-out split only judges it.
+    The candidate that is best on the tune split in fresh repeats is chosen; the held-out split only judges it.
 
     Args:
         tuner: A study with finished trials.
@@ -141,14 +162,14 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
     best = best_trials(tuner.study, spec.top)
     if not best:
         raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
-    seeds = [FRESH_SEEDS + index for index in range(len(spec.seeds))]
-    tune = tuner.evaluator.instances(spec.tune, seeds)
-    held_out = tuner.evaluator.instances(spec.held_out, seeds)
-    note("default settings with fresh seeds")
+    repeats = fresh_repeats(spec)
+    tune = tuner.evaluator.instances(spec.tune, repeats)
+    held_out = tuner.evaluator.instances(spec.held_out, repeats)
+    note("default settings in fresh repeats")
     default = _run(tuner, spec.space.fixed, [*tune, *held_out], jobs)
     candidates = []
     for trial in best:
-        note(f"trial {trial.number} with fresh seeds")
+        note(f"trial {trial.number} in fresh repeats")
         candidate = Candidate(trial=trial.number, params=trial.params, values=list(trial.values))
         try:
             again = _run(tuner, tuner.settings_of(trial), [*tune, *held_out], jobs)
@@ -172,7 +193,9 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
     summary = StudySummary(
         name=spec.name, tracker=spec.tracker, protocol=tuner.evaluator.protocol.describe(),
         trials=count_states(tuner.study), candidates=candidates, chosen=chosen.trial,
-        improves=chosen.held_out is not None and chosen.held_out.shows_gain, conclusion=_conclude(chosen),
+        improves=chosen.held_out is not None and chosen.held_out.shows_gain and not tuner.split_notes,
+        conclusion=_conclude(chosen, tuner.split_notes), repeats=describe_repeats(repeats),
+        split_notes=tuner.split_notes,
         importances=importances(tuner.study), held_out=list(spec.held_out), tune=list(spec.tune),
     )  # fmt: skip
     settings = {**spec.space.fixed, **chosen.params}
@@ -206,7 +229,7 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
 def paired_ratio(
     outcomes: Mapping[Instance, Outcome], default: Mapping[Instance, Outcome], instances: Sequence[Instance]
 ) -> Ratio:
-    """Geometric-mean ATE ratio over paired runs, with a bootstrap interval over sequences and, within them, seeds."""
+    """Geometric-mean ATE ratio over paired runs, with a bootstrap interval over sequences and, within them, repeats."""
     by_sequence: dict[str, list[float]] = {}
     for instance in instances:
         ratio = log_ratio(outcomes[instance].ate_m, default[instance].ate_m)
@@ -215,7 +238,7 @@ def paired_ratio(
     rng = stream(0, "bootstrap", *sorted(by_sequence))
     size = np.array([len(values) for values in groups])
     padded = np.stack([np.pad(values, (0, size.max() - len(values))) for values in groups])
-    drawn = rng.integers(len(groups), size=(RESAMPLES, len(groups)))  # sequences, then seeds within each of them
+    drawn = rng.integers(len(groups), size=(RESAMPLES, len(groups)))  # sequences, then repeats within each of them
     member = (rng.random((*drawn.shape, size.max())) * size[drawn][..., None]).astype(np.intp)
     counts = np.arange(size.max()) < size[drawn][..., None]
     means = (padded[drawn[..., None], member] * counts).sum(axis=2) / size[drawn]
@@ -261,7 +284,7 @@ def _run(
         return dict(zip(instances, pool.map(one, instances), strict=True))
 
 
-def _conclude(chosen: Candidate) -> str:
+def _conclude(chosen: Candidate, split_notes: Sequence[str]) -> str:
     if chosen.failed:
         return f"trial {chosen.trial} was best, but failed when run again: {chosen.failed}"
     assert chosen.tune is not None
@@ -270,7 +293,7 @@ def _conclude(chosen: Candidate) -> str:
         return text + "; no held-out split was given, so nothing is known about other sequences"
     held = f"; on the held-out split {_show(chosen.held_out)} ({chosen.held_out.verdict})"
     few = "; fewer than five held-out sequences: the interval is rough" if 3 <= chosen.held_out.sequences < 5 else ""
-    return text + held + few
+    return text + held + few + (f"; THE SPLITS ARE NOT APART: {'; '.join(split_notes)}" if split_notes else "")
 
 
 def _show(ratio: Ratio) -> str:

@@ -26,10 +26,20 @@ FLOOR_M = 1e-4
 
 @dataclass(frozen=True)
 class Instance:
-    """What a configuration is tried on: one sequence with one seed."""
+    """What a configuration is tried on: one sequence, in one repeat.
+
+    Attributes:
+        sequence: The sequence.
+        seed: Seed of the run.
+        offset: So many leading frames are left out.
+    """
 
     sequence: str
     seed: int
+    offset: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.sequence}, seed {self.seed}" + (f", offset {self.offset}" if self.offset else "")
 
 
 @dataclass(frozen=True)
@@ -106,9 +116,9 @@ class Evaluator:
         self.protocol = held_protocol(spec.protocol)
         self._lock = threading.Lock()
 
-    def instances(self, sequences: Sequence[str], seeds: Sequence[int]) -> list[Instance]:
-        """Every sequence with every seed."""
-        return [Instance(sequence, seed) for sequence in sequences for seed in seeds]
+    def instances(self, sequences: Sequence[str], repeats: Sequence[tuple[int, int]]) -> list[Instance]:
+        """Every sequence in every repeat, a pair of seed and start offset."""
+        return [Instance(sequence, *repeat) for sequence in sequences for repeat in repeats]
 
     def run(
         self,
@@ -134,14 +144,14 @@ class Evaluator:
         """
         spec = RunSpec(
             tracker=self.spec.tracker, sequence=instance.sequence, settings=dict(settings), seed=instance.seed,
-            threads=self.spec.threads, cache=cache, data_root=self.spec.data_root,
+            offset=instance.offset, threads=self.spec.threads, cache=cache, data_root=self.spec.data_root,
         )  # fmt: skip
         listener = None if on_progress is None else (lambda _, partial: on_progress(partial))
         (record,) = run_many([spec], results=self.store, on_progress=listener, protocol=self.protocol)
         if record.status == "stopped":
             return None
         if record.failed:
-            raise InstanceFailedError(f"{instance.sequence}, seed {instance.seed}: {record.status}: {record.reason}")
+            raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
         return self.outcome(record, instance)
 
     def ate_of_first(self, run_id: str, frames: int) -> float | None:

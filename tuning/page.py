@@ -35,7 +35,8 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec, study = tuner.spec, tuner.study
-    tables = [_candidates(summary), _trials(tuner)]
+    summary = summary.model_copy(update={"split_notes": tuner.split_notes})  # a stored one may be older than the check
+    tables = [_candidates(summary), _trials(tuner, summary)]
     figures = _figures(tuner, summary)
     settings = {**spec.space.fixed, **summary.candidates[0].params}
     sections = [
@@ -73,7 +74,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             (str(states.get("fail", 0)), "failed"),
             (str(len(spec.tune)), "tune sequences"),
             (str(len(spec.held_out)), "held-out sequences"),
-            (str(len(spec.seeds)), "seeds"),
+            (str(len(spec.seeds) * len(spec.offsets)), "repeats (seeds x start offsets)"),
         ],
         footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
         f"Reproduce: {' '.join(study.user_attrs.get('command', []))}",
@@ -161,7 +162,7 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
 
 def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Block]:
     captions = {
-        "ratios": "Geometric-mean ATE ratio with fresh seeds and its 95 % bootstrap interval.",
+        "ratios": "Geometric-mean ATE ratio in fresh repeats and its 95 % bootstrap interval.",
         "history": "Every finished trial; trial 0 is the default.",
         "front": "Accuracy against speed.",
         "importances": "",
@@ -171,7 +172,7 @@ def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Block]:
 
 
 def _warnings(tuner: Tuner) -> list[str]:
-    notes = []
+    notes = _copies(tuner)
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if len(finished) < 20:
         notes.append(f"Only {len(finished)} trials were finished: the best value is partly luck.")
@@ -179,6 +180,23 @@ def _warnings(tuner: Tuner) -> list[str]:
     if broken:
         notes.append(f"{len(broken)} trials violate a constraint and are not candidates.")
     return notes
+
+
+def _copies(tuner: Tuner) -> list[str]:
+    """What seeds changed: runs of the same trial that differ in the seed only and are equal to the last bit."""
+    if len(tuner.spec.seeds) < 2:
+        return []
+    errors: dict[tuple[Any, ...], list[float]] = {}
+    for trial in tuner.study.get_trials(deepcopy=False):
+        for sequence, _, _, ate, _, _, *offset in trial.user_attrs.get("instances", []):
+            errors.setdefault((trial.number, sequence, *offset), []).append(ate)
+    several = [each for each in errors.values() if len(each) > 1]
+    if not several or any(len(set(each)) > 1 for each in several):
+        return []
+    return [
+        f"The {len(tuner.spec.seeds)} seeds changed nothing: all runs that differ in the seed alone are equal, so they "
+        "count as copies and not as repeats. Name start offsets in place of seeds."
+    ]
 
 
 def _candidates(summary: StudySummary) -> Table:
@@ -204,18 +222,32 @@ def _candidates(summary: StudySummary) -> Table:
         for number, candidate in enumerate(summary.candidates)
     ]
     caption = (
-        "ATE ratios to the default settings on the same sequences and seeds, geometric mean, 95 % bootstrap interval "
-        "over sequences and seeds. The best on the tune split with fresh seeds is chosen; the held-out split only "
-        "judges. Frame times without the stage cache."
+        "ATE ratios to the default settings on the same sequences and repeats, geometric mean, 95 % bootstrap interval "
+        "over sequences and repeats. The best on the tune split in fresh repeats is chosen; the held-out split only "
+        f"judges. Frame times without the stage cache.{_repeats(summary)}{_apart(summary)}"
     )
     columns = [
         Column("trial"), Column("in the study", meaning="the trial's own value, optimistic: it was selected for it"),
-        Column("tune, fresh seeds"), Column("held-out"), Column("frame ms"), Column("constraints hold", numeric=False),
+        Column("tune, fresh repeats"), Column("held-out"), Column("frame ms"),
+        Column("constraints hold", numeric=False),
     ]  # fmt: skip
     return Table("candidates", "The best trials, run again", caption, columns, rows)
 
 
-def _trials(tuner: Tuner) -> Table:
+def _repeats(summary: StudySummary) -> str:
+    return (
+        f" Fresh repeats: {summary.repeats}; for a tracker that draws nothing from its seed, the start alone counts."
+        if summary.repeats
+        else ""
+    )
+
+
+def _apart(summary: StudySummary) -> str:
+    """A warning for every table of a study whose splits are not apart."""
+    return f" The splits are NOT apart: {'; '.join(summary.split_notes)}." if summary.split_notes else ""
+
+
+def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     names = [parameter.name for parameter in tuner.space]
     objectives = tuner.spec.objectives
     rows = []
@@ -238,7 +270,8 @@ def _trials(tuner: Tuner) -> Table:
         *(Column("ATE ratio" if objective == "accuracy" else "real-time factor") for objective in objectives),
         Column("coverage"), Column("fps"), *(Column(name) for name in names),
     ]  # fmt: skip
-    return Table("trials", "All trials", "Reasons of pruned and failed trials stand behind their state.", columns, rows)
+    caption = f"Reasons of pruned and failed trials stand behind their state.{_apart(summary)}"
+    return Table("trials", "All trials", caption, columns, rows)
 
 
 def _number(value: Any, form: str) -> TableCell:

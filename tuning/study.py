@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ from .dominance import hopeless
 from .objective import Configuration, Evaluator, Instance, InstanceFailedError, Outcome, check_sequences, log_ratio
 from .samplers import build_pruner, build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
+from .splits import check_splits
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
 from .study_file import StudySpec
 
@@ -81,9 +83,10 @@ class Tuner:
         self.base = flatten(defaults)
         sampler, pruner = build_sampler(spec), build_pruner(spec)
         check_sequences(spec)
+        self.split_notes = check_splits(spec, refuse=not reading)
         self.evaluator = Evaluator(spec, self.results)
         self.evaluator.store.prepare()
-        self.tune_instances = self.evaluator.instances(spec.tune, spec.seeds)
+        self.tune_instances = self.evaluator.instances(spec.tune, list(product(spec.seeds, spec.offsets)))
         self.folder = study_folder(self.results, spec)
         self.study = self._open(sampler, pruner)
         self._lock = threading.Lock()
@@ -125,7 +128,7 @@ class Tuner:
 
         def one(instance: Instance) -> Outcome:
             number = self.tune_instances.index(instance)
-            _tell(on_event, "reference", number, len(self.tune_instances), f"{instance.sequence} seed {instance.seed}")
+            _tell(on_event, "reference", number, len(self.tune_instances), str(instance))
             try:
                 outcome = self.evaluator.run(self.spec.space.fixed, instance, cache=self.spec.cache)
             except InstanceFailedError as error:
@@ -196,7 +199,10 @@ class Tuner:
         trial.set_user_attr("rtf", found.rtf)
         trial.set_user_attr(
             "instances",
-            [[o.instance.sequence, o.instance.seed, o.run_id, o.ate_m, o.coverage, o.frame_s] for o in found.outcomes],
+            [
+                [o.instance.sequence, o.instance.seed, o.run_id, o.ate_m, o.coverage, o.frame_s, o.instance.offset]
+                for o in found.outcomes
+            ],
         )
 
     def _pruned(self, trial: optuna.Trial, found: Configuration, text: str) -> tuple[TrialState, None, str]:
@@ -304,10 +310,14 @@ class Tuner:
     def _identity(self) -> dict[str, Any]:
         """What must be the same when a study is resumed."""
         spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage"})
+        if not self.spec.allow_overlap:
+            del spec["allow_overlap"]  # as in studies of before it was there
+        defaults = apply_overrides(self.tracker.settings(), self.spec.space.fixed)
+        masks = str(getattr(getattr(defaults, "segmentation", None), "source", ""))
         return {
             **spec,
             "version": dynslam_bench.__version__,
-            "source": source_fingerprint(self.tracker),
+            "source": source_fingerprint(self.tracker, defaults, masks),
             "parameters": digest([repr(parameter) for parameter in self.space]),
         }
 
@@ -335,11 +345,16 @@ def run_study(
 
 
 def _same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:
-    return all(stored.get(key) == now.get(key) for key in (stored.keys() | now.keys()) - set(but))
+    return all(_of(stored, key) == _of(now, key) for key in (stored.keys() | now.keys()) - set(but))
+
+
+def _of(identity: dict[str, Any], key: str) -> Any:
+    """A part of a study's identity; studies from before there were start offsets had none."""
+    return identity.get(key, [0] if key == "offsets" else None)
 
 
 def _difference(stored: dict[str, Any], now: dict[str, Any]) -> str:
-    changed = [key for key in now if stored.get(key) != now[key]]
+    changed = [key for key in now if _of(stored, key) != now[key]]
     first = changed[0] if changed else next(iter(stored.keys() - now.keys()), "content")
     more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
     return f"{first}{more}: {_short(stored.get(first))} there, {_short(now.get(first))} here"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from dynslam_bench.core.errors import StudyError, did_you_mean
+from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
 from dynslam_bench.core.records import Record, digest
+from dynslam_bench.sequences.catalogue import entry_of
+from dynslam_bench.sequences.synthetic import parse_synthetic_id
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -19,6 +21,7 @@ else:
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
 PrunerName = Literal["none", "median", "hyperband", "wilcoxon"]
 ObjectiveName = Literal["accuracy", "speed"]
+Offset = Annotated[int, Field(ge=0)]
 
 
 class _Part(Record):
@@ -48,14 +51,18 @@ class StudySpec(_Part):
         tune: Sequences that trials run on.
         held_out: Sequences that decide at the end whether tuning helped; no trial sees them.
         space: Which settings are tuned.
-        objectives: ``accuracy``: geometric mean over sequences and seeds of the ATE ratio to the default settings (its
-            logarithm is minimised); ``speed``: real-time factor (maximised).
+        allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
+            other split; every table of the study then says so.
+        objectives: ``accuracy``: geometric mean over sequences and repeats of the ATE ratio to the default settings
+            (its logarithm is minimised); ``speed``: real-time factor (maximised).
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
-        seeds: Seeds that every configuration runs with (common random numbers).
+        seeds: Seeds that every configuration runs with (common random numbers). A seed changes nothing for a tracker
+            that draws nothing from it.
+        offsets: Start offsets that every configuration runs with: so many leading frames are left out.
         trials: Finished trials, trial 0 (the default settings) included.
         timeout_s: No trial begins after this many seconds; None for no limit.
-        top: How many of the best configurations are run again with fresh seeds.
+        top: How many of the best configurations are run again with fresh repeats.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
         pruner: Who ends hopeless trials early; several objectives are ended early by dominance instead.
@@ -71,11 +78,13 @@ class StudySpec(_Part):
     tracker: str = "emfoa-oft"
     tune: tuple[str, ...] = Field(min_length=1)
     held_out: tuple[str, ...] = ()
+    allow_overlap: bool = False
     space: SpaceSpec = SpaceSpec()
     objectives: tuple[ObjectiveName, ...] = Field(default=("accuracy",), min_length=1)
     min_coverage: float | None = Field(default=0.95, ge=0, le=1)
     min_fps: float | None = Field(default=None, gt=0)
-    seeds: tuple[int, ...] = Field(default=(0, 1), min_length=1)
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    offsets: tuple[Offset, ...] = Field(default=(0, 3), min_length=1)
     trials: int = Field(default=40, ge=2)
     timeout_s: float | None = Field(default=None, gt=0)
     top: int = Field(default=3, ge=1)
@@ -91,13 +100,16 @@ class StudySpec(_Part):
     @model_validator(mode="after")
     def _splits_are_apart(self) -> StudySpec:
         for name, values in (("tune", self.tune), ("held_out", self.held_out), ("seeds", self.seeds),
-                             ("objectives", self.objectives)):  # fmt: skip
+                             ("offsets", self.offsets), ("objectives", self.objectives)):  # fmt: skip
             twice = sorted({str(value) for value in values if list(values).count(value) > 1})
             if twice:
                 raise ValueError(f"{name} names '{twice[0]}' twice")
-        both = sorted({_identity(s) for s in self.tune} & {_identity(s) for s in self.held_out})
-        if both:
-            raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{both[0]}'")
+        held_out = {_identity(name): name for name in reversed(self.held_out)}
+        both = [(name, held_out[_identity(name)]) for name in self.tune if _identity(name) in held_out]
+        if both and not self.allow_overlap:
+            one, other = both[0]
+            spelled = "" if one == other else f", held out as '{other}'"
+            raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{one}'{spelled}")
         return self
 
     def digest(self) -> str:
@@ -132,6 +144,16 @@ def read_study(path: str | Path) -> StudySpec:
         raise StudyError(f"{path}: {where + ': ' if where else ''}{text}") from None
 
 
-def _identity(sequence: str) -> str:
-    """The sequence without the part of it that is taken: other frames of a sequence are no other sequence."""
-    return sequence.partition("?")[0] if sequence.startswith("synthetic/") else sequence.rstrip("/")
+def _identity(name: str) -> str:
+    """What a name stands for, as far as the name alone tells (see `splits.check_splits` for the content).
+
+    The frames that are taken of a sequence, and the draw of its noise, make no other sequence.
+    """
+    if name.startswith("synthetic/"):
+        try:
+            parsed = parse_synthetic_id(name)
+        except SequenceError:
+            return name  # refused with a did-you-mean where it is opened
+        return f"{parsed.name}@{parsed.instance}"
+    entry = entry_of(name)
+    return entry.id if entry is not None else str(Path(name).expanduser().resolve())

@@ -83,17 +83,21 @@ def start(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
+LISTS = ("--seed", "--offset")
+"""Options that take several whole numbers."""
+
+
 def expand_lists(arguments: list[str]) -> list[str]:
-    """Let ``--seed 0 1 2`` stand for ``--seed 0 --seed 1 --seed 2``."""
+    """Let ``--seed 0 1 2`` stand for ``--seed 0 --seed 1 --seed 2``; likewise every option of `LISTS`."""
     expanded: list[str] = []
-    following = False
+    following = ""
     for argument in arguments:
-        if following and argument.isdigit() and expanded[-1] != "--seed":
-            expanded.append("--seed")
-        elif argument != "--seed" and not argument.isdigit():
-            following = False
-        if argument == "--seed":
-            following = True
+        if argument in LISTS:
+            following = argument
+        elif not argument.isdigit():
+            following = ""
+        elif following and expanded[-1] not in LISTS:
+            expanded.append(following)
         expanded.append(argument)
     return expanded
 

@@ -96,6 +96,7 @@ def tune_a_little(results: Path, *, frames: int, jobs: int, trials: int) -> tupl
         held_out=(f"synthetic/walking_static@101?frames={frames}",),
         space=SpaceSpec(include=STUDIED),
         seeds=(0,),
+        offsets=(0,),
         trials=trials,
         top=1,
         min_coverage=0.9,

@@ -29,6 +29,12 @@ Seeds = Annotated[
     Optional[list[int]],  # noqa: UP045
     typer.Option("--seed", help="Seeds, several allowed: --seed 0 1 2."),
 ]
+Offsets = Annotated[
+    Optional[list[int]],  # noqa: UP045
+    typer.Option(
+        "--offset", min=0, help="Start so many frames later, a repeat on the same frames; several: --offset 0 1 2."
+    ),
+]
 Assignments = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--set", metavar="NAME=VALUE", help="Set a setting, e.g. epipolar.threshold_px=1.5; repeatable."),

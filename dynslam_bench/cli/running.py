@@ -16,6 +16,7 @@ from .options import (
     Device,
     Frames,
     Jobs,
+    Offsets,
     ProtocolId,
     Results,
     Retry,
@@ -41,6 +42,7 @@ def run(
     tracker: Annotated[str, typer.Argument(help="Id, replay:FILE, module:Attr or file.py:Attr.")],
     sequences: Annotated[list[str], typer.Argument(metavar="SEQUENCE...", help="Ids or folders in TUM layout.")],
     seed: Seeds = None,
+    offset: Offsets = None,
     assignments: Assignments = None,
     settings: SettingsFile = None,
     preset: Annotated[Optional[str], typer.Option(help="A preset of the tracker.")] = None,  # noqa: UP045
@@ -88,14 +90,15 @@ def run(
     strengths = parse_strengths(degrade or ())
     specs = [
         RunSpec(
-            tracker=tracker, sequence=sequence, settings=overrides, frames=part, stride=stride, seed=number,
-            device=device, threads=threads, realtime=realtime, video=video, sheet=sheet, camera=camera, cache=cache,
-            drop_share=drop, degrade=strengths,
+            tracker=tracker, sequence=sequence, settings=overrides, frames=part, offset=skipped, stride=stride,
+            seed=number, device=device, threads=threads, realtime=realtime, video=video, sheet=sheet, camera=camera,
+            cache=cache, drop_share=drop, degrade=strengths,
             data_root=None if data_root is None else str(data_root),
             limits=Limits(time_s=time_limit, memory_mb=memory_limit),
         )
         for sequence in sequences
         for number in (seed or [0])
+        for skipped in (offset or [0])
     ]  # fmt: skip
     finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json)
 
@@ -129,6 +132,7 @@ def bench(
         typer.Option("--tracker", help="Only this tracker, or another one; repeatable."),
     ] = None,
     seed: Seeds = None,
+    offset: Offsets = None,
     frames: Frames = None,
     device: Device = "auto",
     threads: Annotated[Optional[int], typer.Option(min=1, help="Threads of a run.")] = None,  # noqa: UP045
@@ -147,7 +151,7 @@ def bench(
 
     specs = load_suite(suite).specs(
         data_root=data_root, device=device, threads=threads, trackers=tuple(tracker or ()), seeds=tuple(seed or ()),
-        frames=None if frames is None else parse_frames(frames),
+        offsets=tuple(offset or ()), frames=None if frames is None else parse_frames(frames),
     )  # fmt: skip
     finish(
         specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json, scheduler=scheduler

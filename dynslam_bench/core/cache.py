@@ -1,22 +1,20 @@
 """The stage cache: what does not depend on the settings under study is computed once and stored with its cost.
 
-Entries are addressed by content: the key digests the stage, its version, its settings, the machine, the threads and the
-input itself, so that nothing stale is ever returned. Each entry is one file that appears by atomic rename, so many
-processes may share a cache; the least recently used entries go when it grows over its bound.
+Entries are addressed by content: the key digests the stage, its code (a plug-in's too), its settings, the machine, the
+threads and the input itself (see `core.fingerprint`), so that nothing stale is ever returned. Each entry is one file
+that appears by atomic rename, so many processes may share a cache; the least recently used entries go when it grows
+over its bound.
 """
 
 from __future__ import annotations
 
-import hashlib
 import io
 import os
-import platform
 import time
 import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DynslamError
-from .records import digest
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_CACHE"
 DEFAULT_MAX_BYTES = 8 * 2**30
@@ -62,29 +59,6 @@ def default_folder() -> Path:
     named = os.environ.get(ENVIRONMENT_VARIABLE)
     base = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "dynslam-bench"
     return base / "stages"
-
-
-@cache
-def machine_digest() -> str:
-    """Short digest of the machine and the versions that change a stage's result or its cost."""
-    import importlib.metadata
-
-    versions = {}
-    for name in ("numpy", "opencv-python-headless", "torch", "dynslam-bench"):
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = ""
-    return digest({"node": platform.node(), "cpu": _cpu_name(), "versions": versions})
-
-
-def content_digest(*arrays: NDArray[Any]) -> str:
-    """Digest of the bytes, shapes and types of arrays."""
-    state = hashlib.blake2b(digest_size=16)
-    for array in arrays:
-        state.update(f"{array.dtype.str}{array.shape}".encode())
-        state.update(np.ascontiguousarray(array).data)
-    return state.hexdigest()
 
 
 class StageCache:
@@ -190,11 +164,3 @@ class StageCache:
                 continue
             found.append((status.st_mtime, path, status.st_size))
         return found
-
-
-def _cpu_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")

@@ -16,10 +16,12 @@ Example:
 from __future__ import annotations
 
 import json
+import os
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -30,6 +32,7 @@ from .errors import SettingsError, did_you_mean
 S = TypeVar("S", bound="Settings")
 Scalar = bool | int | float | str
 _KEY = "tunable"
+_NAMES = "names"
 
 
 class Settings(BaseModel):
@@ -111,6 +114,37 @@ def tunable(
     if accepted[1] is not None:
         bounds["le"] = accepted[1]
     return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, **bounds)
+
+
+def names(default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = "") -> Any:
+    """A field of text that names something else, whose content decides the result as well.
+
+    Args:
+        default: The default value.
+        kind: ``file``: a path of a file or folder; else a plug-in of that kind, by id or ``module:Attr``.
+        meaning: One line for the documentation table.
+        otherwise: Environment variable that names it where the field is empty.
+    """
+    extra: Any = {_NAMES: {"kind": kind, "otherwise": otherwise}}
+    return Field(default, description=meaning, json_schema_extra=extra)
+
+
+def named(settings: Settings) -> dict[str, tuple[str, str]]:
+    """What the settings name: dotted name to ``(kind, value)``, see `names`; fields that name nothing are left out.
+
+    A field of type `Path` counts as a file, too.
+    """
+    found = {}
+    for name, field in _leaves(type(settings)):
+        extra = field.json_schema_extra
+        note = extra.get(_NAMES) if isinstance(extra, dict) else None
+        value = _get(settings, name)
+        if isinstance(note, dict):
+            value = value or os.environ.get(str(note["otherwise"]), "")
+            found[name] = (str(note["kind"]), str(value))
+        elif isinstance(value, Path):
+            found[name] = ("file", str(value))
+    return {name: each for name, each in found.items() if each[1]}
 
 
 def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:

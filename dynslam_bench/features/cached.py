@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.cache import StageCache, content_digest, machine_digest
+from dynslam_bench.core.cache import StageCache
+from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
 
 from .keypoints import FeatureExtractor, Keypoints
+from .registry import FEATURES
 
-VERSION = 1
-"""Raise it when a change of the extractor changes its keypoints."""
+_ROOMS = ("core", "features")
+"""The rooms whose code decides what an extractor finds."""
 
 
 class CachedExtractor:
-    """An extractor whose results are stored, addressed by the image and the settings.
+    """An extractor whose results are stored, addressed by the image, the extractor's code and the settings.
+
+    Args:
+        extractor: Who extracts; the one that the settings name.
+        settings: Its settings.
+        cache: Where results are stored.
+        threads: Threads of the extractor, part of the cost.
 
     Attributes:
         hit: Whether the last call found its result stored.
@@ -30,6 +39,7 @@ class CachedExtractor:
         self._extractor = extractor
         self._cache = cache
         self._threads = threads
+        self._code = code_of(settings)
         self.settings = settings
         self.hit = False
         self.saved_s = 0.0
@@ -44,7 +54,8 @@ class CachedExtractor:
         self._settings = settings
         if hasattr(self._extractor, "settings"):
             self._extractor.settings = settings
-        self._prefix = digest([VERSION, settings.model_dump(mode="json"), machine_digest(), self._threads])
+        weights = named_digests(settings)
+        self._prefix = digest([self._code, weights, settings.model_dump(mode="json"), machine_digest(), self._threads])
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image."""
@@ -63,3 +74,19 @@ class CachedExtractor:
         self._cache.put("features", key, vars(found), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
         return found
+
+
+def code_of(settings: Settings) -> str:
+    """Digest of the code of the extractor that feature settings name: this package's, and a plug-in's own.
+
+    It is read once a process, when the plug-in is loaded: a file that is edited later is not what runs here.
+
+    Raises:
+        PluginError: No such extractor, or its code cannot be read.
+    """
+    return _code_behind(FEATURES.get(str(getattr(settings, "extractor", "orb"))).entry_point)
+
+
+@cache
+def _code_behind(entry_point: str) -> str:
+    return code_digest(entry_point, _ROOMS)

@@ -6,13 +6,15 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
-from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.settings import Settings, names, tunable
 
 
 class FeatureSettings(Settings):
     """How keypoints are found and described."""
 
-    extractor: str = Field("orb", description="id of the extractor: built in ('orb') or a plug-in of kind 'features'")
+    extractor: str = names(
+        "orb", "features", meaning="id of the extractor: built in ('orb') or a plug-in of kind 'features'"
+    )
     n_features: int = tunable(
         1000, low=300, high=3000, limits=(1, 20000), scale="log", meaning="keypoints sought in each image"
     )

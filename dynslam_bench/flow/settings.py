@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
-from dynslam_bench.core.settings import Scalar, Settings, tunable
+from dynslam_bench.core.settings import Scalar, Settings, names, tunable
 
 _DAISY = {"method": ["daisy"]}
 _EMFOA = {
@@ -41,8 +39,8 @@ class FlowSettings(Settings):
     method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
         "daisy", meaning="DAISY Filter Flow with a label search, pyramidal Lucas-Kanade, or dense inverse search"
     )
-    plugin: str = Field(
-        "", description="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`"
+    plugin: str = names(
+        "", "flow", meaning="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`"
     )
     mode: Literal["sparse", "dense"] = tunable(
         "sparse",

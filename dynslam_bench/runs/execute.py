@@ -13,6 +13,7 @@ from typing import Any
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.sequences.part import part_of
 
 from .child import FRAMES_FILE
 from .forkserver import THREAD_VARIABLES
@@ -94,20 +95,21 @@ def run_one(
     return record
 
 
-def sequence_info(resolved_sequence: Any, content: str, part: str) -> SequenceInfo:
-    """What a record keeps of a sequence."""
-    sequence = resolved_sequence
+def sequence_info(resolved_sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
+    """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
+    sequence, seen = resolved_sequence, part_of(resolved_sequence, offset)
     stamps = sequence.timestamps
     return SequenceInfo(
-        id=sequence.id, content=content, part=part, frames=len(sequence), duration_s=float(stamps[-1] - stamps[0]),
-        fps=sequence.fps, ground_truth=sequence.ground_truth is not None, license=sequence.license,
-        citation=sequence.citation, tags=sorted(getattr(sequence, "tags", ())), split=getattr(sequence, "split", ""),
+        id=sequence.id, content=content, part=part, block=seen.block, noise=seen.noise, frames=len(sequence),
+        duration_s=float(stamps[-1] - stamps[0]), fps=sequence.fps, ground_truth=sequence.ground_truth is not None,
+        license=sequence.license, citation=sequence.citation, tags=sorted(getattr(sequence, "tags", ())),
+        split=getattr(sequence, "split", ""),
     )  # fmt: skip
 
 
 def part_digest(identity: dict[str, Any]) -> str:
     """Names what of the sequence a run saw: content and frames."""
-    return digest({key: identity[key] for key in ("sequence", "content", "frames", "stride")}, 16)
+    return digest({key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16)
 
 
 def _partial(message: dict[str, Any]) -> dict[str, Any]:
@@ -128,8 +130,9 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
             license=tracker.license, citation=tracker.citation, remarks=tracker.remarks,
         ),
         overrides=spec.settings, settings=flatten(resolved.settings),
-        sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity)),
-        frames=spec.frames, stride=spec.stride, seed=spec.seed, device=resolved.device, threads=spec.threads,
+        sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
+        frames=spec.frames, offset=spec.offset, stride=spec.stride, seed=spec.seed, device=resolved.device,
+        threads=spec.threads,
         realtime=spec.realtime, drop_share=spec.drop_share, degrade=identity["degrade"],
         segmentation=resolved.segmentation, n_frames=total, n_processed=len(frames.rows) - dropped, n_tracked=tracked,
         n_lost=frames.count("lost"), n_initialising=frames.count("initialising"), n_dropped=dropped,

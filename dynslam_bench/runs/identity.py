@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
-import sys
-from dataclasses import asdict, dataclass
-from functools import cache, lru_cache
+from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import packages_distributions, version
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import dynslam_bench
 from dynslam_bench.core.errors import RunError, SequenceError
+from dynslam_bench.core.fingerprint import code_digest, named_digests, plugin_digest
+from dynslam_bench.core.plugins import Registry
 from dynslam_bench.core.records import digest
-from dynslam_bench.core.settings import Settings, flatten
+from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
 from dynslam_bench.envs.source import open_frames, preprocessing_of
-from dynslam_bench.segmentation.build import resolve_source
+from dynslam_bench.features.registry import FEATURES
+from dynslam_bench.flow.spec import FLOWS
+from dynslam_bench.segmentation.build import resolve_source, weights_digest
+from dynslam_bench.segmentation.registry import SEGMENTERS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.frame import Sequence
+from dynslam_bench.sequences.part import part_of
 from dynslam_bench.trackers.protocol import TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
@@ -29,7 +31,6 @@ from .spec import RunSpec
 
 _ROOMS = ("core", "geometry", "sequences", "features", "segmentation", "flow", "culling", "slam", "trackers", "envs")
 """The rooms whose source a trajectory may depend on."""
-_MOST_FILES = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         raise RunError(f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing))
     settings = resolve_settings(tracker, spec.settings)
     sequence = open_frames(
-        spec.sequence, spec.data_root, spec.camera, spec.frames, spec.stride, preprocessing_of(settings)
+        spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride, preprocessing_of(settings)
     )
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
@@ -82,19 +83,22 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     device = resolve_device(spec.device)
     source = _segmentation_source(settings, sequence)
     known = versions()
+    part = part_of(sequence, spec.offset)
     identity = {
         "tracker": tracker.id,
         "tracker_version": tracker.version,
         "distribution": distribution_of(tracker),
-        "source": source_fingerprint(tracker),
+        "source": source_fingerprint(tracker, settings, source),
+        "requires": {module: _version_of(module) for module in sorted(tracker.requires)},
         "settings": flatten(settings),
         "segmentation": source,
         "weights": weights_of(settings, source),
-        "sequence": sequence.id,
-        "content": sequence.digest(),
-        "camera": asdict(sequence.camera),
-        "frames": spec.frames,
-        "stride": spec.stride,
+        "sequence": part.id,
+        "content": part.content,
+        "camera": part.camera,
+        "frames": [part.start, part.stop],
+        "offset": spec.offset,
+        "stride": part.stride,
         "seed": spec.seed,
         "device": device,
         "threads": spec.threads,
@@ -117,33 +121,50 @@ def distribution_of(tracker: TrackerSpec) -> str:
     return f"{names[0]} {version(names[0])}" if names else ""
 
 
-def source_fingerprint(tracker: TrackerSpec) -> str:
-    """Digest of the source that the tracker runs: this package's, and the plug-in's own.
+def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, source: str = "") -> str:
+    """Digest of the code that the tracker runs: this package's, the tracker's own, and that of plug-ins it names.
 
-    A plug-in in a file counts with all Python files of its folder, one in a package with all of the package's.
+    Args:
+        tracker: The tracker.
+        settings: Its settings; the plug-ins that they name count with their code.
+        source: Where its masks come from; ``plugin:ID`` counts with its code.
+
+    Raises:
+        PluginError: A plug-in is unknown, or its code cannot be read.
     """
-    module = tracker.entry_point.rpartition(":")[0]
-    parts = [_package_fingerprint()]
-    if module.endswith(".py"):
-        parts.append(_digest_files(sorted(Path(module).expanduser().resolve().parent.glob("*.py"))))
-    elif module.partition(".")[0] != "dynslam_bench":
-        parts.append(_digest_files(_module_files(module)))
-    return digest(parts)
+    points = {} if settings is None else entry_points_of(settings, source)
+    own = code_digest(tracker.entry_point, _ROOMS)
+    return digest([own, {name: plugin_digest(point) for name, point in sorted(points.items())}])
+
+
+def entry_points_of(settings: Settings, source: str = "") -> dict[str, str]:
+    """Entry points of the plug-ins that settings name, by the setting's name.
+
+    Raises:
+        PluginError: A plug-in is unknown.
+    """
+    registries: dict[str, Registry[Any]] = {"features": FEATURES, "flow": FLOWS}
+    found = {
+        name: registries[kind].get(value).entry_point
+        for name, (kind, value) in named(settings).items()
+        if kind in registries
+    }
+    prefix, _, argument = source.partition(":")
+    if prefix == "plugin":
+        found["segmentation.source"] = SEGMENTERS.get(argument).entry_point
+    return found
 
 
 def weights_of(settings: Settings, source: str) -> dict[str, str]:
-    """Digest of every file that the settings name, by the setting's name; of the embedded network where it is used."""
-    found = {}
-    for name, value in flatten(settings).items():
-        path = _named_path(value)
-        if path is not None:
-            found[name] = _digest_path(path)
-    if source == "embedded":
-        from dynslam_bench.segmentation.checkpoints import embedded_weights
+    """Digest of every file that the settings name, by the setting's name; of the network in use where none is named.
 
-        weights = embedded_weights()
-        if weights is not None:
-            found["embedded"] = _digest_path(Path(str(weights)))
+    Raises:
+        PluginError: A file cannot be read.
+    """
+    found = named_digests(settings)
+    group = getattr(settings, "segmentation", None)
+    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
+        found[source] = weights_digest(group.model_copy(update={"source": source}))
     return found
 
 
@@ -162,57 +183,12 @@ def _check_degradation(strengths: dict[str, float]) -> None:
     Degradation(seed=0, **strengths)
 
 
-@cache
-def _package_fingerprint() -> str:
-    roots = [Path(folder) / room for folder in dynslam_bench.__path__ for room in _ROOMS]
-    return _digest_files([file for root in roots for file in sorted(root.rglob("*.py"))])
+def _version_of(module: str) -> str:
+    """Version of the distribution that a required module comes from; empty where it is not known."""
+    names = _distributions().get(module.partition(".")[0], [])
+    return version(names[0]) if names else ""
 
 
 @cache
 def _distributions() -> dict[str, list[str]]:
     return {top: list(names) for top, names in packages_distributions().items()}
-
-
-def _module_files(module: str) -> list[Path]:
-    """Source files of a module's top-level package, found without importing it if it is not imported yet."""
-    top = module.partition(".")[0]
-    loaded = sys.modules.get(top)
-    spec = getattr(loaded, "__spec__", None) or find_spec(top)
-    if spec is None or spec.origin is None:
-        return []
-    origin = Path(spec.origin)
-    return sorted(origin.parent.rglob("*.py")) if origin.name == "__init__.py" else [origin]
-
-
-def _named_path(value: object) -> Path | None:
-    if not isinstance(value, str) or not value:
-        return None
-    for text in (value, value.partition(":")[2]):
-        path = Path(text).expanduser() if text else None
-        if path is not None and len(text) < 1000 and (path.is_file() or (path.is_dir() and text != ".")):
-            return path
-    return None
-
-
-def _digest_files(files: list[Path]) -> str:
-    whole = hashlib.sha256()
-    for file in files[:_MOST_FILES]:
-        whole.update(f"{file.name}\0{len(files)}\0".encode() + file.read_bytes())
-    return whole.hexdigest()[:16]
-
-
-def _digest_path(path: Path) -> str:
-    if path.is_file():
-        stat = path.stat()
-        return _digest_file(str(path), stat.st_size, stat.st_mtime_ns)
-    listing = [(str(file.relative_to(path)), file.stat().st_size) for file in sorted(path.rglob("*")) if file.is_file()]
-    return digest(listing)
-
-
-@lru_cache(maxsize=256)
-def _digest_file(path: str, size: int, mtime_ns: int) -> str:
-    whole = hashlib.sha256()
-    with Path(path).open("rb") as file:
-        while block := file.read(1 << 20):
-            whole.update(block)
-    return whole.hexdigest()[:16]

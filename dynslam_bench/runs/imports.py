@@ -16,6 +16,7 @@ from dynslam_bench.evaluation.frames import STAMP_TOLERANCE
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.tum_file import load_tum, write_tum
 from dynslam_bench.sequences.catalogue import parse_frames
+from dynslam_bench.sequences.part import part_of
 
 from .execute import part_digest, sequence_info
 from .machine import versions
@@ -85,14 +86,16 @@ def import_trajectory(
         notes.append(f"{odd} of {len(trajectory)} poses carry stamps that are no input frame's")
     covered = len(exact) if matching else len(near)
     part = None if frames is None else parse_frames(frames if isinstance(frames, str) else (frames[0] or 0, frames[1]))
+    seen = part_of(opened)
     identity: dict[str, Any] = {
         "kind": "imported", "tracker": tracker, "which": which, "file": sha256(file.read_bytes()).hexdigest(),
-        "sequence": opened.id, "content": opened.digest(), "frames": part, "stride": stride,
+        "sequence": seen.id, "content": seen.content, "frames": [seen.start, seen.stop], "offset": 0,
+        "stride": seen.stride,
     }  # fmt: skip
     record = RunRecord(
         kind="imported", run_id=digest(identity, 16), status="ok",
         tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        sequence=sequence_info(opened, opened.digest(), part_digest(identity)), frames=part, stride=stride,
+        sequence=sequence_info(opened, seen.content, part_digest(identity)), frames=part, stride=stride,
         n_frames=len(opened), n_tracked=covered, n_lost=len(opened) - covered, coverage=covered / len(opened),
         stamps_match=matching, started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(), identity=identity, provenance=provenance or str(file), notes=notes,

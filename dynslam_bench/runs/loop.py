@@ -45,7 +45,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     folder = Path(job["folder"])
     protocol = Protocol.model_validate(job["protocol"])
     base = SlamEnv(
-        spec.sequence, spec.tracker, settings=spec.settings, frames=spec.frames, stride=spec.stride,
+        spec.sequence, spec.tracker, settings=spec.settings, frames=spec.frames_seen, stride=spec.stride,
         device=spec.device, threads=spec.threads, cache=spec.cache, data_root=spec.data_root, camera=spec.camera,
         protocol=protocol, render_mode="rgb_array" if spec.video else None,
     )  # fmt: skip

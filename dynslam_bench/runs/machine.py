@@ -6,16 +6,13 @@ import os
 import platform
 import subprocess
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import dynslam_bench
+from dynslam_bench.core.fingerprint import distribution_version, opencv_version
 from dynslam_bench.core.records import Record
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "gtsam", "gymnasium", "optuna")
-_OPENCV = (
-    "opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python",
-)  # fmt: skip
 
 
 class Machine(Record):
@@ -65,12 +62,11 @@ def versions() -> dict[str, str]:
     """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
     found = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
     for name in PACKAGES:
-        installed = _version(name)
+        installed = distribution_version(name)
         if installed:
             found[name] = installed
-    opencv = next(filter(None, map(_version, _OPENCV)), "")
-    if opencv:
-        found["opencv"] = opencv
+    if opencv_version():
+        found["opencv"] = opencv_version()
     return found
 
 
@@ -91,13 +87,6 @@ def git_revision() -> GitRevision | None:
 def _git(folder: Path, *arguments: str) -> str:
     command = ["git", "-C", str(folder), *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=10).stdout.strip()
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""
 
 
 def _cpu_model() -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import ConfigDict, Field, field_validator
 
+from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.records import Record
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 
@@ -38,6 +39,7 @@ class RunSpec(Record):
         sequence: Id or path of a folder in TUM layout.
         settings: Overrides of the tracker's settings, dotted name to value.
         frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
+        offset: So many leading frames of that part are left out: a repeat on the same frames from a later start.
         stride: Take every so many frames.
         seed: Seed of everything random.
         device: ``auto``, ``cpu`` or ``cuda:N``.
@@ -60,6 +62,7 @@ class RunSpec(Record):
     sequence: str
     settings: dict[str, Any] = Field(default_factory=dict)
     frames: tuple[int, int | None] | None = None
+    offset: int = Field(default=0, ge=0)
     stride: int = Field(default=1, ge=1)
     seed: int = Field(default=0, ge=0, lt=2**63)
     device: str = "auto"
@@ -81,6 +84,18 @@ class RunSpec(Record):
         if isinstance(value, str):
             value = parse_frames(value)
         return None if value in ((0, None), [0, None]) else value
+
+    @property
+    def frames_seen(self) -> tuple[int, int | None] | None:
+        """The part that the tracker sees: `frames` without the `offset` leading ones; None for all.
+
+        Raises:
+            SequenceError: The offset leaves no frame of the part.
+        """
+        start, stop = self.frames or (0, None)
+        if stop is not None and start + self.offset >= stop:
+            raise SequenceError(f"offset {self.offset} leaves none of the {stop - start} frames {start}:{stop}")
+        return (start + self.offset, stop) if self.offset else self.frames
 
     def absolute(self) -> RunSpec:
         """The same run, named independently of the working folder."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 
 from dynslam_bench.core.errors import DynslamError, SegmentationError
+from dynslam_bench.core.fingerprint import path_digest
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.sequences.frame import Frame, MaskSource
 
@@ -171,8 +170,11 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
     """Digest of the file that decides what the segmenter sees; part of a run's identity.
 
     Returns:
-        The first 12 hexadecimal digits of the SHA-256 of the network's file, or of the names and sizes of recorded
+        The first 12 hexadecimal digits of the SHA-256 of the network's file, or of the names and contents of recorded
         masks; empty for sources without a file.
+
+    Raises:
+        SegmentationError: The file cannot be read.
     """
     source = resolve_source(settings, sequence_id, masks)
     prefix, _, argument = source.partition(":")
@@ -187,20 +189,10 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
         return ""
     if path is None or not path.exists():
         return ""
-    if path.is_dir():
-        names = "\n".join(f"{file.name} {file.stat().st_size}" for file in sorted(path.iterdir()) if file.is_file())
-        return hashlib.sha256(names.encode()).hexdigest()[:12]
-    stat = path.stat()
-    return _file_digest(path, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=16)
-def _file_digest(path: Path, modified: int, size: int) -> str:
-    with path.open("rb") as file:
-        digest = hashlib.sha256()
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()[:12]
+    try:
+        return path_digest(path)[:12]
+    except OSError as error:
+        raise SegmentationError(f"cannot read {error.filename}: {error.strerror}") from error
 
 
 def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:

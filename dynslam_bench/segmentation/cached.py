@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 
 import numpy as np
 
-from dynslam_bench.core.cache import Arrays, StageCache, content_digest, machine_digest
+from dynslam_bench.core.cache import Arrays, StageCache
+from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.sequences.frame import Frame
 
 from .build import LOWEST_CONFIDENCE, ConfiguredSegmenter, DeferredSegmenter, weights_digest
 from .instances import Instances, Segmenter
+from .registry import SEGMENTERS
 from .schedule import MaskScheduler
 
 NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
 """Sources whose masks depend on the colour image alone."""
-VERSION = 1
-"""Raise it when a change of a segmenter changes its masks."""
+_ROOMS = ("core", "sequences", "segmentation")
+"""The rooms whose code decides what a network sees."""
 
 
 class CachedSegmenter:
@@ -25,7 +28,7 @@ class CachedSegmenter:
 
     Args:
         segmenter: Who segments.
-        identity: JSON-able description of network, weights and settings that change its masks.
+        identity: JSON-able description of code, network, weights and settings that change its masks.
         cache: Where results are stored.
         threads: Threads of the network, part of the cost.
 
@@ -38,7 +41,7 @@ class CachedSegmenter:
     def __init__(self, segmenter: Segmenter, identity: object, cache: StageCache, threads: int) -> None:
         self._segmenter = segmenter
         self._cache = cache
-        self._prefix = digest([VERSION, identity, machine_digest(), threads])
+        self._prefix = digest([identity, machine_digest(), threads])
         self.hit = False
         self.saved_s = 0.0
 
@@ -93,6 +96,7 @@ def cache_segmenter(
         return None
     settings = configured.settings
     identity = {
+        "code": code_of(configured.source),
         "source": configured.source,
         "weights": weights_digest(settings, sequence_id),
         "confidence": min(LOWEST_CONFIDENCE, settings.confidence),
@@ -105,3 +109,20 @@ def cache_segmenter(
     cached = CachedSegmenter(configured.inner, identity, cache, threads)
     configured.inner = cached
     return cached
+
+
+def code_of(source: str) -> str:
+    """Digest of the code behind a semantic source: this package's, and a plug-in's own.
+
+    It is read once a process, when the plug-in is loaded: a file that is edited later is not what runs here.
+
+    Raises:
+        PluginError: No such segmenter, or its code cannot be read.
+    """
+    prefix, _, argument = source.partition(":")
+    return _code_behind(SEGMENTERS.get(argument if prefix == "plugin" else prefix).entry_point)
+
+
+@cache
+def _code_behind(entry_point: str) -> str:
+    return code_digest(entry_point, _ROOMS)

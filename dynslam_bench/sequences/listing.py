@@ -13,6 +13,7 @@ from dynslam_bench.core.errors import SequenceError
 from .catalogue import catalogue, entry_of, open_sequence
 from .datasets import DATASETS
 from .roots import find_data_root
+from .synthetic import parse_synthetic_id
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,9 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
             if entry is None:
                 rendered = dataset.spec.id == "synthetic"
                 tags = ("high-dynamic" if "walking" in name else "low-dynamic",) if rendered else ()
-                found.append(Summary(name, True, "rendered" if rendered else "", tags, license=dataset.spec.license))
+                split = parse_synthetic_id(name).split if rendered else ""
+                size = "rendered" if rendered else ""
+                found.append(Summary(name, True, size, tags, split, license=dataset.spec.license))
                 continue
             found.append(
                 Summary(

@@ -1,11 +1,11 @@
-"""A suite: which trackers on which sequences, with which seeds."""
+"""A suite: which trackers on which sequences, with which repeats."""
 
 from __future__ import annotations
 
 import sys
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, ValidationError
 
@@ -19,6 +19,9 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+
+Offset = Annotated[int, Field(ge=0)]
 
 
 class Variant(Record):
@@ -64,6 +67,7 @@ class Suite(Record):
         optional: Trackers that take part only where the packages they need are installed.
         sequences: Ids or folders.
         seeds: Seeds.
+        offsets: Start offsets: so many leading frames are left out; repeats, like seeds (see `RunSpec.offset`).
         frames: Part of every sequence, ``[start, stop]``; without it all.
         stride: Take every so many frames.
         threads: Threads of a run.
@@ -84,6 +88,7 @@ class Suite(Record):
     optional: tuple[str, ...] = ()
     sequences: tuple[str, ...] = Field(min_length=1)
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    offsets: tuple[Offset, ...] = Field(default=(0,), min_length=1)
     frames: tuple[int, int | None] | None = None
     stride: int = Field(default=1, ge=1)
     threads: int = Field(default=1, ge=1)
@@ -102,6 +107,7 @@ class Suite(Record):
         threads: int | None = None,
         trackers: tuple[str, ...] = (),
         seeds: tuple[int, ...] = (),
+        offsets: tuple[int, ...] = (),
         frames: tuple[int, int | None] | None = None,
     ) -> list[RunSpec]:
         """The runs of the suite, sequence by sequence so that rendered frames are shared while they are fresh.
@@ -112,6 +118,7 @@ class Suite(Record):
             threads: Threads of a run in place of the suite's.
             trackers: Only these trackers of the suite, or others in place of them.
             seeds: In place of the suite's seeds.
+            offsets: In place of the suite's start offsets.
             frames: In place of the suite's frames.
 
         Raises:
@@ -131,7 +138,8 @@ class Suite(Record):
         entries += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
         return [
             RunSpec(
-                tracker=tracker, sequence=sequence, seed=seed, frames=frames or self.frames, stride=self.stride,
+                tracker=tracker, sequence=sequence, seed=seed, offset=offset, frames=frames or self.frames,
+                stride=self.stride,
                 settings={
                     **{name: value for name, value in self.settings.items() if name in known[tracker]},
                     **self.tracker_settings.get(tracker, {}),
@@ -145,6 +153,7 @@ class Suite(Record):
             for variant in self.variants
             for tracker, own in entries
             for seed in seeds or self.seeds
+            for offset in offsets or self.offsets
         ]  # fmt: skip
 
 

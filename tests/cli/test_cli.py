@@ -286,6 +286,9 @@ def test_seed_lists():
         "2",
         "x",
     ]
+    assert expand_lists(["--seed", "4", "5", "--offset", "0", "2"]) == [
+        *("--seed", "4", "--seed", "5", "--offset", "0", "--offset", "2")
+    ]
     assert expand_lists(["--seed", "4", "--jobs", "2", "7"]) == ["--seed", "4", "--jobs", "2", "7"]
     assert expand_lists(["a", "--seed", "1", "--seed", "2", "3"]) == ["a", "--seed", "1", "--seed", "2", "--seed", "3"]
 

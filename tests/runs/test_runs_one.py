@@ -16,7 +16,7 @@ from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.geometry.tum_file import read_tum
-from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_one, score
+from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, resolve, run_one, score
 from dynslam_bench.runs.frames import FrameLog
 
 
@@ -69,6 +69,24 @@ def test_same_seed_same_run_and_other_seed_other_run(store: RunStore, toy_folder
         texts.append((record.run_id, (store.folder(record.run_id) / "trajectory_online.txt").read_text()))
     assert texts[0] == texts[1]
     assert texts[0][0] != texts[2][0] and texts[0][1] != texts[2][1]
+
+
+def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folder: str) -> None:
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(10, 40))
+    plain = run_one(spec, store)
+    late = run_one(spec.model_copy(update={"offset": 2}), store)
+    assert (plain.offset, plain.n_frames, plain.repeat) == (0, 30, "seed 0")
+    assert (late.offset, late.n_frames, late.repeat) == (2, 28, "seed 0, offset 2") and late.frames == (10, 40)
+    assert late.sequence.block == plain.sequence.block and late.sequence.part != plain.sequence.part
+    cut = run_one(spec.model_copy(update={"frames": (12, 40)}), store)
+    assert cut.run_id != late.run_id and cut.sequence.block != late.sequence.block
+    poses = [(store.folder(run.run_id) / "trajectory_online.txt").read_text().splitlines()[1:] for run in (late, cut)]
+    assert poses[0] == poses[1], "the tracker sees the same frames"
+    assert len(store.timestamps(late.sequence.part)) == 28
+    with pytest.raises(DynslamError, match="offset 30 leaves none of the 30 frames 10:40"):
+        resolve(spec.model_copy(update={"offset": 30}))
+    with pytest.raises(DynslamError, match=r"hold none of the 60 frames"):
+        resolve(RunSpec(tracker=TARGET, sequence=toy_folder, offset=60))
 
 
 LIMITS = Limits(frame_s=3.0)

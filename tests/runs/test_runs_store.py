@@ -27,15 +27,26 @@ def test_run_id_depends_on_what_matters_and_on_nothing_else(toy_folder: str, tmp
     same = [
         {"settings": {"noise.clip": "2.0"}}, {"settings": {"noise.clip": 2}}, {"limits": {"time_s": 5}},
         {"video": True}, {"sheet": True}, {"degrade": {"blur": 0.0}}, {"data_root": str(tmp_path)},
+        {"frames": "0:60"}, {"frames": (0, 900)}, {"offset": 0},
     ]  # fmt: skip
     assert {resolve(RunSpec(**(base | change))).run_id for change in same} == {first}
     other = [
         {"seed": 1}, {"settings": {"noise.clip": 2.5}}, {"frames": (0, 30)}, {"stride": 2}, {"threads": 2},
-        {"degrade": {"blur": 0.1}}, {"drop_share": 0.1}, {"realtime": True},
+        {"degrade": {"blur": 0.1}}, {"drop_share": 0.1}, {"realtime": True}, {"offset": 3}, {"frames": (3, None)},
         {"tracker": TARGET.replace(":SPEC", ":FIXED")},
     ]  # fmt: skip
     ids = [resolve(RunSpec(**(base | change))).run_id for change in other]
     assert len({first, *ids}) == len(ids) + 1
+
+
+def test_a_part_has_one_run_id_however_it_is_written() -> None:
+    def ids(sequence: str, **change) -> str:
+        return resolve(RunSpec(tracker="never-move", sequence=f"synthetic/walking_xyz{sequence}", **change)).run_id
+
+    first = ids("", frames="0:60")
+    assert ids("?frames=60") == ids("@0?frames=60") == ids("@000", frames=(0, 60)) == ids("?frames=90", frames=":60")
+    assert ids("?frames=60") == first != ids("?frames=61")
+    assert len({first, ids("?frames=60&noise=1"), ids("?frames=60&noise=2"), ids("?frames=60", offset=1)}) == 4
 
 
 def test_an_edited_plug_in_is_another_run(toy_folder: str, tmp_path: Path) -> None:
@@ -45,6 +56,40 @@ def test_an_edited_plug_in_is_another_run(toy_folder: str, tmp_path: Path) -> No
     before = resolve(spec).run_id
     plugin.write_text(plugin.read_text() + "\n# edited\n")
     assert resolve(spec).run_id != before
+
+
+def test_an_edited_plug_in_that_a_setting_names_is_another_run(
+    toy_folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    specs = {
+        "features.extractor": "from dynslam_bench.features.registry import FeatureSpec as Spec",
+        "flow.plugin": "from dynslam_bench.flow.spec import FlowSpec as Spec",
+        "segmentation.source": "from dynslam_bench.segmentation.registry import SegmenterSpec as Spec",
+    }
+    for name, text in specs.items():
+        plugin = tmp_path / name / "mine.py"
+        plugin.parent.mkdir()
+        plugin.write_text(f'{text}\n\nSPEC = Spec("mine", f"{{__file__}}:build")\n')
+        value = f"plugin:{plugin}:SPEC" if name == "segmentation.source" else f"{plugin}:SPEC"
+        spec = RunSpec(
+            tracker="emfoa-oft", sequence=toy_folder, settings={"segmentation.source": "embedded", name: value}
+        )
+        before = resolve(spec).run_id
+        (tmp_path / name / "readme.txt").write_text("not code")
+        assert resolve(spec).run_id == before
+        plugin.write_text(plugin.read_text() + "# edited\n")
+        assert resolve(spec).run_id != before, name
+
+
+def test_a_folder_called_like_a_setting_is_no_other_run(
+    toy_folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spec = RunSpec(tracker="orb-slam2", sequence=toy_folder)
+    before = resolve(spec).run_id
+    for word in ("orb", "person", "auto", "daisy"):
+        (tmp_path / word).mkdir()
+    assert resolve(spec).run_id == before
 
 
 def test_changed_weights_are_another_run(toy_folder: str, tmp_path: Path) -> None:

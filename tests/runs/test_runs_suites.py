@@ -9,6 +9,7 @@ import pytest
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.runs import RunSpec
 from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
+from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.suites import load_suite, suite_names
 from dynslam_bench.trackers.registry import TRACKERS
 
@@ -22,14 +23,18 @@ def test_every_suite_names_only_what_exists(name: str) -> None:
     suite = load_suite(name)
     assert suite.title and suite.description and suite.name == name
     for sequence in suite.sequences:
-        assert sequence in sequence_ids() or entry_of(sequence) is not None
+        whole = sequence.partition("@")[0]
+        assert whole in sequence_ids() or entry_of(sequence) is not None
+        if sequence.startswith("synthetic/"):
+            assert parse_synthetic_id(sequence).split == "held-out", "the embedded network was trained on the others"
     specs = suite.specs()
     assert len(specs) == len({spec.model_dump_json() for spec in specs}) > 0
 
 
 def test_dynamic_holds_every_ranked_system_on_the_eight_twins() -> None:
     suite = load_suite("dynamic")
-    assert len(suite.sequences) == 8 and suite.frames == (0, 300) and len(suite.seeds) == 2
+    assert len(suite.sequences) == 8 and suite.frames == (0, 200)
+    assert suite.seeds == (0,) and suite.offsets == (0, 3), "repeats come from what varies"
     composed = {found.spec.id for found in TRACKERS.all() if "trackers.systems" in found.spec.entry_point}
     ablations = {name for name in composed if not TRACKERS.get(name).ranked and name.startswith("emfoa-oft-")}
     assert composed - ablations <= set(suite.trackers)
@@ -67,6 +72,16 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
     orb = next(spec for spec in specs if spec.tracker == "orb-slam2")
     assert orb.settings["guard.min_features"] == 30
     assert all(spec.settings == {} for spec in specs if spec.tracker == "never-move")
+
+
+def test_offsets_of_a_suite_are_repeats_beside_the_seeds(tmp_path: Path) -> None:
+    text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\nseeds = [0, 1]\noffsets = [0, 3]\n'
+    suite = load_suite(write(tmp_path / "mine.toml", text))
+    repeats = [(spec.seed, spec.offset) for spec in suite.specs()]
+    assert repeats == [(0, 0), (0, 3), (1, 0), (1, 3)]
+    assert [spec.offset for spec in suite.specs(seeds=(0,), offsets=(5,))] == [5]
+    with pytest.raises(DynslamError, match=r"offsets\.0: input should be greater than or equal to 0"):
+        load_suite(write(tmp_path / "bad.toml", text.replace("[0, 3]", "[-1]")))
 
 
 @pytest.mark.parametrize(

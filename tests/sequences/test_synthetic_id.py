@@ -22,9 +22,24 @@ def test_instance_and_length_are_read() -> None:
     assert str(parsed) == "synthetic/sitting_rpy@107?frames=33"
 
 
+@pytest.mark.parametrize("query", ["frames=33&noise=5", "noise=5&frames=33", "noise=005&frames=033"])
+def test_a_noise_seed_is_read_in_any_order(query: str) -> None:
+    parsed = parse_synthetic_id(f"synthetic/sitting_rpy@107?{query}")
+    assert parsed == SyntheticId("sitting", "rpy", 107, 33, noise=5)
+    assert str(parsed) == "synthetic/sitting_rpy@107?frames=33&noise=5" and parse_synthetic_id(str(parsed)) == parsed
+    assert parsed.whole == "synthetic/sitting_rpy@107?noise=5"
+    assert parse_synthetic_id("synthetic/sitting_rpy?noise=5") == SyntheticId("sitting", "rpy", noise=5)
+    assert parse_synthetic_id("synthetic/sitting_rpy").noise is None, "the instance's own noise"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ("synthetic/walking_xyz?noise=-1", "noise '-1'"),
+        ("synthetic/walking_xyz?noise", "unknown option 'noise'"),
+        ("synthetic/walking_xyz?noise=1&noise=2", "names noise twice"),
+        ("synthetic/walking_xyz?frames=3&nose=1", "unknown option 'nose=1'"),
+        ("synthetic/walking_xyz?", "unknown option ''"),
         ("synthetic/walking_xy", "did you mean 'synthetic/walking_xyz'"),
         ("synthetic/Walking-static", "did you mean 'synthetic/walking_static'"),
         ("synthetic/walking_xyz@200", "0 to 199"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +49,53 @@ def test_cached_runs_have_the_same_bits_and_load_no_network(
     for before, after in zip(filled, found, strict=True):
         cost = before.timings["segmentation"]
         assert after.timings["segmentation"] == pytest.approx(cost, rel=0.5), "told as what it costs, not the look-up"
+
+
+EXTRACTOR = """
+import numpy as np
+from dynslam_bench.features.keypoints import Keypoints
+from dynslam_bench.features.registry import FeatureSpec
+
+class Mine:
+    def extract(self, gray):
+        n = COUNT
+        return Keypoints(np.full((n, 2), 30, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32),
+                         np.ones(n, np.float32), np.zeros((n, 32), np.uint8))
+
+def build(settings):
+    return Mine()
+
+SPEC = FeatureSpec("mine", f"{__file__}:build")
+"""
+ASK = """
+import sys
+from pathlib import Path
+import numpy as np
+from dynslam_bench.core.cache import StageCache
+from dynslam_bench.features.build import build_extractor
+from dynslam_bench.features.cached import CachedExtractor
+from dynslam_bench.features.settings import FeatureSettings
+
+settings = FeatureSettings(extractor=sys.argv[1], options={"weights": sys.argv[3]})
+cached = CachedExtractor(build_extractor(settings), settings, StageCache(Path(sys.argv[2])), 1)
+print(len(cached.extract(np.zeros((60, 60), np.uint8)).xy), cached.hit)
+"""
+
+
+def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Path) -> None:
+    plugin, weights = tmp_path / "mine.py", tmp_path / "net.bin"
+
+    def ask() -> str:
+        command = [sys.executable, "-c", ASK, f"{plugin}:SPEC", str(tmp_path / "cache"), str(weights)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    plugin.write_text(EXTRACTOR.replace("COUNT", "3"))
+    weights.write_text("one")
+    assert [ask(), ask()] == ["3 False", "3 True"]
+    plugin.write_text(EXTRACTOR.replace("COUNT", "5"))
+    assert [ask(), ask()] == ["5 False", "5 True"]
+    weights.write_text("three")
+    assert ask() == "5 False"
 
 
 def test_a_missing_file_is_an_error_at_once_with_the_cache_too(sequence, tmp_path: Path) -> None:

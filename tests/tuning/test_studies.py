@@ -38,7 +38,8 @@ def sequences(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def make(sequences: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": sequences[:2], "held_out": sequences[2:], "trials": 10,
-        "space": {"include": ["gain", "wobble"]}, "seeds": [0], "top": 2, "pruner": "none", "min_coverage": None,
+        "space": {"include": ["gain", "wobble"]}, "seeds": [0], "offsets": [0], "top": 2,
+        "pruner": "none", "min_coverage": None,
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 
@@ -232,7 +233,7 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
 ) -> None:
     spec = make(sequences, trials=2)
     run_study(spec, results=tmp_path)
-    monkeypatch.setattr("dynslam_bench.tuning.study.source_fingerprint", lambda tracker: "newer")
+    monkeypatch.setattr("dynslam_bench.tuning.study.source_fingerprint", lambda *_: "newer")
     with pytest.raises(StudyError, match="stored with other source"):
         Tuner(spec, tmp_path)
     reader = Tuner(spec, tmp_path, reading=True)

@@ -58,6 +58,7 @@ class Renderer:
         self._pool: ThreadPoolExecutor | None = None
         self._pool_process = 0
         text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
+        text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
         self._density = self._texel_density()
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)

@@ -46,7 +46,8 @@ class SyntheticSequence:
         self._timestamps = np.round(stamps, 6)
         self.store: FrameStore | None = None
         if cache_root is not None:
-            label = f"{sequence.name}@{sequence.instance}-{self._key()}"
+            noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
+            label = f"{sequence.name}@{sequence.instance}{noise}-{self._key()}"
             self.store = FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
 
     def __getstate__(self) -> dict[str, object]:
@@ -116,9 +117,28 @@ class SyntheticSequence:
         """The renderer; built when the first frame is rendered."""
         return Renderer(self._id, self.settings, self.threads)
 
+    @property
+    def split(self) -> str:
+        """``tune`` (instances 0-99) or ``held-out`` (100-199)."""
+        return self._id.split
+
+    @property
+    def noise(self) -> int | None:
+        """Seed of the sensors' noise; None for the instance's own."""
+        return self._id.noise
+
+    @property
+    def whole_id(self) -> str:
+        """The id without its length, for example ``synthetic/walking_xyz@0``: all lengths cut the same script."""
+        return self._id.whole
+
     def digest(self) -> str:
         """Short digest of the renderer's version and all parameters."""
         return digest({"id": self.id, "key": self._key()})
+
+    def scene_digest(self) -> str:
+        """Digest of what is filmed: neither the length nor the sensors' noise."""
+        return digest({"scene": f"{self._id.name}@{self._id.instance}", "key": self._key()})
 
     def _key(self) -> str:
         return digest({"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")}, 8)

@@ -29,24 +29,28 @@ MOTIONS = ("xyz", "static", "halfsphere", "rpy")
 SYNTHETIC_IDS = tuple(f"synthetic/{people}_{motion}" for people in PEOPLE for motion in MOTIONS)
 """The eight rendered twins of TUM's fr3 dynamic sequences, instance 0, 600 frames."""
 
+_OPTIONS = {"frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
+"""What may stand behind the question mark, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<instance>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class SyntheticId:
-    """A parsed id ``synthetic/<people>_<motion>[@instance][?frames=N]``.
+    """A parsed id ``synthetic/<people>_<motion>[@instance][?frames=N][&noise=SEED]``.
 
     Attributes:
         people: ``walking`` or ``sitting``.
         motion: The camera's motion: ``xyz``, ``static``, ``halfsphere`` or ``rpy``.
         instance: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held out.
         frames: Length of the sequence; frames are the same whatever the length.
+        noise: Seed of the sensors' noise: another draw of the same scene. None is the instance's own draw.
     """
 
     people: Literal["walking", "sitting"]
     motion: Literal["xyz", "static", "halfsphere", "rpy"]
     instance: int = 0
     frames: int = DEFAULT_FRAMES
+    noise: int | None = None
 
     @property
     def name(self) -> str:
@@ -58,15 +62,22 @@ class SyntheticId:
         """Which split the instance belongs to."""
         return "held-out" if self.instance in HELD_OUT_INSTANCES else "tune"
 
+    @property
+    def whole(self) -> str:
+        """The id without its length: what is seen, however much of it."""
+        noise = "" if self.noise is None else f"?noise={self.noise}"
+        return f"synthetic/{self.name}@{self.instance}{noise}"
+
     def __str__(self) -> str:
-        return f"synthetic/{self.name}@{self.instance}?frames={self.frames}"
+        noise = "" if self.noise is None else f"&noise={self.noise}"
+        return f"synthetic/{self.name}@{self.instance}?frames={self.frames}{noise}"
 
 
 def parse_synthetic_id(text: str) -> SyntheticId:
-    """Parse an id such as ``synthetic/walking_xyz@101?frames=150``.
+    """Parse an id such as ``synthetic/walking_xyz@101?frames=150`` or ``synthetic/walking_xyz?frames=150&noise=3``.
 
     Raises:
-        SequenceError: Unknown name (with a did-you-mean), or an instance or length out of range.
+        SequenceError: Unknown name (with a did-you-mean), or an instance, length or noise seed out of range.
     """
     match = _ID.fullmatch(text)
     if match is None:
@@ -77,14 +88,23 @@ def parse_synthetic_id(text: str) -> SyntheticId:
     instance = 0
     if match["instance"] is not None:
         instance = _integer(match["instance"], "instance", text, 0, HELD_OUT_INSTANCES.stop - 1)
-    frames = DEFAULT_FRAMES
-    if match["query"] is not None:
-        key, separator, value = match["query"].partition("=")
-        if key != "frames" or not separator:
-            raise SequenceError(f"'{text}' has an unknown option '{match['query']}'", "write ?frames=N")
-        frames = _integer(value, "frames", text, 1, MAX_FRAMES)
+    options = {"frames": DEFAULT_FRAMES, "noise": None} | _options(match["query"], text)
     people, _, motion = match["name"].partition("_")
-    return SyntheticId(people, motion, instance, frames)  # type: ignore[arg-type]  # checked against SYNTHETIC_IDS
+    return SyntheticId(people, motion, instance, **options)  # type: ignore[arg-type]  # checked against SYNTHETIC_IDS
+
+
+def _options(query: str | None, text: str) -> dict[str, int]:
+    """The options behind the question mark, each at most once."""
+    found: dict[str, int] = {}
+    for option in [] if query is None else query.split("&"):
+        key, separator, value = option.partition("=")
+        if key not in _OPTIONS or not separator:
+            raise SequenceError(f"'{text}' has an unknown option '{option}'", "write ?frames=N, ?noise=SEED or both, "
+                                "as ?frames=N&noise=SEED")  # fmt: skip
+        if key in found:
+            raise SequenceError(f"'{text}' names {key} twice", "leave one out")
+        found[key] = _integer(value, key, text, *_OPTIONS[key])
+    return found
 
 
 def _integer(value: str, what: str, text: str, low: int, high: int) -> int:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.settings import Settings, names, tunable
 
 
 class ConstantVelocitySettings(Settings):
@@ -25,7 +25,9 @@ class ConstantVelocitySettings(Settings):
 class ReplaySettings(Settings):
     """Settings of `replay:FILE`."""
 
-    file: str = Field("", description="trajectory file in TUM format (timestamp tx ty tz qx qy qz qw, camera to world)")
+    file: str = names(
+        "", "file", meaning="trajectory file in TUM format (timestamp tx ty tz qx qy qz qw, camera to world)"
+    )
     tolerance_s: float = Field(
         0.01, gt=0, le=1, description="largest difference in seconds between a frame's stamp and its pose's"
     )
@@ -55,9 +57,10 @@ class SubprocessSettings(ProgramSettings):
 class OrbSlam3Settings(ProgramSettings):
     """Settings of `orbslam3`: those of its own settings file that matter for RGB-D."""
 
-    vocabulary: str = Field(
-        "", description="DBoW2 text vocabulary (.txt or .txt.xz); empty for $DYNSLAM_BENCH_ORB_VOCABULARY"
-    )
+    vocabulary: str = names(
+        "", "file", otherwise="DYNSLAM_BENCH_ORB_VOCABULARY",
+        meaning="DBoW2 text vocabulary (.txt or .txt.xz); empty for $DYNSLAM_BENCH_ORB_VOCABULARY",
+    )  # fmt: skip
     features: int = tunable(
         1000, meaning="ORB features a frame", low=500, high=2500, scale="log", limits=(100, 10000), unit="features"
     )

@@ -1,0 +1,141 @@
+"""Digests of code, weights, machine and content: what changes them, and what must not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynslam_bench.core import fingerprint
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.fingerprint import (
+    code_digest,
+    content_digest,
+    machine_digest,
+    named_digests,
+    named_files,
+    opencv_version,
+    path_digest,
+    plugin_digest,
+)
+from dynslam_bench.core.settings import Settings, names, tunable
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_content_digest_sees_type_shape_and_value() -> None:
+    base = np.zeros((2, 3), np.uint8)
+    others = [base.reshape(3, 2), base.astype(np.int8), base + 1]
+    assert len({content_digest(each) for each in (base, *others)}) == 4
+    assert content_digest(base) == content_digest(np.zeros((2, 6), np.uint8)[:, ::2])
+
+
+def test_a_plug_in_counts_with_the_code_of_its_folder_and_nothing_else(tmp_path: Path) -> None:
+    plugin = write(tmp_path / "mine.py", "a = 1\n")
+    helper = write(tmp_path / "helper.py", "b = 1\n")
+    before = plugin_digest(f"{plugin}:SPEC")
+    write(tmp_path / "notes.txt", "not code")
+    assert plugin_digest(f"{plugin}:SPEC") == before
+    helper.write_text("b = 2\n")
+    assert plugin_digest(f"{plugin}:SPEC") != before
+    assert plugin_digest("dynslam_bench.features.orb:OrbExtractor") == ""
+    with pytest.raises(PluginError, match=r"cannot read the code.*No such file"):
+        plugin_digest(f"{tmp_path}/none/none.py:SPEC")
+
+
+def test_no_file_is_left_out_however_many_there_are(tmp_path: Path) -> None:
+    plugin = write(tmp_path / "a_first.py", "")
+    for number in range(600):
+        write(tmp_path / f"m{number:03d}.py", f"n = {number}\n")
+    before = plugin_digest(f"{plugin}:SPEC")
+    write(tmp_path / "m599.py", "n = -1\n")
+    assert plugin_digest(f"{plugin}:SPEC") != before
+
+
+def test_packages_with_and_without_init_count_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    write(tmp_path / "fp_regular" / "__init__.py", "")
+    for package in ("fp_regular", "fp_namespace"):
+        inner = write(tmp_path / package / "deep" / "inner.py", "a = 1\n")
+        before = plugin_digest(f"{package}.deep.inner:SPEC")
+        inner.write_text("a = 2\n")
+        changed = plugin_digest(f"{package}.deep.inner:SPEC")
+        inner.rename(inner.with_name("other.py"))
+        assert len({before, changed, plugin_digest(f"{package}.deep.inner:SPEC")}) == 3
+    with pytest.raises(PluginError, match="code of 'fp_nowhere' cannot be found"):
+        plugin_digest("fp_nowhere.module:SPEC")
+
+
+def test_own_rooms_count_each_by_itself() -> None:
+    orb = "dynslam_bench.features.orb:OrbExtractor"
+    assert code_digest(orb, ("core", "features")) == code_digest(orb, ("core", "features"))
+    assert code_digest(orb, ("core", "features")) != code_digest(orb, ("core", "segmentation"))
+
+
+def test_a_folder_counts_by_content_not_by_sizes(tmp_path: Path) -> None:
+    mask = write(tmp_path / "masks" / "1.png", "aaaa")
+    before = path_digest(tmp_path / "masks")
+    stat = mask.stat()
+    mask.write_text("bbbb")
+    os.utime(mask, ns=(stat.st_atime_ns, stat.st_mtime_ns + 1))
+    assert path_digest(tmp_path / "masks") != before
+
+
+class Inner(Settings):
+    source: str = "auto"
+    options: dict[str, object] = {}  # noqa: RUF012
+
+
+class Whole(Settings):
+    extractor: str = names("orb", "features", meaning="an id")
+    vocabulary: str = names("", "file", meaning="a file", otherwise="FP_TEST_VOCABULARY")
+    word: str = "orb"
+    weights: Path | None = None
+    gain: float = tunable(1.0, low=0, high=2, meaning="a number")
+    inner: Inner = Inner()
+
+
+def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = named_files(Whole())
+    (tmp_path / "orb").mkdir()
+    write(tmp_path / "auto", "a file called like a setting")
+    assert named_files(Whole()) == before == {}, "a folder called like a word changes nothing"
+    net = write(tmp_path / "net.onnx", "one")
+    write(tmp_path / "voc.txt", "words")
+    settings = Whole(
+        vocabulary="voc.txt", word=str(net), weights=Path("net.onnx"),
+        inner=Inner(source="onnx:net.onnx", options={"network": {"file": str(net)}, "side": 3}),
+    )  # fmt: skip
+    found = named_digests(settings)
+    assert set(found) == {"vocabulary", "word", "weights", "inner.source", "inner.options.network.file"}
+    assert len(set(found.values())) == 2
+    net.write_text("three")
+    assert named_digests(settings)["inner.source"] != found["inner.source"]
+    monkeypatch.setenv("FP_TEST_VOCABULARY", str(tmp_path / "voc.txt"))
+    assert named_digests(Whole())["vocabulary"] == found["vocabulary"], "named by the environment"
+
+
+@pytest.mark.parametrize("name", fingerprint.OPENCV)
+def test_every_distribution_of_opencv_is_versioned(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def only(version: str):
+        monkeypatch.setattr(fingerprint, "distribution_version", lambda asked: version if asked == name else "")
+        for cached in (opencv_version, machine_digest):
+            cached.cache_clear()
+        return opencv_version(), machine_digest()
+
+    try:
+        (first, machine), (second, other) = only("4.10.0"), only("4.11.0")
+        assert first == f"{name} 4.10.0" and second == f"{name} 4.11.0" and machine != other
+        monkeypatch.setattr(fingerprint, "distribution_version", lambda asked: "")
+        opencv_version.cache_clear()
+        assert opencv_version().startswith("cv2 "), "a build of one's own tells its version itself"
+    finally:
+        for cached in (opencv_version, machine_digest):
+            cached.cache_clear()

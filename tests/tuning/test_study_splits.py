@@ -1,0 +1,126 @@
+"""Splits that are not apart are refused however they are spelled; repeats are what really varies."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import toy_tracker
+
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, write_page
+from dynslam_bench.tuning.final_runs import describe_repeats, fresh_repeats
+from dynslam_bench.tuning.splits import check_splits
+
+TRACKER = f"{toy_tracker.__file__}:SPEC"
+WALK = "synthetic/walking_xyz"
+
+
+def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
+    values: dict[str, object] = {
+        "name": "toy", "tracker": TRACKER, "tune": tune, "held_out": held_out, "trials": 2, "top": 1,
+        "space": {"include": ["gain"]}, "pruner": "none", "min_coverage": None, "offsets": [0],
+    }  # fmt: skip
+    return StudySpec.model_validate({**values, **changes})
+
+
+@pytest.mark.parametrize("other", ["@0", "@000", "@0?frames=50", "?frames=10&noise=3", ""])
+def test_rendered_sequences_overlap_in_every_spelling(other: str, tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(f'tune = ["{WALK}"]\nheld_out = ["{WALK}{other}"]\n')
+    with pytest.raises(StudyError, match=r"^[^\n]*share 1 sequences") as caught:
+        read_study(path)
+    assert f"'{WALK}'" in str(caught.value) and f"{WALK}{other}'" in str(caught.value), "both spellings"
+
+
+def test_aliases_and_paths_are_spellings_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for one, other in (
+        ("tum/fr3/walking_xyz", "rgbd_dataset_freiburg3_walking_xyz"),
+        ("./toys/a", str(tmp_path / "toys" / "b" / ".." / "a")),
+    ):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(ValueError, match=r"share 1 sequences, the first is .*, held out as"):
+            spec([one], [other])
+
+
+def test_copies_and_excerpts_of_a_recording_are_the_same_recording(tmp_path: Path) -> None:
+    whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3)
+    copy = shutil.copytree(whole, tmp_path / "copy")
+    excerpt = shutil.copytree(whole, tmp_path / "excerpt")
+    for name in ("rgb", "depth", "groundtruth"):
+        lines = (excerpt / f"{name}.txt").read_text().splitlines()
+        (excerpt / f"{name}.txt").write_text("\n".join(lines[4:9]) + "\n")
+    other = toy_tracker.make_sequence(tmp_path / "other", 1.1)
+    for held_out in (copy, excerpt):
+        with pytest.raises(StudyError, match="are the same sequence") as caught:
+            check_splits(spec([str(whole)], [str(held_out)]))
+        assert str(whole) in str(caught.value) and str(held_out) in str(caught.value)
+    assert check_splits(spec([str(whole)], [str(other)])) == []
+    with pytest.raises(StudyError, match="tune names the same frames twice"):
+        check_splits(spec([str(whole), str(copy)], [str(other)]))
+
+
+def test_instances_stay_in_their_split() -> None:
+    with pytest.raises(StudyError, match=r"'synthetic/walking_xyz@5' is used as held-out.*0-99.*into the tune split"):
+        check_splits(spec([f"{WALK}@1"], [f"{WALK}@5"]))
+    with pytest.raises(StudyError, match=r"'synthetic/walking_xyz@105' is used as tune.*100-199.*held-out split"):
+        check_splits(spec([f"{WALK}@105"], [f"{WALK}@101"]))
+    assert check_splits(spec([f"{WALK}@1", f"{WALK}@1?noise=4"], [f"{WALK}@101"])) == []
+
+
+def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
+    for name in ("rgbd_dataset_freiburg3_walking_rpy", "rgbd_dataset_freiburg3_walking_xyz"):
+        toy_tracker.make_sequence(tmp_path / name, 0.1 * len(name) + 0.5 * name.endswith("xyz"))
+    held, tune = "rgbd_dataset_freiburg3_walking_rpy", "rgbd_dataset_freiburg3_walking_xyz"
+    camera = (tmp_path / held / "camera.toml").read_text()
+    assert "width = 16" in camera
+    with pytest.raises(StudyError, match=r"walking_rpy' is used as tune, but the catalogue puts it into the held-out"):
+        check_splits(spec([str(tmp_path / held)], []))
+    with pytest.raises(StudyError, match=r"walking_xyz' is used as held-out, but the catalogue puts it into the tune"):
+        check_splits(spec([str(toy_tracker.make_sequence(tmp_path / "plain", 0.7))], [str(tmp_path / tune)]))
+    assert check_splits(spec([str(tmp_path / tune)], [str(tmp_path / held)])) == []
+
+
+def test_an_older_study_with_overlapping_splits_can_still_be_looked_at() -> None:
+    study = spec([f"{WALK}@1"], [f"{WALK}@5"])
+    assert len(check_splits(study, refuse=False)) == 1
+
+
+def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
+    whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3)
+    copy = shutil.copytree(whole, tmp_path / "copy")
+    with pytest.raises(StudyError, match="allow_overlap = true"):
+        Tuner(spec([str(whole)], [str(copy)]), tmp_path / "results")
+    study = spec([str(whole)], [str(copy)], allow_overlap=True)
+    tuner = run_study(study, results=tmp_path / "results")
+    summary = finish(tuner)
+    assert summary.split_notes == [f"'{whole}' to tune on and '{copy}' held out are the same sequence"]
+    assert "THE SPLITS ARE NOT APART" in summary.conclusion and not summary.improves
+    assert "SPLITS ARE NOT APART" in " ".join((tuner.folder / "best.toml").read_text().split())
+    page = write_page(tuner, summary).read_text()
+    assert page.count("The splits are NOT apart") >= 2, "below each table"
+
+
+def test_repeats_are_start_offsets_and_fresh_ones_are_fresh(tmp_path: Path) -> None:
+    study = spec(["a"], [], seeds=[0], offsets=[0, 3])
+    assert fresh_repeats(study) == [(1000, 1), (1001, 2)]
+    assert fresh_repeats(spec(["a"], [], seeds=[0, 1], offsets=[1])) == [(1000, 0), (1001, 2)]
+    assert describe_repeats([(1000, 1)]) == "seed 1000 from frame 1"
+    assert StudySpec(name="x", tune=("a",)).seeds == (0,) and StudySpec(name="x", tune=("a",)).offsets == (0, 3)
+
+
+def test_a_tracker_without_randomness_has_repeats_that_differ(tmp_path: Path) -> None:
+    folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
+    fixed = {"include": ["gain"], "fixed": {"wobble": 0}}
+    tuner = run_study(spec([folder], [], seeds=[0, 1], offsets=[0, 2], space=fixed), results=tmp_path / "results")
+    rows = tuner.study.get_trials()[1].user_attrs["instances"]
+    assert sorted((row[1], row[6]) for row in rows) == [(0, 0), (0, 2), (1, 0), (1, 2)]
+    by_seed = {offset: {row[3] for row in rows if row[6] == offset} for offset in (0, 2)}
+    assert all(len(errors) == 1 for errors in by_seed.values()) and by_seed[0] != by_seed[2]
+    summary = finish(tuner)
+    runs = [tuner.evaluator.store.get(run) for run in tuner.evaluator.store.ids()]
+    fresh = {(run.seed, run.offset) for run in runs if run.seed >= 1000}
+    assert fresh == {(1000, 1), (1001, 3), (1002, 4), (1003, 5)}
+    page = write_page(tuner, summary).read_text()
+    assert "seeds changed nothing" in page and "seed 1001 from frame 3" in page
