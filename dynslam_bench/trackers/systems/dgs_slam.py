@@ -8,6 +8,7 @@ from dynslam_bench.culling.baseline_settings import ResidualSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -38,6 +39,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
     assumptions=(
+        masks_in_words(DgsSlamSettings().segmentation),
         "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",
         "its classes of features with priority in tracking are left out",
         "segmentation on every frame instead of selected ones",

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, MultiViewSettings
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -21,9 +21,11 @@ class DiSlamSettings(SemanticSystemSettings):
 
     segmentation: SegmentationSettings = SegmentationSettings(confidence=0.1)
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
-    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous")
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(
+        inside_px=0.2, outside_px=1.0, fit="outside previous", unmatched="judge"
+    )
     multiview: MultiViewSettings = MultiViewSettings(grow=False)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -50,6 +52,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
     assumptions=(
+        masks_in_words(DiSlamSettings().segmentation),
+        matches_in_words(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
         "the published code of SG-SLAM stands in for the epipolar half",
         "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",
         "seeds of the multi-view test are grown by 15 px",
