@@ -51,7 +51,7 @@ SPEC = TrackerSpec(
         masks_in_words(BlitzSlamSettings().segmentation),
         matches_in_words(BlitzSlamSettings().flow, BlitzSlamSettings().box_epipolar.unmatched),
         "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated), refitted to its inliers",
-        "with fewer than 20 matches outside the boxes all kept ones count; boxes derive from the masks",
+        "with fewer than 20 matches outside the boxes all kept ones count; its boxes are those of the masks",
         "which classes are movable (not stated)",
         "the residual removal of its mapping is left out: it does not touch the pose",
     ),

@@ -9,7 +9,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, links_in_words, masks_in_words
+from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -45,7 +45,8 @@ SPEC = TrackerSpec(
         masks_in_words(CfpSlamSettings().segmentation),
         links_in_words(CfpSlamSettings().flow),
         "constant-velocity boxes instead of its Kalman filter",
-        "depth repair instead of DBSCAN in the box; masks grown by 7 px",
+        "depth repair instead of DBSCAN in the box",
+        grown_in_words(CfpSlamSettings().segmentation),
         "a Bayes filter of 0.9 on the masks as static probability, a feature's and not a map point's",
         "greedy association of boxes instead of the Hungarian one",
     ),

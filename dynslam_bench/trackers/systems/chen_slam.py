@@ -8,7 +8,7 @@ from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -46,7 +46,8 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(ChenSlamSettings().segmentation),
         matches_in_words(ChenSlamSettings().flow, ChenSlamSettings().box_epipolar.unmatched),
-        "epipolar threshold 1 px; masks grown by 15 px",
+        grown_in_words(ChenSlamSettings().segmentation),
+        "epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
         "RGB-D back end (theirs is monocular)",
     ),
 )

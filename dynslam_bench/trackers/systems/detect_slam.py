@@ -42,7 +42,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., Detect-SLAM, WACV 2018",
     assumptions=(
-        masks_in_words(DetectSlamSettings().segmentation),
+        masks_in_words(DetectSlamSettings().segmentation, boxes=True),
         links_in_words(DetectSlamSettings().flow),
         "rate 0.3 and threshold 0.75 (no readable source)",
         "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection at "

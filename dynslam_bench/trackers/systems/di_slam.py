@@ -52,11 +52,13 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
     assumptions=(
-        masks_in_words(DiSlamSettings().segmentation),
+        masks_in_words(DiSlamSettings().segmentation, boxes=True),
         matches_in_words(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
-        "the published code of SG-SLAM stands in for the epipolar half",
+        "the published code of SG-SLAM stands in for the epipolar half; distances are taken in the current image, "
+        "theirs in the previous one",
         "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",
         "seeds of the multi-view test are grown by 15 px",
-        "multi-view depth without growing regions; the guard undoes it before the epipolar verdict",
+        "multi-view depth without growing regions; where fewer than a tenth of the features remain the guard "
+        "undoes it first (SG-SLAM restores all)",
     ),
 )

@@ -9,7 +9,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, links_in_words, masks_in_words
+from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -45,7 +45,8 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(HuaiSlamSettings().segmentation),
         links_in_words(HuaiSlamSettings().flow),
-        "five frames, 7 px, Bayes filter of 0.9; greedy association of constant-velocity boxes",
+        grown_in_words(HuaiSlamSettings().segmentation),
+        "Bayes filter of 0.9; greedy association of constant-velocity boxes",
         "masks are fitted to depth at their border, within 0.33 m, and not cut by it as a whole",
     ),
 )

@@ -48,7 +48,7 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(MorSlamSettings().segmentation),
         matches_in_words(MorSlamSettings().flow, MorSlamSettings().box_epipolar.unmatched),
-        "closing of 7 px, depth step 0.1 m, 1 px",
+        "closing of 7 px, depth step 0.1 m, epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
         "depth decides within 8 px of a mask's border; holes inside are filled whatever their depth",
     ),
 )

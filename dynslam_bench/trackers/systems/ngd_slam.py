@@ -49,7 +49,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhang et al., NGD-SLAM, arXiv 2405.07392",
     assumptions=(
-        masks_in_words(NgdSlamSettings().segmentation),
+        masks_in_words(NgdSlamSettings().segmentation, boxes=True),
         "detection on every third frame stands in for its asynchronous detector",
         "masks are carried by our sparse flow, not by its clustering of corners",
         "its tracking of static corners with a PnP of its own between keyframes is left out",

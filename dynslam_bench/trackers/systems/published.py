@@ -37,16 +37,22 @@ LOST: dict[Unmatched, str] = {
 """What becomes of features without a match, by the setting `unmatched`."""
 
 
-def masks_in_words(segmentation: SegmentationSettings) -> str:
-    """Where a system's masks come from, and what the shared stage adds to them."""
+def masks_in_words(segmentation: SegmentationSettings, *, boxes: bool = False) -> str:
+    """Where a system's masks, or its boxes, come from, and what the shared stage adds to them."""
+    what = "boxes are those of the instance masks, which" if boxes else "masks"
     bridged = (
         f"missed detections bridged for {segmentation.compensate} segmented frames"
         if segmentation.compensate
         else "missed detections not bridged"
     )
     return (
-        f"masks come from the stage that all systems share: scores of at least {segmentation.confidence:g}, {bridged}"
+        f"{what} come from the stage that all systems share: scores of at least {segmentation.confidence:g}, {bridged}"
     )
+
+
+def grown_in_words(segmentation: SegmentationSettings) -> str:
+    """How far a system's masks are grown, where its source does not say."""
+    return f"masks grown by {segmentation.dilation_px} px (not stated)"
 
 
 def tracks_in_words(flow: FlowSettings) -> str:

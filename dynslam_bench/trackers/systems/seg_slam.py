@@ -8,7 +8,7 @@ from dynslam_bench.culling.baseline_settings import ClassRuleSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -41,6 +41,7 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(SegSlamSettings().segmentation),
         matches_in_words(SegSlamSettings().flow, SegSlamSettings().class_rule.unmatched),
-        "0.3 m, 1 px, 30 % of an object's points",
+        grown_in_words(SegSlamSettings().segmentation),
+        "0.3 m, 1 px (RANSAC 1 px, 0.99, refitted to its inliers), 30 % of an object's points",
     ),
 )

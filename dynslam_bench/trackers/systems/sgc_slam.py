@@ -39,7 +39,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yang et al., SGC-VSLAM, Sensors 2020",
     assumptions=(
-        masks_in_words(SgcSlamSettings().segmentation),
+        masks_in_words(SgcSlamSettings().segmentation, boxes=True),
         matches_in_words(SgcSlamSettings().flow, SgcSlamSettings().box_epipolar.unmatched),
         "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
         "with fewer than 20 matches outside the boxes F is fitted to all kept ones",

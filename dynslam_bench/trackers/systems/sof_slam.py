@@ -8,7 +8,7 @@ from dynslam_bench.culling.baseline_settings import ClassRuleSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -41,7 +41,8 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(SofSlamSettings().segmentation),
         matches_in_words(SofSlamSettings().flow, SofSlamSettings().class_rule.unmatched),
+        grown_in_words(SofSlamSettings().segmentation),
         "potentially dynamic are chairs and monitors (the class list is not public)",
-        "RANSAC 1 px, 0.99; distance 1 px",
+        "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
     ),
 )

@@ -42,7 +42,6 @@ SPEC = TrackerSpec(
         "the set grows by the nearest depth first (order not stated); 0.43 is taken in square metres",
         "features of a box without depth go with the person",
         "RANSAC draws at most 50 pairs for a probability of 0.99; a box with fewer than three depths keeps all",
-        "boxes derive from the masks",
-        masks_in_words(YoloSlamSettings().segmentation),
+        masks_in_words(YoloSlamSettings().segmentation, boxes=True),
     ),
 )
