@@ -35,7 +35,14 @@ NAMED = {
     "ds-slam": ("undistorted", "degeneracy guard"),
     "blitz-slam": ("RANSAC of 1 px", "refitted", "movable", "boxes are those of the masks", "residual removal"),
     "yolo-slam": ("nearest depth first", "square metres", "without depth", "50 pairs", "boxes are those of"),
-    "di-slam": ("SG-SLAM stands in", "current image", "refitted", "guard", "without growing regions"),
+    "di-slam": (
+        "SG-SLAM stands in",
+        "unmatched = judge",
+        "previous image",
+        "refitted",
+        "guard",
+        "without growing regions",
+    ),
     "sgc-slam": ("refitted", "fewer than 20", "quadtree"),
     "mask-rcnn": ("border of the grown mask",),
 }

@@ -20,7 +20,7 @@ from dynslam_bench.trackers.systems.published import PublishedFlowSettings
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 TESTED = {
     "sgc-slam": "keep",
-    "di-slam": "judge",
+    "di-slam": "keep",
     "blitz-slam": "keep",
     "chen-slam": "keep",
     "mor-slam": "keep",

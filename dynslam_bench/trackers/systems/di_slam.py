@@ -21,9 +21,7 @@ class DiSlamSettings(SemanticSystemSettings):
 
     segmentation: SegmentationSettings = SegmentationSettings(confidence=0.1)
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
-    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(
-        inside_px=0.2, outside_px=1.0, fit="outside previous", unmatched="judge"
-    )
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous")
     multiview: MultiViewSettings = MultiViewSettings(grow=False)
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
@@ -54,8 +52,8 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(DiSlamSettings().segmentation, boxes=True),
         matches_in_words(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
-        "the published code of SG-SLAM stands in for the epipolar half; distances are taken in the current image, "
-        "theirs in the previous one",
+        "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature which the flow loses by "
+        "the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
         "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",
         "seeds of the multi-view test are grown by 15 px",
         "multi-view depth without growing regions; where fewer than a tenth of the features remain the guard "

@@ -32,7 +32,7 @@ class PublishedFlowSettings(FlowSettings):
 LOST: dict[Unmatched, str] = {
     "keep": "a feature that the flow loses is not judged and stays (not stated)",
     "drop": "a feature that the flow loses is dropped",
-    "judge": "a feature that the flow loses is judged by the place where it was lost, as in the code",
+    "judge": "a feature that the flow loses is judged by the place where it was lost",
 }
 """What becomes of features without a match, by the setting `unmatched`."""
 
