@@ -52,8 +52,8 @@ SPEC = TrackerSpec(
     assumptions=(
         masks_in_words(DiSlamSettings().segmentation, boxes=True),
         matches_in_words(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
-        "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature which the flow loses by "
-        "the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
+        "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the flow loses "
+        "by the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
         "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",
         "seeds of the multi-view test are grown by 15 px",
         "multi-view depth without growing regions; where fewer than a tenth of the features remain the guard "
