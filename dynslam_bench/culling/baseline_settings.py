@@ -29,6 +29,10 @@ MovableClasses = Annotated[str, AfterValidator(_known_classes)]
 """Comma-separated COCO names or presets, validated."""
 
 
+Unmatched = Literal["keep", "drop", "judge"]
+"""What becomes of a feature whose flow failed: it stays unjudged, it goes, or it is judged by where it was lost."""
+
+
 class BoxSettings(Settings):
     """B2, box removal (Crowd-SLAM, YOLO-SLAM's detection half)."""
 
@@ -57,12 +61,16 @@ class BoxEpipolarSettings(Settings):
         meaning="matches that F is fitted to: outside the boxes, outside those of the previous frame (SG-SLAM), "
         "or all that earlier filters kept (those outside the masks)",
     )
+    unmatched: Unmatched = tunable(
+        "keep",
+        meaning="a feature whose flow failed stays, goes, or is judged by the place where it was lost (SG-SLAM's code)",
+    )
 
 
 class MovingVoteSettings(Settings):
     """B3 and B11 as in DS-SLAM's code: one vote for all people."""
 
-    corners: int = tunable(1000, low=200, high=2000, limits=(8, 10000), meaning="Shi-Tomasi corners that are tracked")
+    corners: int = tunable(1000, low=200, high=2000, limits=(8, 10000), meaning="Harris corners that are tracked")
     sad_limit: int = tunable(2120, low=500, high=5000, limits=(1, 10**6), meaning="largest 3x3 sum of differences")
     inlier_px: float = tunable(
         0.1, low=0.05, high=1.0, scale="log", limits=(0.01, 10.0), unit="px", meaning="RANSAC's inlier threshold"
@@ -230,6 +238,10 @@ class ClassRuleSettings(Settings):
     )  # fmt: skip
     vote_share: float = tunable(
         0.3, low=0.05, high=0.9, limits=(0.0, 1.0), meaning="share of an object's points that must fail"
+    )
+    unmatched: Unmatched = tunable(
+        "keep",
+        meaning="a feature on a movable object whose flow failed stays, goes, or is judged by where it was lost",
     )
 
 

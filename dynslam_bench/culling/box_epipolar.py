@@ -12,6 +12,7 @@ from .baseline_settings import BoxEpipolarSettings
 from .boxes import dynamic_boxes, in_boxes
 from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .links import judged_by_flow
 from .settings import EpipolarSettings
 
 MIN_OUTSIDE = 20
@@ -22,7 +23,8 @@ class BoxEpipolarFilter(DynamicFilter):
     """Drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
 
     Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is
-    meaningless. Stats: ``dropped``, ``matches``, ``boxes``, ``failed`` (1 where F could not be estimated).
+    meaningless. Features whose flow failed go by the setting ``unmatched``. Stats: ``dropped``, ``matches``, ``boxes``,
+    ``lost`` (features whose flow failed), ``failed`` (1 where F could not be estimated).
     """
 
     name = "box_epipolar"
@@ -41,16 +43,20 @@ class BoxEpipolarFilter(DynamicFilter):
         keep = np.ones(len(frame), dtype=bool)
         flow = state.flow
         boxes = dynamic_boxes(frame, self.segmentation)
-        stats = {"matches": 0.0, "boxes": float(len(boxes)), "failed": 0.0}
-        stats |= {"f_asked": 0.0, "f_judged": 0.0}
+        stats = {"matches": 0.0, "boxes": float(len(boxes)), "lost": 0.0, "failed": 0.0, "f_asked": 0.0, "f_judged": 0.0}
         if flow is None or state.previous is None:
             return FilterResult.of(keep, stats)
         stats["f_asked"] = 1.0
+        lost = state.keep & ~flow.valid
+        stats["lost"] = float(np.count_nonzero(lost))
+        if self.settings.unmatched == "drop":
+            keep &= ~lost
+        judged = judged_by_flow(flow, state.keep, self.settings.unmatched)
         inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
         before = state.camera.undistort_points(flow.xy)
-        fit = flow.valid & state.keep & ~self._left_out(inside, state)
+        fit = judged & ~self._left_out(inside, state)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
-            fit = flow.valid & state.keep
+            fit = judged
         stats["matches"] = float(np.count_nonzero(fit))
         options = EpipolarSettings(inlier_px=self.settings.inlier_px, confidence=self.settings.confidence)
         matrix = None
@@ -59,9 +65,9 @@ class BoxEpipolarFilter(DynamicFilter):
         if matrix is None:
             return FilterResult.of(keep, {**stats, "failed": 1.0})
         stats["f_judged"] = 1.0
-        distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
-        limit = np.where(inside[flow.valid], self.settings.inside_px, self.settings.outside_px)
-        keep[flow.valid] = distance <= limit
+        distance = epipolar_distance(matrix, before[judged], frame.xy[judged])
+        limit = np.where(inside[judged], self.settings.inside_px, self.settings.outside_px)
+        keep[judged] = distance <= limit
         return FilterResult.of(keep, stats)
 
     def _left_out(self, inside: NDArray[np.bool_], state: FilterState) -> NDArray[np.bool_]:

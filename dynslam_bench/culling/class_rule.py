@@ -11,6 +11,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from .baseline_settings import ClassRuleSettings
 from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from .links import judged_by_flow
 from .semantic import inside
 from .settings import EpipolarSettings
 
@@ -18,7 +19,8 @@ from .settings import EpipolarSettings
 class ClassRuleFilter(DynamicFilter):
     """Drops all points on people; on movable things those off their line, or at the depth of a thing that moves.
 
-    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``.
+    A feature on a movable thing whose flow failed goes by the setting ``unmatched``.
+    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``, ``lost`` (features whose flow failed).
     """
 
     name = "class_rule"
@@ -35,7 +37,7 @@ class ClassRuleFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Judge by class first, then movable things by geometry."""
         keep = np.ones(len(frame), dtype=bool)
-        stats = dict.fromkeys(("on_people", "on_movable", "moving_objects"), 0.0)
+        stats = dict.fromkeys(("on_people", "on_movable", "moving_objects", "lost"), 0.0)
         stats |= {"f_asked": float(state.flow is not None and state.previous is not None), "f_judged": 0.0}
         if frame.instances is None or not len(frame.instances):
             return FilterResult.of(keep, stats)
@@ -43,13 +45,17 @@ class ClassRuleFilter(DynamicFilter):
         keep &= ~inside(people, frame.keypoints.xy)
         stats["on_people"] = float(np.count_nonzero(~keep))
         movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
+        lost = np.zeros(len(frame), dtype=bool)
+        if state.flow is not None and state.previous is not None:
+            lost = state.keep & ~state.flow.valid
+        stats["lost"] = float(np.count_nonzero(lost))
         off_line, tested = self._off_line(frame, state, keep & ~inside(movable.union(), frame.keypoints.xy))
         stats["f_judged"] = float(tested.any())
         for mask in movable.masks:
             on = inside(mask, frame.keypoints.xy) & keep
             stats["on_movable"] += float(np.count_nonzero(on))
             voters = on & tested
-            drop = on & off_line
+            drop = on & (off_line | lost) if self.settings.unmatched == "drop" else on & off_line
             if voters.any() and off_line[voters].mean() >= self.settings.vote_share:
                 stats["moving_objects"] += 1.0
                 depth = frame.depth[mask]
@@ -64,8 +70,8 @@ class ClassRuleFilter(DynamicFilter):
         none = np.zeros(len(frame), dtype=bool)
         if state.flow is None or state.previous is None:
             return none, none
-        valid = state.flow.valid
-        fit = valid & state.keep & static
+        judged = judged_by_flow(state.flow, state.keep, self.settings.unmatched)
+        fit = judged & static
         before = state.camera.undistort_points(state.flow.xy)
         matrix = (
             fundamental_matrix(before[fit], frame.xy[fit], EpipolarSettings()) if fit.sum() >= MIN_MATCHES else None
@@ -73,7 +79,5 @@ class ClassRuleFilter(DynamicFilter):
         if matrix is None:
             return none, none
         failing = none.copy()
-        failing[valid] = (
-            epipolar_distance(matrix, before[valid], frame.xy[valid]) > self.settings.threshold_px
-        )  # fmt: skip
-        return failing, valid
+        failing[judged] = epipolar_distance(matrix, before[judged], frame.xy[judged]) > self.settings.threshold_px
+        return failing, judged

@@ -1,4 +1,4 @@
-"""Which feature of the previous frame is this one? Links by optical flow, for filters with a memory of points."""
+"""Which feature of the previous frame is this one, and which are judged by their flow at all?"""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from dynslam_bench.flow.estimator import FlowResult
+
+from .baseline_settings import Unmatched
 from .filter import FilterState, FrameBundle
 
 
@@ -27,6 +30,19 @@ def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 
     near = np.isfinite(distance)
     link[rows[near]] = np.asarray(nearest)[near]
     return link
+
+
+def judged_by_flow(flow: FlowResult, asked: NDArray[np.bool_], unmatched: Unmatched) -> NDArray[np.bool_]:
+    """Which features a test on flow judges, bool ``[N]``.
+
+    Args:
+        flow: Flow of the features; where it failed, ``xy`` is the place where the tracker gave up.
+        asked: bool ``[N]``, features whose flow was asked for: those that earlier filters kept.
+        unmatched: ``judge`` takes those along whose flow failed.
+    """
+    if unmatched != "judge":
+        return np.asarray(asked & flow.valid)
+    return np.asarray(asked & np.isfinite(flow.xy).all(axis=1))
 
 
 def inherit(values: NDArray[np.float64], link: NDArray[np.intp], default: float) -> NDArray[np.float64]:

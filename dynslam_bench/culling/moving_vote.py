@@ -16,6 +16,8 @@ from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need,
 from .semantic import inside
 
 BORDER_PX = 5
+HARRIS_K = 0.04
+"""Of the corner measure that the authors' code chooses (Harris, blocks of 3 px)."""
 LEVELS = 5
 WINDOW = (22, 22)
 
@@ -62,13 +64,17 @@ class MovingVoteFilter(DynamicFilter):
     ) -> tuple[NDArray[np.float32], float, bool]:
         """Raw pixels ``[M, 2]`` of the corners off their line in the current image; how many tracked; whether F was."""
         nothing = np.zeros((0, 2), np.float32)
-        corners = cv2.goodFeaturesToTrack(previous, self.settings.corners, 0.01, 8)
+        corners = cv2.goodFeaturesToTrack(
+            previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
+        )
         if corners is None or len(corners) < 8:
             return nothing, 0.0, False
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
         corners = cv2.cornerSubPix(previous, corners, (10, 10), (-1, -1), criteria)
         guess = corners.copy()
-        tracked, found, _ = cv2.calcOpticalFlowPyrLK(previous, current, corners, guess, winSize=WINDOW, maxLevel=LEVELS)
+        tracked, found, _ = cv2.calcOpticalFlowPyrLK(
+            previous, current, corners, guess, winSize=WINDOW, maxLevel=LEVELS, criteria=(criteria[0], 20, 0.01)
+        )
         before, after = corners.reshape(-1, 2), tracked.reshape(-1, 2)
         height, width = current.shape
         low, high = np.array([BORDER_PX, BORDER_PX]), np.array([width - BORDER_PX - 1, height - BORDER_PX - 1])
@@ -93,10 +99,10 @@ class MovingVoteFilter(DynamicFilter):
 def _patch_difference(
     first: NDArray[np.uint8], second: NDArray[np.uint8], xy1: NDArray[np.float32], xy2: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Sum of absolute differences of the 3x3 patches around rounded pixels inside both images, ``[N]``."""
+    """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
     offsets = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-    a = np.rint(xy1)[:, None].astype(np.intp) + offsets
-    b = np.rint(xy2)[:, None].astype(np.intp) + offsets
+    a = xy1[:, None].astype(np.intp) + offsets
+    b = xy2[:, None].astype(np.intp) + offsets
     return np.asarray(
         np.abs(first[a[..., 1], a[..., 0]].astype(np.int64) - second[b[..., 1], b[..., 0]].astype(np.int64)).sum(axis=1)
     )

@@ -59,8 +59,10 @@ class MissedDetections:
             frames: Frames since the last update.
 
         Returns:
-            The found objects, followed by the bridged ones (with halved scores for every frame missed). Oracles miss
-            nothing: results with `Instances.moving` are returned as they are.
+            The found objects, followed by the bridged ones with the scores that they had when they were last seen: how
+            long an object is bridged is `limit`'s to say, and a score that fell with every miss would end it earlier,
+            at the confidence that filters select by. Oracles miss nothing: results with `Instances.moving` are
+            returned as they are.
         """
         if self.limit <= 0 or found.moving is not None:
             self._tracks = []
@@ -105,7 +107,6 @@ class MissedDetections:
             return False  # it left the image
         track.mask, track.box = mask, np.clip(box, 0, np.array([width, height] * 2)).astype(np.float32)
         track.missed += 1
-        track.score *= 0.5
         return True
 
 

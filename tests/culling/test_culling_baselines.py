@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scenes import CAMERA, Scene, box_instance, bundle, keyframe, keypoints, scene
@@ -174,6 +175,21 @@ def test_moving_vote_drops_all_people_or_nobody(shift: int) -> None:
     x, y = np.rint(made.frame.keypoints.xy).T
     on = (x >= BOX[0]) & (x < BOX[2]) & (y >= BOX[1]) & (y < BOX[3])
     np.testing.assert_array_equal(verdict.keep, ~on if shift else np.ones(len(on), bool))
+
+
+def test_moving_vote_tracks_the_corners_that_the_authors_code_chooses(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    previous = cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
+    harris = cv2.goodFeaturesToTrack(
+        previous, 1000, 0.01, 8, mask=None, blockSize=3, gradientSize=3, useHarrisDetector=True, k=0.04
+    )
+    given: list[np.ndarray] = []
+    refine = cv2.cornerSubPix
+    monkeypatch.setattr(cv2, "cornerSubPix", lambda image, corners, *rest: given.append(corners.copy()) or refine(
+        image, corners, *rest
+    ))  # fmt: skip
+    MovingVoteFilter(MovingVoteSettings(), SEGMENTATION)._moving_corners(previous, np.roll(previous, 3, 1), CAMERA)
+    np.testing.assert_array_equal(given[0], harris)
 
 
 def test_residual_clusters_find_the_part_that_the_camera_does_not_explain() -> None:

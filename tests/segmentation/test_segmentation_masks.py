@@ -162,9 +162,29 @@ def test_a_missed_detection_is_bridged_at_constant_velocity():
         assert len(bridge.update(instances(walker(k)))) == 1
     for k in (4, 5):
         bridged = bridge.update(instances())
-        assert len(bridged) == 1 and bridged.scores[0] < 0.9
+        assert len(bridged) == 1 and bridged.scores[0] == np.float32(0.9)
         assert iou(bridged.masks[0], walker(k)) > 0.75
     assert len(bridge.update(instances())) == 0
+
+
+@pytest.mark.parametrize("schedule", ["every", "every_nth"])
+@pytest.mark.parametrize("promised", [0, 1, 3, 5])
+def test_a_miss_is_bridged_for_as_many_segmented_frames_as_promised_however_weak_the_detection(promised, schedule):
+    class Weak:
+        def segment(self, frame):
+            found = instances(walker(1)) if frame.index < 6 else instances()
+            return Instances(found.masks, found.boxes, found.class_names, np.full(len(found), 0.31, np.float32))
+
+    settings = SegmentationSettings(compensate=promised, schedule=schedule, n=2, confidence=0.3)
+    stage = MaskScheduler(settings, Weak())
+    gray = np.random.default_rng(0).integers(0, 255, (H, W), dtype=np.uint8)
+    seen = []
+    for index in range(20):
+        frame = Frame(index, index / 30, gray[:, :, None].repeat(3, 2), np.zeros((H, W), np.float32))
+        used = select(stage.masks_for(frame, gray, keyframe=False), settings)
+        if stage.segmented and index >= 6:
+            seen.append(len(used))
+    assert seen == [1] * promised + [0] * (len(seen) - promised)
 
 
 def test_single_detections_leaving_objects_and_oracles_are_not_bridged():

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, DepthBlockSettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SHARED_MASKS, SemanticSystemSettings, compose
+from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -21,7 +21,7 @@ class BlitzSlamSettings(SemanticSystemSettings):
     segmentation: SegmentationSettings = SegmentationSettings(dilation_px=0)
     depth_blocks: DepthBlockSettings = DepthBlockSettings()
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.5, outside_px=1000.0)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: BlitzSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -48,9 +48,10 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Fan et al., Blitz-SLAM, Pattern Recognition 2022",
     assumptions=(
-        SHARED_MASKS,
+        masks_in_words(BlitzSlamSettings().segmentation),
+        matches_in_words(BlitzSlamSettings().flow, BlitzSlamSettings().box_epipolar.unmatched),
         "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated), refitted to its inliers",
-        "matches come from Lucas-Kanade flow; with fewer than 20 outside the boxes all kept ones count",
+        "with fewer than 20 matches outside the boxes all kept ones count; its boxes are those of the masks",
         "which classes are movable (not stated)",
         "the residual removal of its mapping is left out: it does not touch the pose",
     ),

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import ProbabilitySettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -20,7 +20,7 @@ class CfpSlamSettings(SemanticSystemSettings):
 
     segmentation: SegmentationSettings = SegmentationSettings(compensate=5, repair="depth", dilation_px=7)
     probability: ProbabilitySettings = ProbabilitySettings(threshold=0.7, soft=True)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: CfpSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -42,8 +42,11 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Hu et al., CFP-SLAM, IROS 2022",
     assumptions=(
+        masks_in_words(CfpSlamSettings().segmentation),
+        links_in_words(CfpSlamSettings().flow),
         "constant-velocity boxes instead of its Kalman filter",
-        "depth repair instead of DBSCAN in the box; masks grown by 7 px, missed ones bridged for five frames",
+        "depth repair instead of DBSCAN in the box",
+        grown_in_words(CfpSlamSettings().segmentation),
         "a Bayes filter of 0.9 on the masks as static probability, a feature's and not a map point's",
         "greedy association of boxes instead of the Hungarian one",
     ),

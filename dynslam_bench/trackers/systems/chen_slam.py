@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
-from dynslam_bench.flow.settings import FlowSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -18,7 +18,7 @@ class ChenSlamSettings(SemanticSystemSettings):
     """Masks and the epipolar test."""
 
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: ChenSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -44,7 +44,10 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Chen et al., Micromachines 13(11) 2006, 2022",
     assumptions=(
-        "epipolar threshold 1 px; masks grown by 15 px",
+        masks_in_words(ChenSlamSettings().segmentation),
+        matches_in_words(ChenSlamSettings().flow, ChenSlamSettings().box_epipolar.unmatched),
+        grown_in_words(ChenSlamSettings().segmentation),
+        "epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
         "RGB-D back end (theirs is monocular)",
     ),
 )

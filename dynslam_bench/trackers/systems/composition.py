@@ -19,10 +19,11 @@ from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings
 
 from ..protocol import TrackerContext
+from .published import masks_in_words
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Where masks can come from, as `segmentation.source` names it."""
-SHARED_MASKS = "masks come from the stage that all systems share: scores above 0.3, missed detections bridged"
+SHARED_MASKS = masks_in_words(SegmentationSettings())
 """An assumption of every system with a semantic source."""
 CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
 """The paper's improved mask branch, as far as it is there."""

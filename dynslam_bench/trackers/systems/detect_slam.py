@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import ProbabilitySettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, links_in_words, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -20,7 +20,7 @@ class DetectSlamSettings(SemanticSystemSettings):
 
     segmentation: SegmentationSettings = SegmentationSettings(schedule="keyframes", dilation_px=0)
     probability: ProbabilitySettings = ProbabilitySettings(rule="average", threshold=0.75, expand_px=32.0)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: DetectSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -42,6 +42,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., Detect-SLAM, WACV 2018",
     assumptions=(
+        masks_in_words(DetectSlamSettings().segmentation, boxes=True),
+        links_in_words(DetectSlamSettings().flow),
         "rate 0.3 and threshold 0.75 (no readable source)",
         "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection at "
         "least on every tenth frame",

@@ -8,6 +8,7 @@ from dynslam_bench.culling.baseline_settings import ResidualSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import ObjectSettings, SemanticSystemSettings, compose
+from .published import masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -39,6 +40,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
     assumptions=(
+        masks_in_words(DgsSlamSettings().segmentation),
         "the warp: every eighth pixel of the frame goes to the nearest one of the previous image by the motion model's "
         "prediction, before the frame's own pose is known",
         "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, MultiViewSettings
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -23,7 +23,7 @@ class DiSlamSettings(SemanticSystemSettings):
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous")
     multiview: MultiViewSettings = MultiViewSettings(grow=False)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -50,9 +50,13 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
     assumptions=(
-        "the published code of SG-SLAM stands in for the epipolar half",
+        masks_in_words(DiSlamSettings().segmentation, boxes=True),
+        matches_in_words(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
+        "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the flow loses "
+        "by the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
         "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",
         "seeds of the multi-view test are grown by 15 px",
-        "multi-view depth without growing regions; the guard undoes it before the epipolar verdict",
+        "multi-view depth without growing regions; where fewer than a tenth of the features remain the guard "
+        "undoes it first (SG-SLAM restores all)",
     ),
 )

@@ -8,7 +8,8 @@ from dynslam_bench.culling.baseline_settings import MovingVoteSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SHARED_MASKS, SemanticSystemSettings, compose
+from .composition import SemanticSystemSettings, compose
+from .published import masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -39,6 +40,9 @@ SPEC = TrackerSpec(
     published_as=("DS-SLAM",),
     license="MIT (re-implemented from the description; the authors' code derives from ORB-SLAM2, GPL-3.0)",
     citation="Yu et al., DS-SLAM, IROS 2018",
-    assumptions=(SHARED_MASKS,),
+    assumptions=(
+        masks_in_words(DsSlamSettings().segmentation),
+        "corners are undistorted before F is fitted (the code fits raw pixels)",
+    ),
     remarks="has no degeneracy guard: the published system fails on walking_rpy (0.44 m)",
 )

@@ -8,6 +8,7 @@ from dynslam_bench.culling.baseline_settings import TemplateSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -38,6 +39,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., DynaTM-SLAM, Robotics and Autonomous Systems 174, 2024",
     assumptions=(
+        masks_in_words(DynaTmSlamSettings().segmentation, boxes=True),
         "patch, window and correlation threshold; the patch is shifted, not warped",
         "a feature in a box without depth or history goes with the box",
         "no object constraints in bundle adjustment",

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import ProbabilitySettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -22,7 +22,7 @@ class HuaiSlamSettings(SemanticSystemSettings):
         compensate=5, repair="depth", repair_depth_m=0.33, dilation_px=7
     )
     probability: ProbabilitySettings = ProbabilitySettings()
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: HuaiSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -43,7 +43,10 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Huai et al., Sensors 25(6) 1696, 2025",
     assumptions=(
-        "five frames, 7 px, Bayes filter of 0.9",
+        masks_in_words(HuaiSlamSettings().segmentation),
+        links_in_words(HuaiSlamSettings().flow),
+        grown_in_words(HuaiSlamSettings().segmentation),
+        "Bayes filter of 0.9; greedy association of constant-velocity boxes",
         "masks are fitted to depth at their border, within 0.33 m, and not cut by it as a whole",
     ),
 )

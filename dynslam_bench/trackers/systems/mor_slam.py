@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
-from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -20,7 +20,7 @@ class MorSlamSettings(SemanticSystemSettings):
 
     segmentation: SegmentationSettings = SegmentationSettings(repair="depth", repair_depth_m=0.1, dilation_px=0)
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: MorSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -46,7 +46,9 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yao et al., MOR-SLAM, Mathematics 11(19) 4037, 2023",
     assumptions=(
-        "closing of 7 px, depth step 0.1 m, 1 px",
+        masks_in_words(MorSlamSettings().segmentation),
+        matches_in_words(MorSlamSettings().flow, MorSlamSettings().box_epipolar.unmatched),
+        "closing of 7 px, depth step 0.1 m, epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
         "depth decides within 8 px of a mask's border; holes inside are filled whatever their depth",
     ),
 )

@@ -10,6 +10,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -48,6 +49,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhang et al., NGD-SLAM, arXiv 2405.07392",
     assumptions=(
+        masks_in_words(NgdSlamSettings().segmentation, boxes=True),
         "detection on every third frame stands in for its asynchronous detector",
         "masks are carried by our sparse flow, not by its clustering of corners",
         "its tracking of static corners with a PnP of its own between keyframes is left out",

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.settings import EpipolarSettings
-from dynslam_bench.flow.settings import FlowSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SystemSettings, compose
+from .published import PublishedFlowSettings
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -20,7 +20,7 @@ class OpfSlamSettings(SystemSettings):
     epipolar: EpipolarSettings = EpipolarSettings(
         min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
     )
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: OpfSlamSettings, context: TrackerContext) -> SlamPipeline:

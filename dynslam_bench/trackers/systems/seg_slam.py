@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import ClassRuleSettings
-from dynslam_bench.flow.settings import FlowSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -18,7 +18,7 @@ class SegSlamSettings(SemanticSystemSettings):
     """The class rule."""
 
     class_rule: ClassRuleSettings = ClassRuleSettings()
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: SegSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -38,5 +38,10 @@ SPEC = TrackerSpec(
     ranked=False,
     license="MIT (re-implemented from the description)",
     citation="Cong et al., SEG-SLAM, Sensors 24(7) 2102, 2024",
-    assumptions=("0.3 m, 1 px, 30 % of an object's points",),
+    assumptions=(
+        masks_in_words(SegSlamSettings().segmentation),
+        matches_in_words(SegSlamSettings().flow, SegSlamSettings().class_rule.unmatched),
+        grown_in_words(SegSlamSettings().segmentation),
+        "0.3 m, 1 px (RANSAC 1 px, 0.99, refitted to its inliers), 30 % of an object's points",
+    ),
 )

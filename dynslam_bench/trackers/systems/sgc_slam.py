@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
-from dynslam_bench.flow.settings import FlowSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -18,7 +18,7 @@ class SgcSlamSettings(SemanticSystemSettings):
     """The epipolar test with boxes."""
 
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: SgcSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -39,6 +39,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yang et al., SGC-VSLAM, Sensors 2020",
     assumptions=(
+        masks_in_words(SgcSlamSettings().segmentation, boxes=True),
+        matches_in_words(SgcSlamSettings().flow, SgcSlamSettings().box_epipolar.unmatched),
         "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
         "with fewer than 20 matches outside the boxes F is fitted to all kept ones",
         "its improved quadtree of features is left out",

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.culling.baseline_settings import ClassRuleSettings
-from dynslam_bench.flow.settings import FlowSettings
 
 from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
+from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -18,7 +18,7 @@ class SofSlamSettings(SemanticSystemSettings):
     """The class rule without its depth part."""
 
     class_rule: ClassRuleSettings = ClassRuleSettings(movable="chair,tv", depth_m=0.0, vote_share=1.0)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: SofSlamSettings, context: TrackerContext) -> SlamPipeline:
@@ -39,7 +39,10 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Cui and Ma, SOF-SLAM, IEEE Access 2019",
     assumptions=(
+        masks_in_words(SofSlamSettings().segmentation),
+        matches_in_words(SofSlamSettings().flow, SofSlamSettings().class_rule.unmatched),
+        grown_in_words(SofSlamSettings().segmentation),
         "potentially dynamic are chairs and monitors (the class list is not public)",
-        "RANSAC 1 px, 0.99; distance 1 px",
+        "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
     ),
 )

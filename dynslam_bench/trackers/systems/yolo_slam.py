@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from dynslam_bench.culling.baseline_settings import DepthRansacSettings
 
 from ..protocol import TrackerContext, TrackerSpec
-from .composition import SHARED_MASKS, SemanticSystemSettings, compose
+from .composition import SemanticSystemSettings, compose
+from .published import masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -38,10 +39,9 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Wu et al., YOLO-SLAM, Neural Computing and Applications 2022",
     assumptions=(
-        "the set grows by the nearest depth first (order not stated)",
+        "the set grows by the nearest depth first (order not stated); 0.43 is taken in square metres",
         "features of a box without depth go with the person",
         "RANSAC draws at most 50 pairs for a probability of 0.99; a box with fewer than three depths keeps all",
-        "boxes derive from the masks",
-        SHARED_MASKS,
+        masks_in_words(YoloSlamSettings().segmentation, boxes=True),
     ),
 )
