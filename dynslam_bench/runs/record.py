@@ -40,7 +40,10 @@ class SequenceInfo(Record):
     Attributes:
         id: Its id.
         content: Digest of its content.
-        part: Digest of content, camera and frames: names the folder with the stamps and the ground truth.
+        part: Digest of content and frames: names the folder with the stamps and the ground truth.
+        block: Digest of what is filmed, camera, frames and stride, without the start offset and the noise seed: one
+            column of a table. Empty in records of older versions, whose `part` stands for it.
+        noise: Seed of the sensors' noise; None for the sequence's own.
         frames: Frames of the run's part.
         duration_s: Time between its first and last frame.
         fps: Nominal frame rate.
@@ -54,6 +57,8 @@ class SequenceInfo(Record):
     id: str
     content: str = ""
     part: str
+    block: str = ""
+    noise: int | None = None
     frames: int
     duration_s: float
     fps: float
@@ -88,6 +93,7 @@ class RunRecord(Record):
         settings: All settings, dotted name to value.
         sequence: The sequence.
         frames: Part of it; None for all.
+        offset: So many leading frames of that part were left out.
         stride: Every so many frames.
         seed: Seed.
         device: Where it computed.
@@ -107,6 +113,8 @@ class RunRecord(Record):
         map_points: Map points at the end, None if the tracker does not say.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
             where either is missing.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
         timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
@@ -119,6 +127,7 @@ class RunRecord(Record):
         command: The command line of the parent process.
         identity: What `run_id` stands for.
         provenance: For imported trajectories: where it came from.
+        place: Folder of the sequence where it was named by its path; empty for an id.
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
         notes: Anything a reader should know, one line each.
     """
@@ -133,6 +142,7 @@ class RunRecord(Record):
     settings: dict[str, Any] = Field(default_factory=dict)
     sequence: SequenceInfo
     frames: tuple[int, int | None] | None = None
+    offset: int = 0
     stride: int = 1
     seed: int = 0
     device: str = ""
@@ -151,6 +161,7 @@ class RunRecord(Record):
     keyframes: int | None = None
     map_points: int | None = None
     mask_iou: float | None = None
+    epipolar_skipped: float | None = None
     timings: dict[str, StageTime] = Field(default_factory=dict)
     finalize_s: float | None = None
     started: str = ""
@@ -163,6 +174,7 @@ class RunRecord(Record):
     command: list[str] = Field(default_factory=list)
     identity: dict[str, Any] = Field(default_factory=dict)
     provenance: str = ""
+    place: str = ""
     stamps_match: bool = True
     notes: list[str] = Field(default_factory=list)
 
@@ -174,6 +186,14 @@ class RunRecord(Record):
     def failed(self) -> bool:
         """Whether it did not come to its end."""
         return self.status in FAILED
+
+    @property
+    def repeat(self) -> str:
+        """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
+        words = [f"seed {self.seed}"]
+        words += [f"offset {self.offset}"] * bool(self.offset)
+        words += [] if self.sequence.noise is None else [f"noise {self.sequence.noise}"]
+        return ", ".join(words)
 
     @property
     def frame_time_s(self) -> float | None:
@@ -189,7 +209,7 @@ class RunRecord(Record):
 
     def describe(self) -> str:
         """One line: tracker, sequence, seed, status, coverage, frame time."""
-        parts = [f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, seed {self.seed}: {self.status}"]
+        parts = [f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"]
         parts.append(f"coverage {100 * self.coverage:.1f} %")
         if self.frame_time_s is not None:
             parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
