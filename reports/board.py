@@ -230,10 +230,11 @@ def _order_sequences(board: Board) -> None:
 
 
 def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
-    """Who is ranked on which sequences.
+    """Who is ranked on which sequences: on those that all ranked trackers have.
 
-    A tracker without any success is not; where no sequence is common to all that could be, those with the fewest are
-    left out until there is one.
+    Trackers with few sequences are left out where that leaves more cells to rank (trackers times sequences), so that
+    neither one more sequence of one tracker nor one run of another takes the ranking away from the rest. A tracker
+    without any success is not ranked.
     """
     rankable = [key for key in scored if board.first(key).ranked and board.first(key).provenance != "control"]
     rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
@@ -241,8 +242,9 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     competing = sorted(rankable, key=lambda key: (-len(has[key]), key))
     if board.on == "all":
         competing = [key for key in competing if has[key] == set(board.sequences)]
-    while competing and not set.intersection(*(has[key] for key in competing)):
-        competing.pop()
+    sizes = {n: n * len(set.intersection(*(has[key] for key in competing[:n]))) for n in range(1, len(competing) + 1)}
+    several = {n: cells for n, cells in sizes.items() if n > 1 and cells} or sizes
+    competing = competing[: max(several, key=lambda n: (several[n], n), default=0)]
     shared = set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
     board.common = [name for name in board.sequences if name in shared]
     board.hopeless = [key for key in scored if not _succeeded(board, key)]

@@ -29,7 +29,7 @@ _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cros
 
 def ratio_figure(board: Board) -> Figure | None:
     """Geometric-mean ATE ratios with their intervals, best on top; None where nothing is scored."""
-    standings = [s for s in board.standings if np.isfinite(s.ratio.value)]
+    standings = [s for s in board.standings if np.isfinite(s.ratio.value) and s.key not in board.hopeless]
     if not standings:
         return None
     palette = colours(board)
@@ -123,10 +123,11 @@ def speed_figure(board: Board) -> Figure | None:
         height=max(460, 120 + 21 * len(points)),
         xaxis=log_axis(
             "× real time: frame interval over mean frame time (right is better)",
-            [1.0, *(speed for _, speed, _ in points)],
+            [1.0, *(speed for _, speed, _, _ in points)],
         ),
         yaxis=log_axis(
-            "ATE ratio (down is better)", [1.0, *(r for _, _, ratio in points for r in (ratio.low, ratio.high))]
+            "ATE ratio (down is better)",
+            [1.0, *(end for _, _, ratio, _ in points for end in (ratio.value, ratio.low, ratio.high))],
         ),
         shapes=[guide(x=1.0), guide(y=1.0)],
         annotations=[

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from .board import Board
 from .rows import RunRow
 
-_MOST = 20
+_MOST = 8
 
 
 def missing_note(board: Board) -> str:
@@ -24,7 +24,7 @@ def missing_note(board: Board) -> str:
             parts.append(f"The ranking stands on the {common} of {total} sequences that all ranked trackers have.")
     if board.incomplete:
         left = ", ".join(board.labels[key] for key in board.incomplete)
-        why = "lack sequences" if board.on == "all" else "share none of those"
+        why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
         parts.append(f"Not ranked, since they {why}: {left}.")
     cells = "; ".join(f"{board.labels[key]} on {_list(names)}" for key, names in list(lacking.items())[:_MOST])
     more = f"; and {len(lacking) - _MOST} more trackers" if len(lacking) > _MOST else ""

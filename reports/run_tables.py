@@ -78,8 +78,8 @@ def repeatability(board: Board) -> Table | None:
         return None
     caption = (
         "How far the runs of one tracker on one sequence lie apart when only seed, start offset or sensor noise "
-        "differ. Differences between trackers that are smaller than this are noise. Copies (several seeds, one result to the "
-        "last digit) are no repeats: they are counted as deterministic and take no part."
+        "differ. Differences between trackers that are smaller than this are noise. Copies (several seeds, one result "
+        "to the last digit) are no repeats: they are counted as deterministic and take no part."
     )
     return Table("repeatability", "Repeatability", caption, columns, rows)
 

@@ -124,24 +124,37 @@ def separable(logs: Mapping[str, Array]) -> dict[tuple[str, str], bool]:
     error of `FAMILY_ERROR`). Below `FEWEST` sequences nothing is separable.
 
     Args:
-        logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of sequences.
+        logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of sequences, none missing.
 
     Returns:
         For every pair ``(a, b)``, a before b in `logs`, whether they differ.
     """
     pairs = list(combinations(logs, 2))
-    p_values: dict[tuple[str, str], float] = {}
-    for pair in pairs:
-        difference = logs[pair[0]] - logs[pair[1]]
-        difference = difference[np.isfinite(difference)]
-        if len(difference) >= FEWEST and np.ptp(difference) > 0:
-            p_values[pair] = float(stats.ttest_1samp(difference, 0.0).pvalue)
-        elif len(difference) >= FEWEST and difference[0] != 0:
-            p_values[pair] = 0.0  # the same ratio on every sequence
-        else:
-            p_values[pair] = 1.0
-    corrected = holm({str(at): p_values[pair] for at, pair in enumerate(pairs)})
+    if not pairs:
+        return {}
+    differences = np.stack([logs[a] - logs[b] for a, b in pairs])
+    p_values = np.ones(len(pairs))
+    if differences.shape[1] >= FEWEST:
+        varied = np.ptp(differences, axis=1) > 0
+        p_values[varied] = stats.ttest_1samp(differences[varied], 0.0, axis=1).pvalue
+        p_values[~varied & (differences[:, 0] != 0)] = 0.0  # the same ratio on every sequence
+    corrected = holm({str(at): float(p) for at, p in enumerate(p_values)})
     return {pair: corrected[str(at)] <= FAMILY_ERROR for at, pair in enumerate(pairs)}
+
+
+def rank_groups(logs: Mapping[str, Array]) -> dict[str, tuple[int, int]]:
+    """First and last rank that the data leave open to every tracker.
+
+    Args:
+        logs: As in `separable`.
+    """
+    better, worse = dict.fromkeys(logs, 0), dict.fromkeys(logs, 0)
+    for (a, b), apart in separable(logs).items():
+        if apart:
+            first, second = (a, b) if logs[a].mean() < logs[b].mean() else (b, a)
+            worse[first] += 1
+            better[second] += 1
+    return {key: (1 + better[key], len(logs) - worse[key]) for key in logs}
 
 
 def paired_p_value(log_a: Array, log_b: Array) -> float | None:
@@ -229,13 +242,7 @@ def _ranks(logs: Mapping[str, Array]) -> tuple[dict[str, int], dict[str, tuple[i
     means = {key: float(np.mean(logs[key])) for key in keys}
     order = stats.rankdata([round(means[key], 12) for key in keys], method="min")
     per_sequence = stats.rankdata(np.stack([logs[key] for key in keys]), method="average", axis=0).mean(axis=1)
-    better, worse = dict.fromkeys(keys, 0), dict.fromkeys(keys, 0)
-    for (a, b), apart in separable(logs).items():
-        if apart:
-            first, second = (a, b) if means[a] < means[b] else (b, a)
-            worse[first] += 1
-            better[second] += 1
-    groups = {key: (1 + better[key], len(keys) - worse[key]) for key in keys}
+    groups = rank_groups(logs)
     return (
         {key: int(order[i]) for i, key in enumerate(keys)},
         groups,

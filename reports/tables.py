@@ -19,7 +19,7 @@ from .statistics import FEWEST, Interval, Standing
 from .table import Column, Emphasis, Table, TableCell
 
 _PROVENANCE = {
-    "own": "our own system: parts of it are in no paper",
+    "own": "parts of it are in no paper",
     "faithful-code": "follows the published code",
     "faithful-paper": "follows the paper",
     "inspired": "follows an abstract or a survey; constants are ours",
@@ -27,6 +27,7 @@ _PROVENANCE = {
     "external": "not part of this project",
     "control": "a control, not a system",
 }
+_NAMES = {"own": "our own system"}
 CACHED_MARK = "†"
 CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 
@@ -52,7 +53,7 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
 def _columns(board: Board, epipolar: bool) -> list[Column]:
     skipped = Column(
         "F skipped",
-        meaning="share of the tracked frames on which the epipolar test had no say: the fundamental matrix was not used",
+        meaning="share of the tracked frames on which the epipolar test had no say, since F was not used",
     )
     return [
         Column("#", meaning="ranks that the data leave open; several: not separable from the others with that rank"),
@@ -107,8 +108,10 @@ def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[T
     good = sum(not row.failed for row in runs)
     success = TableCell(f"{good}/{len(runs)}", value=good / len(runs))
     name = TableCell(board.labels[key], tip=board.first(key).tracker)
+    if key in board.hopeless:
+        return [TableCell("–"), success, name, TableCell("nothing succeeded", emphasis="failed"), *[TableCell()] * 3]
     if standing is None:
-        return [TableCell("–"), success, name, *[TableCell() for _ in range(4)]]
+        return [TableCell("–"), success, name, *[TableCell()] * 4]
     ratio = interval_cell(standing.ratio, ".2f", _mark(board, standing))
     if standing.sequences < len(board.common):
         text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
@@ -135,8 +138,9 @@ def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
         speed_cell(ended),
         number_cell(middle(row.peak_memory_mb for row in ended), ".0f"),
         TableCell(tag=kinds),
-        TableCell(provenance, f"{masks} masks" if masks else "", tip=_PROVENANCE.get(provenance, "")),
-    ]
+        TableCell(_NAMES.get(provenance, provenance), f"{masks} masks" if masks else "",
+                  tip=_PROVENANCE.get(provenance, "")),
+    ]  # fmt: skip
 
 
 def timed(runs: Sequence[RunRow]) -> list[RunRow]:
