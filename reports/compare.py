@@ -14,11 +14,11 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.store import RunStore
 
-from .board import make_labels
 from .build import ReportData
 from .cell import make_cell
 from .columns import name_columns
 from .formats import mm
+from .labels import make_labels
 from .rows import RunRow, check_one_protocol, load_runs, open_stores
 from .statistics import FEWEST, Interval, ratio_interval
 from .table import Column, Table, TableCell, to_csv, to_markdown

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.store import RunStore
 
-from .board import make_labels
 from .columns import name_columns
+from .labels import make_labels
 from .rows import RunRow, load_runs, open_stores
 
 if TYPE_CHECKING:
