@@ -5,37 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import median
+from typing import TYPE_CHECKING, Literal
 
-from dynslam_bench.core.errors import ReportError
+from dynslam_bench.core.errors import ReportError, did_you_mean
 
+from .cell import Cell, make_cell
+from .columns import name_columns, shortened
+from .labels import make_labels
 from .rows import RunRow, check_one_protocol
 from .statistics import Standing, standings
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 NEVER_MOVE = "never move (from the ground truth)"
+DEFAULT_REFERENCE = "orb-slam2"
+On = Literal["common", "all"]
+"""Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
 _GROUPS = (("static", "static"), ("low-dynamic", "low dynamic"), ("high-dynamic", "high dynamic"))
 
 _NAMES = (("walking", "high dynamic"), ("sitting", "low dynamic"))
 _OTHER = "other"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """All runs of one tracker on one sequence.
-
-    Attributes:
-        rows: The runs.
-        scores: Their errors in metres, failures imputed.
-        imputed: How many of them were imputed.
-    """
-
-    rows: tuple[RunRow, ...]
-    scores: tuple[float, ...]
-    imputed: int
-
-    @property
-    def median(self) -> float | None:
-        """Median error in metres; None without ground truth."""
-        return median(self.scores) if self.scores else None
 
 
 @dataclass
@@ -44,25 +34,34 @@ class Board:
 
     Attributes:
         rows: All rows.
-        trackers: Variant keys in order of standing.
+        on: What trackers are ranked on.
+        columns: Column id of a row to the name of its sequence.
+        trackers: Variant keys in order of standing; those of which only final trajectories are known stand apart.
+        final_only: Variant keys of imports of which only the final trajectory is known.
         labels: Variant key to the name in tables.
-        sequences: Sequence keys with ground truth, grouped and sorted.
-        short: Sequence key to what is left of it without the parts that all share.
-        groups: Sequence key to the name of its group.
-        unscored: Sequence keys without ground truth.
-        cells: Variant key to sequence key to its runs.
-        never_move: Sequence key to the error of a camera that does not move.
+        sequences: Names of the sequences with ground truth, grouped and sorted.
+        common: Those of them that the standings are taken over.
+        short: Sequence to what is left of its name without the parts that all share.
+        groups: Sequence to the name of its group.
+        unscored: Names of the sequences without ground truth.
+        cells: Variant key to sequence to its runs.
+        never_move: Sequence to the error of a camera that does not move.
         reference: Variant key of the reference; None if ratios are to a camera that never moves.
         reference_name: How to call the reference in captions.
-        standings: Standing of every variant with a score, in order.
+        standings: Standing of every variant with a score on the common sequences, in order.
         ranked: Variant keys that take part in the ranking.
-        incomplete: Variant keys left out of the ranking since they lack sequences.
+        incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
+        hopeless: Variant keys that never succeeded on the common sequences.
     """
 
     rows: list[RunRow]
+    on: On = "common"
+    columns: dict[str, str] = field(default_factory=dict)
     trackers: list[str] = field(default_factory=list)
+    final_only: list[str] = field(default_factory=list)
     labels: dict[str, str] = field(default_factory=dict)
     sequences: list[str] = field(default_factory=list)
+    common: list[str] = field(default_factory=list)
     short: dict[str, str] = field(default_factory=dict)
     groups: dict[str, str] = field(default_factory=dict)
     unscored: list[str] = field(default_factory=list)
@@ -73,6 +72,11 @@ class Board:
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
+    hopeless: list[str] = field(default_factory=list)
+
+    def sequence(self, row: RunRow) -> str:
+        """Name of the sequence of a row."""
+        return self.columns[row.column_id]
 
     def runs(self, key: str) -> list[RunRow]:
         """All rows of a tracker."""
@@ -86,69 +90,84 @@ class Board:
         """Ranked trackers from the best to the worst."""
         return [key for key in self.trackers if key in self.ranked]
 
+    def frame(self) -> pd.DataFrame:
+        """All rows as a pandas frame; see `rows_frame` for its columns and units."""
+        from .frame import rows_frame
+
+        return rows_frame(self.rows, self.columns, self.labels)
+
+    def lacking(self, key: str) -> list[str]:
+        """The sequences on which a tracker was not run."""
+        return [name for name in self.sequences if name not in self.cells[key]]
+
     def reference_scores(self) -> dict[str, list[float]]:
-        """The reference's errors on every sequence."""
+        """The reference's errors on the common sequences."""
         if self.reference is None:
-            return {name: [self.never_move[name]] for name in self.sequences}
-        return {name: list(self.cells[self.reference][name].scores) for name in self.sequences}
+            return {name: [self.never_move[name]] for name in self.common}
+        return {name: list(self.cells[self.reference][name].scores) for name in self.common}
 
-    def reference_median(self, sequence: str) -> float:
-        """The reference's median error on a sequence."""
-        return median(self.reference_scores()[sequence])
+    def reference_median(self, sequence: str) -> float | None:
+        """The reference's median error on a sequence; None where it was not run."""
+        if self.reference is None:
+            return self.never_move[sequence]
+        cell = self.cells[self.reference].get(sequence)
+        return None if cell is None else cell.median
+
+    def separators(self) -> set[int]:
+        """Rows of a table of all trackers above which a line is drawn: the unranked, and those that never succeeded."""
+        unranked = sum(key in self.ranked for key in self.trackers)
+        failed = len(self.trackers) - sum(key in self.hopeless for key in self.trackers)
+        return {at for at in (unranked, failed) if 0 < at < len(self.trackers)}
 
 
-def make_board(rows: Sequence[RunRow], reference: str = "orb-slam2") -> Board:
+def make_board(rows: Sequence[RunRow], reference: str = DEFAULT_REFERENCE, on: On = "common") -> Board:
     """Order rows into a board.
 
     Args:
         rows: One a run.
-        reference: Tracker id that errors are divided by; where it was not run on every sequence, a camera that never
-            moves takes its place.
+        reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
+            never moves takes its place.
+        on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
 
     Raises:
-        ReportError: There are no rows, or they mix protocols.
+        ReportError: There are no rows, they mix protocols, or nothing is known of the reference.
     """
     if not rows:
         raise ReportError("there are no runs to report")
     check_one_protocol(rows)
-    board = Board(list(rows))
+    known = sorted({row.tracker for row in rows})
+    if reference not in known and reference != DEFAULT_REFERENCE:
+        raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, known))
+    board = Board(list(rows), on, name_columns(rows))
     board.labels = make_labels(rows)
-    for key in {row.sequence_key: None for row in rows}:
-        found = [row.never_move_m for row in rows if row.sequence_key == key and row.never_move_m is not None]
-        if found:
-            board.never_move[key] = median(found)
-        else:
-            board.unscored.append(key)
-        board.groups[key] = _group(next(row for row in rows if row.sequence_key == key))
-    if set(board.groups.values()) == {_OTHER}:
-        board.groups = dict.fromkeys(board.groups, "")
-    order = {name: position for position, (_, name) in enumerate(_GROUPS)}
-    board.sequences = sorted(board.never_move, key=lambda key: (order.get(board.groups[key], 9), key))
-    board.short = shortened(board.sequences)
+    _order_sequences(board)
     for key in board.labels:
-        board.cells[key] = {
-            sequence: _cell([row for row in rows if row.variant_key == key and row.sequence_key == sequence])
-            for sequence in {row.sequence_key: None for row in rows if row.variant_key == key}
-        }
-    scored = [key for key, cell in board.cells.items() if any(cell[s].scores for s in board.sequences if s in cell)]
-    complete = [key for key in scored if all(s in board.cells[key] for s in board.sequences)]
-    board.ranked = [k for k in complete if board.first(k).ranked and board.first(k).provenance != "control"]
-    board.incomplete = [key for key in scored if key not in complete]
-    candidates = [key for key in complete if board.first(key).tracker == reference]
-    if candidates:
+        found: dict[str, list[RunRow]] = {}
+        for row in board.runs(key):
+            found.setdefault(board.sequence(row), []).append(row)
+        board.cells[key] = {name: make_cell(runs) for name, runs in found.items()}
+    shown = [key for key in board.labels if not _only_final(board, key)]
+    board.final_only = [key for key in board.labels if key not in shown]
+    scored = [key for key in shown if any(_scored(board, key))]
+    _choose_ranked(board, scored)
+    candidates = [
+        k for k in scored if board.first(k).tracker == reference and set(board.common) <= set(_scored(board, k))
+    ]
+    if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
         board.reference_name = board.labels[board.reference]
-    if board.sequences and scored:
+    if board.common:
         board.standings = rank(board, scored, board.ranked)
     placed = [standing.key for standing in board.standings]
-    board.trackers = placed + sorted((key for key in board.labels if key not in placed), key=board.labels.__getitem__)
+    placed += sorted((key for key in shown if key not in placed), key=board.labels.__getitem__)
+    board.trackers = [k for k in placed if k not in board.hopeless] + [k for k in placed if k in board.hopeless]
     return board
 
 
 def rank(
     board: Board, scored: Sequence[str], ranked: Sequence[str], score: Callable[[RunRow], float | None] | None = None
 ) -> list[Standing]:
-    """Standings under one rule for failures.
+    """Standings over the common sequences under one rule for failures.
 
     Args:
         board: Gives cells and reference.
@@ -159,9 +178,9 @@ def rank(
     rule = score or (lambda row: row.score_m)
     cells = {
         key: {
-            sequence: [value for row in cell.rows if (value := rule(row)) is not None]
-            for sequence, cell in board.cells[key].items()
-            if sequence in board.never_move
+            name: [value for row in cell.kept if (value := rule(row)) is not None]
+            for name, cell in board.cells[key].items()
+            if name in board.common
         }
         for key in scored
     }
@@ -174,51 +193,62 @@ def rank(
     return standings({key: cells[key] for key in placed}, shared, full)
 
 
-def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
-    """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants."""
-    variants: dict[str, RunRow] = {}
-    for row in rows:
-        variants.setdefault(row.variant_key, row)
-    labels = {}
-    for key, row in variants.items():
-        others = [other for other in variants.values() if other.tracker == row.tracker]
-        names = sorted({name for other in others for name in other.variant})
-        differing = [name for name in names if len({str(other.variant.get(name)) for other in others}) > 1]
-        parts = [f"{name}={row.variant[name]}" for name in differing if name in row.variant]
-        imported = row.kind == "imported"
-        if imported and any(other.kind != row.kind for other in others):
-            parts.append("imported")
-        same_label = [other for other in variants.values() if other.label == row.label and other.tracker != row.tracker]
-        base = f"{row.label} <{row.tracker}>" if same_label else row.label
-        labels[key] = base + (f" · {', '.join(parts)}" if parts else "")
-    return labels
+def _order_sequences(board: Board) -> None:
+    rows: dict[str, list[RunRow]] = {}
+    for row in board.rows:
+        rows.setdefault(board.sequence(row), []).append(row)
+    for name, found in rows.items():
+        still = [row.never_move_m for row in found if row.never_move_m is not None]
+        if still:
+            board.never_move[name] = median(still)
+        else:
+            board.unscored.append(name)
+        board.groups[name] = _group(found[0])
+    if set(board.groups.values()) == {_OTHER}:
+        board.groups = dict.fromkeys(board.groups, "")
+    order = {name: position for position, (_, name) in enumerate(_GROUPS)}
+    board.sequences = sorted(board.never_move, key=lambda key: (order.get(board.groups[key], 9), key))
+    board.short = shortened(board.sequences)
 
 
-def shortened(names: Sequence[str]) -> dict[str, str]:
-    """Names without the folders, and without the ``@...`` or ``?...`` behind them, that all of them share."""
-    if len(names) < 2:
-        return {name: name for name in names}
-    folders = [name.split("@")[0].split("?")[0].split("/")[:-1] for name in names]
-    shared = 0
-    while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
-        shared += 1
-    tails = {name[len(_stem(name)) :] for name in names}
-    short = {name: "/".join(_stem(name).split("/")[shared:]) + ("" if len(tails) == 1 else name[len(_stem(name)) :])
-             for name in names}  # fmt: skip
-    return short if len(set(short.values())) == len(names) else {name: name for name in names}
+def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
+    """Who is ranked on which sequences: on those that all ranked trackers have.
+
+    Trackers with few sequences are left out where that leaves more cells to rank (trackers times sequences), so that
+    neither one more sequence of one tracker nor one run of another takes the ranking away from the rest. A tracker
+    without any success is not ranked.
+    """
+    rankable = [key for key in scored if board.first(key).ranked and board.first(key).provenance != "control"]
+    rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
+    has = {key: set(_scored(board, key)) for key in rankable}
+    competing = sorted(rankable, key=lambda key: (-len(has[key]), key))
+    if board.on == "all":
+        competing = [key for key in competing if has[key] == set(board.sequences)]
+    sizes = {n: n * len(set.intersection(*(has[key] for key in competing[:n]))) for n in range(1, len(competing) + 1)}
+    several = {n: cells for n, cells in sizes.items() if n > 1 and cells} or sizes
+    competing = competing[: max(several, key=lambda n: (several[n], n), default=0)]
+    shared = set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
+    board.common = [name for name in board.sequences if name in shared]
+    board.hopeless = [key for key in scored if not _succeeded(board, key)]
+    board.ranked = [key for key in scored if key in competing and key not in board.hopeless]
+    board.incomplete = [key for key in rankable if key not in competing]
 
 
-def _stem(name: str) -> str:
-    """A sequence key up to its ``@``, ``?`` or `` [``."""
-    return min((name.partition(mark)[0] for mark in ("@", "?", " [")), key=len)
+def _succeeded(board: Board, key: str) -> bool:
+    """Whether any run on the common sequences did; on its others, if it was run on none of those."""
+    cells = board.cells[key]
+    names = [name for name in board.common if name in cells] or list(cells)
+    return any(cells[name].success for name in names)
 
 
-def _cell(rows: list[RunRow]) -> Cell:
-    rows = sorted(rows, key=lambda row: row.seed)
-    scores = [row.score_m for row in rows]
-    kept = tuple(score for score in scores if score is not None)
-    imputed = sum(1 for row in rows if row.failed and row.score_m is not None)
-    return Cell(tuple(rows), kept, imputed)
+def _scored(board: Board, key: str) -> list[str]:
+    """The sequences on which a tracker has a score."""
+    return [name for name in board.sequences if name in board.cells[key] and board.cells[key][name].scores]
+
+
+def _only_final(board: Board, key: str) -> bool:
+    """Whether a tracker has nothing of the trajectory that the others are judged by."""
+    return all(row.imported and not row.metrics and row.final_ate_m is not None for row in board.runs(key))
 
 
 def _group(row: RunRow) -> str:

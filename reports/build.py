@@ -7,27 +7,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from statistics import median
 
 from pydantic import Field
 
 import dynslam_bench
-from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.records import Record, write_atomic
-from dynslam_bench.evaluation.evaluate import evaluate
-from dynslam_bench.evaluation.frames import common_frames
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.store import RunStore
 
-from . import fairness_tables, figures, run_tables, tables
-from .board import Board, make_board
+from . import fairness_tables, figures, run_tables, sequence_tables, tables
+from .board import DEFAULT_REFERENCE, Board, On, make_board
+from .common import common_errors, representatives
 from .figure_style import Figure
+from .formats import significant_text
+from .missing import missing_commands, missing_note
 from .page import Block, Section, render
-from .reported import reported_for
-from .rows import Loaded, LoadedRun, RunRow, load_runs, open_stores
+from .reported import is_excerpt, reported_for
+from .rows import Loaded, RunRow, load_runs, open_stores
 from .sequence_figures import sequence_figures
-from .statistics import power_note
+from .statistics import FEWEST, power_note
 from .table import Table, to_csv, to_latex, to_markdown
 
 SCHEMA_VERSION = 1
@@ -98,7 +97,8 @@ def build_report(
     output: Path | str,
     *,
     protocol: Protocol | str = "tum-rgbd/v1",
-    reference: str = "orb-slam2",
+    reference: str = DEFAULT_REFERENCE,
+    on: On = "common",
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
 ) -> ReportPaths:
@@ -110,8 +110,9 @@ def build_report(
         runs: Results folders, or a store.
         output: Folder of the report; files in it that the report does not make are left alone.
         protocol: How to evaluate.
-        reference: Tracker id that errors are divided by; where it was not run on every sequence, a camera that never
-            moves takes its place.
+        reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
+            never moves takes its place.
+        on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
 
@@ -123,7 +124,7 @@ def build_report(
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
     loaded = load_runs(stores, protocol)
-    board = make_board([run.row for run in loaded.runs], reference)
+    board = make_board([run.row for run in loaded.runs], reference, on)
     draft = _Draft()
     _leaderboard(draft, board, protocol, loaded)
     _sequences(draft, board, protocol, loaded)
@@ -131,6 +132,7 @@ def build_report(
     _behaviour(draft, board, output)
     again = command or shlex.join(
         ["dynslam-bench", "report", *(str(store.root) for store in stores), "-o", str(output)]
+        + (["--on", on] if on != "common" else [])
     )
     _provenance(draft, board, again)
     data = ReportData(
@@ -141,15 +143,19 @@ def build_report(
 
 
 def _leaderboard(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
-    fewest = min((len(c.scores) for key in board.ranked for c in board.cells[key].values() if c.scores), default=0)
-    notes = []
-    if len(board.ranked) > 1 or len(board.sequences) > 0:
-        notes.append(power_note(len(board.ranked), len(board.sequences), fewest))
+    cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
+    notes = [power_note(board.standings, len(board.common), min((len(c.scores) for c in cells if c.scores), default=0))]
+    missing = missing_note(board)
+    if missing:
+        notes.insert(0, missing)
+    if board.final_only:
+        named = ", ".join(board.labels[key] for key in board.final_only)
+        notes.append(f"Only in the table of final trajectories, as nothing else is known of them: {named}.")
     if board.unscored:
         notes.append(f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}.")
     if loaded.superseded or loaded.stopped or loaded.unreadable:
         left = [
-            (loaded.superseded, f"{loaded.superseded} older runs of the same tracker, settings, sequence and seed"),
+            (loaded.superseded, f"{loaded.superseded} older runs of the same tracker, settings, frames and repeat"),
             (loaded.stopped, f"{loaded.stopped} runs that were stopped on request"),
             (len(loaded.unreadable), f"{len(loaded.unreadable)} folders without a valid record"),
         ]
@@ -158,8 +164,14 @@ def _leaderboard(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded
     section.blocks.append(draft.table(tables.leaderboard(board, protocol)))
     ratio = figures.ratio_figure(board)
     if ratio is not None:
-        caption = "Points: geometric-mean ATE ratio; bars: 95 % bootstrap interval. Open points are not ranked."
+        caption = (
+            f"Points: geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} sequences on. Open "
+            "points are not ranked."
+        )
         section.blocks.append(draft.figure("ratio", ratio, caption))
+    commands = missing_commands(board)
+    if commands:
+        section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(commands)))
     draft.add(section)
     speed = figures.speed_figure(board)
     if speed is not None:
@@ -168,6 +180,8 @@ def _leaderboard(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded
             "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
             "include segmentation and exclude decoding; they hold for the machine named below."
         )
+        if any(row.cached for row in board.rows):
+            caption += f" {tables.CACHED_NOTE}"
         section.blocks.append(draft.figure("speed", speed, caption))
         draft.add(section)
 
@@ -176,23 +190,37 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
     if not board.sequences:
         return
     section = Section("errors", "Errors by sequence", "Errors")
-    published = reported_for(board.sequences, protocol.alignment)
-    section.blocks.append(draft.table(tables.per_sequence(board, protocol, published), "Absolute trajectory error"))
-    common, frames = _common_errors(board, protocol, loaded)
+    excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence, row.duration_s)}
+    parts = sorted(excerpts | {board.sequence(row) for row in board.rows if row.frames})
+    if parts:
+        section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
+    published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)
+    table_of_errors = sequence_tables.per_sequence(board, protocol, published)
+    section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
+    common, frames = common_errors(board, protocol, loaded)
     table = fairness_tables.common_frames_table(board, common, frames)
     if table is not None:
         section.blocks.append(draft.table(table, table.title))
-    final = tables.metric_table(
+    final = sequence_tables.metric_table(
         board, lambda row: row.final_ate_m, "final_trajectory", "Error of the final trajectory",
-        "Median ATE (RMSE, metres) of the trajectory after loop closing and final optimisation, of the trackers that "
-        f"have one; all other tables show the {protocol.trajectory} one.",
+        "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
+        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+        trackers=[*board.trackers, *board.final_only],
     )  # fmt: skip
     if final is not None and protocol.trajectory == "online":
         section.blocks.append(draft.table(final, final.title))
+    if any(row.coverage < 1 and not row.failed for row in board.rows):
+        excluded = sequence_tables.metric_table(
+            board, lambda row: row.metrics.get("ate_rmse_m"), "lost_frames_excluded", "Error without the lost frames",
+            "Median ATE (RMSE, millimetres) of the tracked frames only, of the runs that succeeded: the sensitivity to "
+            f"lost frames, not what ranks. {protocol.describe()}.",
+        )  # fmt: skip
+        if excluded is not None:
+            section.blocks.append(draft.table(excluded, excluded.title))
     rule = fairness_tables.failure_rule_table(board)
     if rule is not None:
         section.blocks.append(draft.table(rule, rule.title))
-    for table in tables.relative_errors(board, protocol):
+    for table in sequence_tables.relative_errors(board, protocol):
         section.blocks.append(draft.table(table, table.title))
     draft.add(section)
 
@@ -200,7 +228,7 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
 def _details(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
     section = Section("trajectories", "Trajectories and error over time", "Trajectories")
     for position, sequence in enumerate(board.sequences):
-        chosen = _representatives(board, sequence, loaded)
+        chosen = representatives(board, sequence, loaded)
         estimates: dict[str, Trajectory] = {}
         truth = None
         for key, run in chosen.items():
@@ -240,10 +268,10 @@ def _behaviour(draft: _Draft, board: Board, output: Path) -> None:
         section.blocks.append(draft.table(repeat))
         draft.add(section)
     masks = figures.mask_figure(board)
-    table = tables.metric_table(
+    table = sequence_tables.metric_table(
         board, lambda row: row.mask_iou, "mask_iou", "Mask quality",
         "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
-        digits=3, larger_is_better=True,
+        text=significant_text, larger_is_better=True,
     )  # fmt: skip
     if masks is not None or table is not None:
         section = Section("masks", "Mask quality and pose error", "Masks")
@@ -269,7 +297,7 @@ def _provenance(draft: _Draft, board: Board, again: str) -> None:
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
     notes = [
-        f"{board.labels[r.variant_key]} on {r.sequence_key}, seed {r.seed}: {n}" for r in board.rows for n in r.notes
+        f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]
     if notes:
         shown = notes[:60]
@@ -277,51 +305,6 @@ def _provenance(draft: _Draft, board: Board, again: str) -> None:
             shown.append(f"... and {len(notes) - len(shown)} more in report.json")
         section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown))
     draft.add(section)
-
-
-def _common_errors(
-    board: Board, protocol: Protocol, loaded: Loaded
-) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
-    """Median ATE on the frames that all successful runs tracked; nothing where all runs tracked all frames."""
-    errors: dict[tuple[str, str], float] = {}
-    frames: dict[str, str] = {}
-    brief = protocol.model_copy(update={"rpe": (), "segments_m": (), "lost_frames": "exclude"})
-    for sequence in board.sequences:
-        runs = [
-            run for run in loaded.runs if run.row.sequence_key == sequence and run.row.metrics and not run.row.failed
-        ]
-        pairs = [(run, run.store.trajectory(run.row.run_id, protocol.trajectory)) for run in runs]
-        held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
-        truth = held[0][0].store.ground_truth(held[0][0].record.sequence.part) if held else None
-        if truth is None or len({run.row.variant_key for run, _ in held}) < 2:
-            continue
-        reduced = common_frames([trajectory for _, trajectory in held])
-        total = max(run.row.n_frames for run, _ in held)
-        frames[sequence] = f"{len(reduced[0])} of {total}"
-        values: dict[str, list[float]] = {}
-        for (run, _), trajectory in zip(held, reduced, strict=True):
-            try:
-                error = evaluate(trajectory, truth, brief).metrics["ate_rmse_m"]
-            except DynslamError:
-                continue
-            values.setdefault(run.row.variant_key, []).append(error)
-        errors |= {(key, sequence): median(found) for key, found in values.items()}
-    return errors, frames
-
-
-def _representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:
-    """Of each tracker the run on a sequence whose error is the (lower) median one."""
-    chosen: dict[str, LoadedRun] = {}
-    for key in board.trackers:
-        runs = [
-            run
-            for run in loaded.runs
-            if run.row.variant_key == key and run.row.sequence_key == sequence and "ate_rmse_m" in run.row.metrics
-        ]
-        if runs:
-            ordered = sorted(runs, key=lambda run: run.row.metrics["ate_rmse_m"])
-            chosen[key] = ordered[(len(ordered) - 1) // 2]
-    return chosen
 
 
 def _write(draft: _Draft, board: Board, protocol: Protocol, title: str, output: Path, data: ReportData) -> ReportPaths:
@@ -342,9 +325,11 @@ def _write(draft: _Draft, board: Board, protocol: Protocol, title: str, output: 
         csv={},
         data=output / "report.json",
     )
-    for table in [*draft.tables, run_tables.all_runs(board)]:
+    for table in draft.tables:
         paths.csv[table.id] = output / "csv" / f"{table.id}.csv"
         write_atomic(paths.csv[table.id], to_csv(table))
+    paths.csv["runs"] = output / "csv" / "runs.csv"
+    write_atomic(paths.csv["runs"], board.frame().to_csv(index=False))
     head = f"# {title}\n\n{protocol.describe()}\n\n" + ", ".join(f"{value} {name}" for value, name in facts) + "\n\n"
     notes = "".join(f"> {note}\n\n" for section in draft.sections for note in section.notes)
     write_atomic(

@@ -22,13 +22,14 @@ from .figure_style import (
     significant,
     wrapped,
 )
+from .tables import CACHED_MARK, timed
 
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "pentagon", "hexagon", "star")
 
 
 def ratio_figure(board: Board) -> Figure | None:
     """Geometric-mean ATE ratios with their intervals, best on top; None where nothing is scored."""
-    standings = [s for s in board.standings if np.isfinite(s.ratio.value)]
+    standings = [s for s in board.standings if np.isfinite(s.ratio.value) and s.key not in board.hopeless]
     if not standings:
         return None
     palette = colours(board)
@@ -56,10 +57,10 @@ def ratio_figure(board: Board) -> Figure | None:
         },
         "hovertemplate": "%{y}<br>ratio %{x:.3f}<extra></extra>",
     }
-    low, high = min(s.ratio.low for s in standings), max(s.ratio.high for s in standings)
+    reach = [value for s in standings for value in (s.ratio.value, s.ratio.low, s.ratio.high)]
     layout = layout_of(
         height=110 + 34 * len(standings),
-        xaxis=log_axis(f"ATE ratio to {safe(board.reference_name)} (left is better)", [low, high, 1.0]),
+        xaxis=log_axis(f"ATE ratio to {safe(board.reference_name)} (left is better)", [*reach, 1.0]),
         yaxis={"autorange": "reversed", "automargin": True, "gridcolor": GRID, "ticks": ""},
         shapes=[guide(x=1.0)],
         margin={"l": 20, "r": 30, "t": 40, "b": 60},
@@ -74,13 +75,15 @@ def speed_figure(board: Board) -> Figure | None:
     standings = {s.key: s for s in board.standings}
     points = []
     for key in board.trackers:
-        factors = [row.real_time_factor for row in board.runs(key) if row.real_time_factor and not row.failed]
+        rows = timed([row for row in board.runs(key) if row.real_time_factor and not row.failed])
+        factors = [row.real_time_factor for row in rows if row.real_time_factor]
         if key in standings and factors and np.isfinite(standings[key].ratio.value):
-            points.append((key, float(np.median(factors)), standings[key].ratio))
+            mark = f" {CACHED_MARK}" if any(row.cached for row in rows) else ""
+            points.append((key, float(np.median(factors)), standings[key].ratio, mark))
     if not points:
         return None
     traces: list[dict[str, Any]] = []
-    front = _pareto([(speed, ratio.value) for key, speed, ratio in points if key in board.ranked])
+    front = _pareto([(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked])
     if len(front) > 1:
         traces.append(
             {
@@ -93,7 +96,7 @@ def speed_figure(board: Board) -> Figure | None:
                 "hoverinfo": "skip",
             }
         )
-    for index, (key, speed, ratio) in enumerate(points):
+    for index, (key, speed, ratio, mark) in enumerate(points):
         ranked = key in board.ranked
         symbol = _SYMBOLS[index // len(COLOURS) % len(_SYMBOLS)]
         traces.append(
@@ -102,7 +105,7 @@ def speed_figure(board: Board) -> Figure | None:
                 "mode": "markers",
                 "x": [significant(speed)],
                 "y": [significant(ratio.value)],
-                "name": wrapped(board.labels[key]),
+                "name": wrapped(board.labels[key] + mark),
                 "marker": {"size": 13, "color": palette[key], "symbol": symbol if ranked else f"{symbol}-open"},
                 "error_y": {
                     "type": "data",
@@ -120,10 +123,11 @@ def speed_figure(board: Board) -> Figure | None:
         height=max(460, 120 + 21 * len(points)),
         xaxis=log_axis(
             "× real time: frame interval over mean frame time (right is better)",
-            [1.0, *(speed for _, speed, _ in points)],
+            [1.0, *(speed for _, speed, _, _ in points)],
         ),
         yaxis=log_axis(
-            "ATE ratio (down is better)", [1.0, *(r for _, _, ratio in points for r in (ratio.low, ratio.high))]
+            "ATE ratio (down is better)",
+            [1.0, *(end for _, _, ratio, _ in points for end in (ratio.value, ratio.low, ratio.high))],
         ),
         shapes=[guide(x=1.0), guide(y=1.0)],
         annotations=[
@@ -148,10 +152,10 @@ def repeat_figure(board: Board) -> Figure | None:
             cell = board.cells[key].get(sequence)
             if cell is None or len(cell.scores) < 2 or cell.median is None:
                 continue
-            for row in cell.rows:
+            for row in cell.kept:
                 if row.score_m is not None:
                     values.append(max(row.score_m, 1e-6) / max(cell.median, 1e-6))
-                    notes.append(f"{safe(sequence)}, seed {row.seed}{' (failed)' if row.failed else ''}")
+                    notes.append(f"{safe(sequence)}, {row.repeat}{f' ({row.ending})' if row.failed else ''}")
         if values:
             everything += values
             traces.append(
@@ -190,9 +194,7 @@ def mask_figure(board: Board) -> Figure | None:
     everything: list[float] = []
     for key in board.trackers:
         rows = [
-            row
-            for row in board.runs(key)
-            if row.mask_iou is not None and row.score_m is not None and row.sequence_key in board.never_move
+            row for row in board.runs(key) if row.mask_iou is not None and row.score_m is not None and not row.failed
         ]
         if rows:
             everything += [max(float(row.score_m or 0.0), 1e-6) for row in rows]
@@ -204,7 +206,7 @@ def mask_figure(board: Board) -> Figure | None:
                     "x": rounded([float(row.mask_iou or 0.0) for row in rows]),
                     "y": rounded([max(float(row.score_m or 0.0), 1e-6) for row in rows]),
                     "text": [
-                        f"{safe(row.sequence_key)}, seed {row.seed}, masks: {safe(row.segmentation)}" for row in rows
+                        f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(row.segmentation)}" for row in rows
                     ],
                     "marker": {"size": 9, "opacity": 0.85, "color": palette[key]},
                     "hovertemplate": "%{text}<br>IoU %{x:.3f}<br>ATE %{y:.4f} m<extra>%{fullData.name}</extra>",

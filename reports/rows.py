@@ -10,14 +10,24 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from dynslam_bench.core.errors import DynslamError, ReportError
+from dynslam_bench.core.errors import ReportError
 from dynslam_bench.core.records import Record
-from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
-from dynslam_bench.evaluation.never_move import never_move
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.scoring import score
 from dynslam_bench.runs.store import RunStore
+
+from .row_values import (
+    camera_words,
+    column_of,
+    command_line,
+    held_error,
+    machine_words,
+    never_move_error,
+    part_options,
+    part_words,
+    variant_of,
+)
 
 Kind = Literal["run here", "imported"]
 
@@ -30,25 +40,39 @@ class RunRow(Record):
         kind: Made by this toolkit, or a trajectory from elsewhere.
         tracker: Tracker id.
         label: Tracker's label.
-        variant: What sets runs of one tracker apart besides sequence and seed: overrides, device, threads, mode.
+        variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
         provenance: How closely the tracker follows its source.
         ranked: Whether its spec lets it be ranked.
         sequence: Sequence id.
         frames: Part of the sequence in words, empty for all of it.
+        part_options: The same as command-line options.
+        block: What one column of a table is: content, camera, frames and stride.
+        content: Digest of the content.
+        camera: Camera in words.
+        place: Folder of the sequence where it was named by its path.
+        duration_s: Time between its first and last frame.
         tags: Tags of the sequence.
         split: ``tune``, ``held-out`` or empty.
         seed: Seed.
+        offset: Leading frames that were left out: another repeat.
+        noise: Seed of the sensors' noise: another repeat.
         status: Status of the run.
         reason: Why it is not ``ok``.
         failed: Whether it counts as a failure: it did not end, could not track, or cannot be evaluated.
         protocol_id: Id of the protocol of `metrics`.
         protocol_digest: Its digest.
+        trajectory: Which trajectory the metrics are of; an import may hold the final one only.
         metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
-        final_ate_m: ATE of the final trajectory (after loop closing); None if there is none.
-        held_ate_m: The ATE with lost frames held at the last tracked pose; None if nothing was tracked.
+        final_ate_m: ATE of the final trajectory; None if there is none.
+        held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
         never_move_m: What a camera that does not move scores there; None without ground truth.
         n_frames: Input frames.
-        coverage: Share of them that was tracked.
+        n_processed: Frames that the tracker saw before it ended.
+        n_tracked: Frames that were tracked.
+        coverage: Share of the input frames that was tracked.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
+        cached: Whether stage times come from the stage cache and were not taken in this run.
         frame_ms: Median frame time in milliseconds, None if unknown.
         real_time_factor: Frame interval over mean frame time, None if unknown.
         peak_memory_mb: Largest resident memory, None if unknown.
@@ -70,20 +94,33 @@ class RunRow(Record):
     ranked: bool = True
     sequence: str
     frames: str = ""
+    part_options: list[str] = Field(default_factory=list)
+    block: str = ""
+    content: str = ""
+    camera: str = ""
+    place: str = ""
+    duration_s: float = 0.0
     tags: list[str] = Field(default_factory=list)
     split: str = ""
     seed: int = 0
+    offset: int = 0
+    noise: int | None = None
     status: str = "ok"
     reason: str = ""
     failed: bool = False
     protocol_id: str
     protocol_digest: str
+    trajectory: Literal["online", "final"] = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
     final_ate_m: float | None = None
     held_ate_m: float | None = None
     never_move_m: float | None = None
     n_frames: int = 0
+    n_processed: int = 0
+    n_tracked: int = 0
     coverage: float = 0.0
+    epipolar_skipped: float | None = None
+    cached: bool = False
     frame_ms: float | None = None
     real_time_factor: float | None = None
     peak_memory_mb: float | None = None
@@ -96,19 +133,51 @@ class RunRow(Record):
     notes: list[str] = Field(default_factory=list)
 
     @property
-    def sequence_key(self) -> str:
-        """Sequence and part of it."""
-        return f"{self.sequence} [{self.frames}]" if self.frames else self.sequence
+    def column_id(self) -> str:
+        """What one column of a table is; equal for all repeats and for every spelling of the same frames."""
+        return self.block or f"{self.sequence} [{self.frames}]"
+
+    @property
+    def repeat_key(self) -> tuple[int, int, int, str]:
+        """Which repeat of its cell it is; every imported file is one of its own."""
+        return self.offset, -1 if self.noise is None else self.noise, self.seed, self.run_id if self.imported else ""
+
+    @property
+    def repeat(self) -> str:
+        """The same in words, e.g. ``seed 0, offset 2``."""
+        if self.imported:
+            return f"import {self.run_id[:6]}"
+        words = [f"seed {self.seed}"] + [f"offset {self.offset}"] * bool(self.offset)
+        return ", ".join(words + ([] if self.noise is None else [f"noise {self.noise}"]))
+
+    @property
+    def imported(self) -> bool:
+        """Whether the trajectory comes from elsewhere."""
+        return self.kind == "imported"
 
     @property
     def variant_key(self) -> str:
-        """Tracker and everything that sets its runs apart besides sequence and seed."""
+        """Tracker and everything that sets its runs apart besides sequence and repeat."""
         return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)
 
     @property
     def score_m(self) -> float | None:
-        """The ATE that aggregates use: a failure counts as a camera that never moves; None without ground truth."""
-        return self.never_move_m if self.failed else self.metrics.get("ate_rmse_m")
+        """The ATE that ranks: lost frames held; a failure counts as never moving or worse; None without ground truth.
+
+        A failure whose held trajectory is even further off than a camera that never moves keeps that error.
+        """
+        if self.failed:
+            return None if self.never_move_m is None else max(self.never_move_m, self.held_ate_m or 0.0)
+        return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
+
+    @property
+    def ending(self) -> str:
+        """How a failed run ended, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
+        if not self.failed:
+            return ""
+        if self.status == "lost":
+            return f"lost, {self.n_tracked}/{self.n_frames} tracked"
+        return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
 
 
 @dataclass(frozen=True)
@@ -125,7 +194,7 @@ class Loaded:
     """Everything read from the stores.
 
     Attributes:
-        runs: The newest run of every (variant, sequence, seed).
+        runs: The newest run of every variant, column and repeat.
         superseded: How many older ones there were.
         stopped: How many runs were left out since they were ended on request.
         unreadable: Folders without a valid record, with reasons.
@@ -144,21 +213,17 @@ def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
         ReportError: There is no run at all.
     """
     loaded = Loaded()
-    newest: dict[tuple[str, str, int], LoadedRun] = {}
+    found: list[LoadedRun] = []
     for store in sources:
         records, unreadable = store.all()
         loaded.unreadable += [f"{bad.path}: {bad.reason}" for bad in unreadable]
-        for record in records:
-            if record.status == "stopped":
-                loaded.stopped += 1
-                continue
-            run = LoadedRun(make_row(store, record, protocol), record, store)
-            key = (run.row.variant_key, run.row.sequence_key, run.row.seed)
-            if key in newest:
-                loaded.superseded += 1
-                if newest[key].row.started > run.row.started:
-                    continue
-            newest[key] = run
+        found += [LoadedRun(make_row(store, r, protocol), r, store) for r in records if r.status != "stopped"]
+        loaded.stopped += sum(record.status == "stopped" for record in records)
+    _join_old_imports(found)
+    newest: dict[tuple[object, ...], LoadedRun] = {}
+    for run in sorted(found, key=lambda run: run.row.started):
+        newest[run.row.variant_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
+    loaded.superseded = len(found) - len(newest)
     if not newest:
         places = ", ".join(str(store.root) for store in sources)
         raise ReportError(
@@ -168,40 +233,68 @@ def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
     return loaded
 
 
+def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
+    """Imports of older versions name no camera: they belong to the one column of the same frames, if there is one."""
+    columns: dict[str, set[str]] = {}
+    for run in runs:
+        columns.setdefault(run.record.sequence.part, set()).add(run.row.column_id)
+    for run in runs:
+        part = run.record.sequence.part
+        others = columns[part] - {part}
+        if run.row.imported and run.row.block == part and len(others) == 1:
+            run.row.block = next(iter(others))
+
+
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     """The row of one stored run."""
     scored = score(store, record, protocol)
-    evaluation = scored.primary
-    has_truth = record.sequence.ground_truth
+    which = protocol.trajectory
+    if record.kind == "imported" and scored.online is None and scored.final is not None:
+        which = "final"
+    evaluation = scored.online if protocol.trajectory == "online" else scored.final
     reason = record.reason
     failed = record.failed or record.status == "lost"
-    if has_truth and evaluation is None and not failed:
+    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
         failed = True
-        reason = reason or scored.reasons.get(scored.trajectory, "it cannot be evaluated")
+        reason = reason or scored.reasons.get(which, "it cannot be evaluated")
+    still = never_move_error(store, record, protocol, evaluation)
     return RunRow(
         run_id=record.run_id,
         kind="run here" if record.kind == "run" else "imported",
         tracker=record.tracker.id,
         label=record.tracker.label or record.tracker.id,
-        variant=_variant(record),
+        variant=variant_of(record),
         provenance=record.tracker.provenance,
         ranked=record.tracker.ranked,
         sequence=record.sequence.id,
-        frames=_part(record),
+        frames=part_words(record),
+        part_options=part_options(record),
+        block=column_of(record),
+        content=record.sequence.content,
+        camera=camera_words(record),
+        place=record.place,
+        duration_s=record.sequence.duration_s,
         tags=record.sequence.tags,
         split=record.sequence.split,
         seed=record.seed,
+        offset=record.offset,
+        noise=record.sequence.noise,
         status=record.status,
         reason=reason,
         failed=failed,
         protocol_id=scored.protocol_id,
         protocol_digest=scored.protocol_digest,
-        metrics=dict(scored.metrics),
+        trajectory=which,
+        metrics={} if evaluation is None else dict(evaluation.metrics),
         final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
-        held_ate_m=_held(store, record, protocol, evaluation),
-        never_move_m=_never_move(store, record, protocol, evaluation),
+        held_ate_m=held_error(store, record, protocol, evaluation, still),
+        never_move_m=still,
         n_frames=record.n_frames,
+        n_processed=record.n_processed,
+        n_tracked=record.n_tracked,
         coverage=record.coverage,
+        epipolar_skipped=record.epipolar_skipped,
+        cached=bool(record.identity.get("cache")),
         frame_ms=None if record.frame_time_s is None else 1000 * record.frame_time_s,
         real_time_factor=record.real_time_factor,
         peak_memory_mb=record.peak_memory_mb,
@@ -209,8 +302,8 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         segmentation=record.segmentation,
         started=record.started,
         log=str(store.folder(record.run_id) / "log.txt"),
-        command=_command(record.command),
-        machine=_machine(record),
+        command=command_line(record.command),
+        machine=machine_words(record),
         notes=[*record.notes, *(evaluation.diagnostics if evaluation is not None else [])],
     )
 
@@ -254,77 +347,3 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
             raise ReportError(f"{folder} holds no runs: it has no folder 'runs'", "name the folder given as --results")
         stores.append(RunStore(folder))
     return stores
-
-
-def _never_move(store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None) -> float | None:
-    if evaluation is not None and "never_move_ate_rmse_m" in evaluation.metrics:
-        return evaluation.metrics["never_move_ate_rmse_m"]
-    try:
-        truth = store.ground_truth(record.sequence.part)
-        if truth is None:
-            return None
-        errors = never_move(truth, store.timestamps(record.sequence.part), protocol.max_dt)
-    except DynslamError:
-        return None
-    return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
-
-
-def _held(store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None) -> float | None:
-    if evaluation is None:
-        return None
-    if evaluation.coverage == 1.0:
-        return evaluation.metrics["ate_rmse_m"]
-    trajectory = store.trajectory(record.run_id, protocol.trajectory)
-    truth = store.ground_truth(record.sequence.part)
-    if trajectory is None or truth is None:
-        return None
-    held = protocol.model_copy(update={"lost_frames": "hold", "rpe": (), "segments_m": ()})
-    try:
-        stamps = store.timestamps(record.sequence.part)
-        return evaluate(trajectory, truth, held, input_timestamps=stamps).metrics["ate_rmse_m"]
-    except DynslamError:
-        return None
-
-
-def _variant(record: RunRecord) -> dict[str, Any]:
-    variant: dict[str, Any] = dict(sorted(record.overrides.items()))
-    if record.kind == "run":
-        variant |= {"device": record.device, "threads": record.threads}
-    if record.realtime:
-        variant["realtime"] = True
-    if record.drop_share:
-        variant["drop_share"] = record.drop_share
-    variant |= {f"degrade.{name}": value for name, value in sorted(record.degrade.items())}
-    return variant
-
-
-def _part(record: RunRecord) -> str:
-    parts = []
-    if record.frames is not None:
-        start, stop = record.frames
-        parts.append(f"{start}:{'' if stop is None else stop}")
-    if record.stride != 1:
-        parts.append(f"every {record.stride}")
-    return ", ".join(parts)
-
-
-def _command(command: list[str]) -> str:
-    import shlex
-
-    if not command:
-        return ""
-    head = Path(command[0]).name
-    return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *command[1:]])
-
-
-def _machine(record: RunRecord) -> str:
-    parts = []
-    if record.machine is not None:
-        machine = record.machine
-        parts.append(f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}")
-        if machine.gpu:
-            parts.append(machine.gpu)
-    parts += [f"{name} {version}" for name, version in record.versions.items()]
-    if record.git is not None:
-        parts.append(f"git {record.git.revision[:10]}{' (changed)' if record.git.dirty else ''}")
-    return "; ".join(parts)

@@ -1,19 +1,19 @@
-"""Statistics of a leaderboard: ratios to a reference with bootstrap intervals, ranks, paired tests, power.
+"""Statistics of a leaderboard: ratios to a reference, groups of trackers that the data can separate, paired tests.
 
 Errors of different sequences are never averaged as they are (a hard sequence would drown the rest); they are compared
-as ratios to a reference on the same sequence and averaged geometrically.
+as ratios to a reference on the same sequence and averaged geometrically. Sequences are the sample: the repeats of a
+cell give its median, and are no further evidence about other sequences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-
-from dynslam_bench.core.seeding import stream
 
 Array = NDArray[np.float64]
 Cells = Mapping[str, Mapping[str, Sequence[float]]]
@@ -21,12 +21,15 @@ Cells = Mapping[str, Mapping[str, Sequence[float]]]
 
 FLOOR_M = 1e-6
 """Errors below a micrometre count as one, so that their logarithm exists."""
-REPLICATES = 2000
+FEWEST = 5
+"""Sequences below which no interval is given and no two trackers are called different."""
+FAMILY_ERROR = 0.04
+"""Chance that any pair of trackers is put into a wrong order; below 5 % since errors are only about log-normal."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with its 95 % interval."""
+    """A value with its 95 % interval; without one, `low` and `high` are nan."""
 
     value: float
     low: float
@@ -39,78 +42,119 @@ class Standing:
 
     Attributes:
         key: The tracker.
-        ratio: Geometric mean over sequences of its median error over the reference's.
+        ratio: Geometric mean over sequences of its median error over the reference's; with Student's interval from
+            `FEWEST` sequences on.
         rank: Rank by that ratio among the ranked trackers, 1 is best; None for an unranked one.
+        group: First and last rank that the data leave open; None for an unranked tracker.
         mean_rank: Mean over sequences of its rank there; None for an unranked one.
-        best_probability: Share of the bootstrap replicates in which it has rank 1.
-        improvement: Probability that a run of it has a smaller error than a run of the reference.
+        wins: Sequences on which its median error is smaller than the reference's.
+        better: Probability that a run of it has a smaller error than a run of the reference.
         p_value: Two-sided Wilcoxon signed-rank test of its medians against the reference's over sequences,
-            Holm-corrected over the ranked trackers; None for others and for the reference itself.
+            Holm-corrected over the ranked trackers; None for others, for the reference itself, and where so few
+            sequences can never give 0.05.
         sequences: Sequences it was run on.
     """
 
     key: str
     ratio: Interval
-    rank: Interval | None
+    rank: int | None
+    group: tuple[int, int] | None
     mean_rank: float | None
-    best_probability: float | None
-    improvement: Interval
+    wins: int
+    better: float
     p_value: float | None
     sequences: int
 
 
-def standings(
-    cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Sequence[str], *, seed: int = 0
-) -> list[Standing]:
+def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Sequence[str]) -> list[Standing]:
     """Compare trackers over sequences.
-
-    The bootstrap draws sequences with replacement (the same for all trackers, as they are paired) and within each
-    sequence the runs of each tracker.
 
     Args:
         cells: Errors of the trackers; a tracker may lack sequences if it is not ranked.
         reference: The reference's errors on every sequence.
         ranked: Trackers that take part in the ranking; each needs a value on every sequence.
-        seed: Seed of the bootstrap.
 
     Returns:
         The ranked trackers from the best to the worst, then the others by their ratio.
     """
-    sequences = list(reference)
-    rng = stream(seed, "report bootstrap")
-    picks = rng.integers(0, len(sequences), (REPLICATES, len(sequences)))
-    reference_log, reference_draws = _medians(reference, sequences, rng)
-    ratios: dict[str, tuple[float, Array]] = {}
-    improvements: dict[str, Interval] = {}
-    p_values: dict[str, float | None] = {}
-    medians: dict[str, Array] = {}
-    for key, cell in cells.items():
-        if all(list(cell.get(name, ())) == list(reference[name]) for name in sequences):
-            point, draws = reference_log, reference_draws  # the reference itself: a ratio of exactly 1
-        else:
-            point, draws = _medians(cell, sequences, rng)
-        medians[key] = np.exp(point)
-        difference = draws - reference_draws
-        chosen = difference[picks, np.arange(REPLICATES)[:, None]]
-        ratios[key] = (float(np.nanmean(point - reference_log)), _nanmean(chosen))
-        improvements[key] = _improvement(cell, reference, sequences, picks)
-        p_values[key] = paired_p_value(point, reference_log)
-    corrected = holm({key: p for key in ranked if (p := p_values[key]) is not None})
-    ranks, best, mean_ranks = _ranks({key: ratios[key] for key in ranked}, {key: medians[key] for key in ranked})
+    names = list(reference)
+    base = _log_medians(reference, names)
+    logs = {key: _log_medians(cell, names) for key, cell in cells.items()}
+    p_values = {key: paired_p_value(logs[key], base) for key in ranked}
+    tested = {key: p for key, p in p_values.items() if p is not None}
+    corrected = holm(tested) if attainable_p(len(names), len(tested)) <= 0.05 else {}
+    ranks, groups, means = _ranks({key: logs[key] for key in ranked})
     found = [
         Standing(
             key=key,
-            ratio=Interval(float(np.exp(point)), *np.exp(_percentiles(draws)).tolist()),
+            ratio=ratio_interval(log - base),
             rank=ranks.get(key),
-            mean_rank=mean_ranks.get(key),
-            best_probability=best.get(key),
-            improvement=improvements[key],
+            group=groups.get(key),
+            mean_rank=means.get(key),
+            wins=int((log < base).sum()),
+            better=_better(cells[key], reference),
             p_value=corrected.get(key),
-            sequences=sum(1 for name in sequences if cells[key].get(name)),
+            sequences=int(np.isfinite(log).sum()),
         )
-        for key, (point, draws) in ratios.items()
+        for key, log in logs.items()
     ]
-    return sorted(found, key=lambda s: (s.rank is None, s.rank.value if s.rank else 0.0, s.ratio.value))
+    return sorted(found, key=lambda s: (s.rank is None, s.rank or 0, s.ratio.value))
+
+
+def ratio_interval(log_ratios: Array) -> Interval:
+    """Geometric mean of ratios, with Student's 95 % interval where there are `FEWEST` or more; nan values are left out.
+
+    Args:
+        log_ratios: Their logarithms ``[S]``.
+    """
+    values = log_ratios[np.isfinite(log_ratios)]
+    if not len(values):
+        return Interval(np.nan, np.nan, np.nan)
+    mean = float(values.mean())
+    if len(values) < FEWEST:
+        return Interval(float(np.exp(mean)), np.nan, np.nan)
+    half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+    return Interval(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
+
+
+def separable(logs: Mapping[str, Array]) -> dict[tuple[str, str], bool]:
+    """Which trackers the sequences tell apart: paired t tests of the log errors, Holm-corrected over all pairs.
+
+    The order of all pairs that are called separable is right together with a chance of at least 95 % (a family-wise
+    error of `FAMILY_ERROR`). Below `FEWEST` sequences nothing is separable.
+
+    Args:
+        logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of sequences, none missing.
+
+    Returns:
+        For every pair ``(a, b)``, a before b in `logs`, whether they differ.
+    """
+    pairs = list(combinations(logs, 2))
+    if not pairs:
+        return {}
+    differences = np.stack([logs[a] - logs[b] for a, b in pairs])
+    p_values = np.ones(len(pairs))
+    if differences.shape[1] >= FEWEST:
+        varied = np.ptp(differences, axis=1) > 0
+        p_values[varied] = stats.ttest_1samp(differences[varied], 0.0, axis=1).pvalue
+        p_values[~varied & (differences[:, 0] != 0)] = 0.0  # the same ratio on every sequence
+    corrected = holm({str(at): float(p) for at, p in enumerate(p_values)})
+    return {pair: corrected[str(at)] <= FAMILY_ERROR for at, pair in enumerate(pairs)}
+
+
+def rank_groups(logs: Mapping[str, Array]) -> dict[str, tuple[int, int]]:
+    """First and last rank that the data leave open to every tracker.
+
+    Args:
+        logs: As in `separable`.
+    """
+    better, worse = dict.fromkeys(logs, 0), dict.fromkeys(logs, 0)
+    for (a, b), apart in separable(logs).items():
+        if apart:
+            first, second = (a, b) if logs[a].mean() < logs[b].mean() else (b, a)
+            worse[first] += 1
+            better[second] += 1
+    return {key: (1 + better[key], len(logs) - worse[key]) for key in logs}
 
 
 def paired_p_value(log_a: Array, log_b: Array) -> float | None:
@@ -120,6 +164,11 @@ def paired_p_value(log_a: Array, log_b: Array) -> float | None:
     if not len(difference):
         return None
     return float(stats.wilcoxon(difference).pvalue)
+
+
+def attainable_p(sequences: int, tests: int = 1) -> float:
+    """The smallest Holm-corrected p that a signed-rank test can give."""
+    return min(1.0, max(tests, 1) * 2.0 / 2.0**sequences)
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
@@ -132,94 +181,70 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     return corrected
 
 
-def critical_difference(trackers: int, sequences: int, alpha: float = 0.05) -> float:
-    """Nemenyi's critical difference of mean ranks."""
-    q = float(stats.studentized_range.ppf(1 - alpha, trackers, np.inf)) / np.sqrt(2)
-    return float(q * np.sqrt(trackers * (trackers + 1) / (6 * sequences)))
+def power_note(standings: Sequence[Standing], sequences: int, fewest_repeats: int) -> str:
+    """One paragraph on what a sample of this size can show.
 
-
-def power_note(trackers: int, sequences: int, fewest_runs: int) -> str:
-    """One paragraph on what a sample of this size can show."""
+    Args:
+        standings: The ranked ones count.
+        sequences: Sequences that they are ranked on.
+        fewest_repeats: Repeats that count in the smallest of their cells.
+    """
     if not sequences:
         return "No sequence has ground truth, so nothing can be compared."
+    groups = [s.group for s in standings if s.group is not None]
     parts = []
-    smallest = 2.0 / 2**sequences
     count = f"{sequences} sequence{'s' if sequences != 1 else ''}"
-    if smallest > 0.05:
+    if sequences < FEWEST:
         parts.append(
-            f"With {count} a paired signed-rank test can never reach p < 0.05 (the smallest possible p is "
-            f"{smallest:.3g}): read the order as a description of these sequences, not as evidence about others."
+            f"With {count} no two trackers are called different (below {FEWEST} there are no intervals): read the "
+            "order as a description of these sequences, not as evidence about others."
         )
-    if trackers >= 2 and sequences >= 2:
-        need = critical_difference(trackers, sequences)
-        most = trackers - 1
-        verdict = " (more than can occur)" if need > most else ""
+    elif len(groups) > 1:
+        total = len(groups) * (len(groups) - 1) // 2
+        apart = sum(len(groups) - (last - first + 1) for first, last in groups) // 2
         parts.append(
-            f"With {count} and {trackers} ranked trackers, mean ranks must differ by {need:.2f}{verdict} to count as "
-            "different (Nemenyi, 5 %)."
+            f"{count}, {len(groups)} ranked trackers: {apart} of {total} pairs can be told apart (paired t tests of "
+            "the log errors over sequences, Holm)."
         )
-    if fewest_runs < 3:
+    if attainable_p(sequences, len(groups)) > 0.05:
         parts.append(
-            f"Some cells hold only {fewest_runs} run{'s' if fewest_runs != 1 else ''}: the spread from run to run is "
-            "unknown there and the intervals are too narrow."
+            f"The smallest p that a signed-rank test can reach is {attainable_p(sequences, len(groups)):.3g}, so none "
+            "is shown."
         )
-    return " ".join(parts) or f"{count}, {trackers} ranked trackers, at least {fewest_runs} runs a cell."
+    if fewest_repeats < 3:
+        parts.append(
+            f"Some cells hold only {fewest_repeats} run{'s' if fewest_repeats != 1 else ''} that count: the spread "
+            "from run to run is unknown there."
+        )
+    return " ".join(parts) or f"{count}, {len(groups)} ranked trackers, at least {fewest_repeats} runs a cell."
 
 
-def _medians(
-    cell: Mapping[str, Sequence[float]], sequences: Sequence[str], rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Logarithms of the median errors ``[S]`` and of bootstrapped medians ``[S, B]``; nan where there is no run."""
-    point = np.full(len(sequences), np.nan)
-    draws = np.full((len(sequences), REPLICATES), np.nan)
-    for i, name in enumerate(sequences):
-        values = np.maximum(np.asarray(cell.get(name, ()), dtype=np.float64), FLOOR_M)
-        if not len(values):
-            continue
-        point[i] = np.log(np.median(values))
-        drawn = values[rng.integers(0, len(values), (REPLICATES, len(values)))]
-        draws[i] = np.log(np.median(drawn, axis=1))
-    return point, draws
+def _log_medians(cell: Mapping[str, Sequence[float]], names: Sequence[str]) -> Array:
+    """Logarithms of the median errors ``[S]``; nan where there is no run."""
+    medians = [float(np.median(cell[name])) if cell.get(name) else np.nan for name in names]
+    return np.asarray(np.log(np.maximum(np.asarray(medians, dtype=np.float64), FLOOR_M)))
 
 
-def _nanmean(values: Array) -> Array:
-    """Mean over sequences ``[B]`` of ``[B, S]``, leaving out missing ones; replicates with none are dropped."""
-    count = np.isfinite(values).sum(axis=1)
-    total = np.nansum(values, axis=1)
-    return np.asarray(total[count > 0] / count[count > 0])
-
-
-def _percentiles(draws: Array) -> Array:
-    return np.percentile(draws, [2.5, 97.5]) if len(draws) else np.array([np.nan, np.nan])
-
-
-def _improvement(
-    cell: Mapping[str, Sequence[float]],
-    reference: Mapping[str, Sequence[float]],
-    sequences: Sequence[str],
-    picks: NDArray[np.int64],
-) -> Interval:
-    share = np.full(len(sequences), np.nan)
-    for i, name in enumerate(sequences):
-        a, b = np.asarray(cell.get(name, ())), np.asarray(reference[name])
+def _better(cell: Mapping[str, Sequence[float]], reference: Mapping[str, Sequence[float]]) -> float:
+    shares = []
+    for name, others in reference.items():
+        a, b = np.asarray(cell.get(name, ())), np.asarray(others)
         if len(a) and len(b):
-            share[i] = (a[:, None] < b).mean() + 0.5 * (a[:, None] == b).mean()
-    return Interval(float(np.nanmean(share)), *_percentiles(_nanmean(share[picks])).tolist())
+            shares.append(float((a[:, None] < b).mean() + 0.5 * (a[:, None] == b).mean()))
+    return float(np.mean(shares)) if shares else np.nan
 
 
-def _ranks(
-    ratios: Mapping[str, tuple[float, Array]], medians: Mapping[str, Array]
-) -> tuple[dict[str, Interval], dict[str, float], dict[str, float]]:
-    if not ratios:
+def _ranks(logs: Mapping[str, Array]) -> tuple[dict[str, int], dict[str, tuple[int, int]], dict[str, float]]:
+    """Ranks by the mean logarithm, the ranks that the data leave open, and mean ranks over sequences."""
+    if not logs:
         return {}, {}, {}
-    keys = list(ratios)
-    point = stats.rankdata([ratios[key][0] for key in keys], method="min")
-    draws = stats.rankdata(np.stack([ratios[key][1] for key in keys]), method="min", axis=0)
-    per_sequence = stats.rankdata(np.stack([medians[key] for key in keys]), method="average", axis=0)
-    ranks, best, mean_ranks = {}, {}, {}
-    for i, key in enumerate(keys):
-        low, high = np.percentile(draws[i], [2.5, 97.5], method="nearest").tolist()
-        ranks[key] = Interval(float(point[i]), low, high)
-        best[key] = float((draws[i] == 1).mean())
-        mean_ranks[key] = float(per_sequence[i].mean())
-    return ranks, best, mean_ranks
+    keys = list(logs)
+    means = {key: float(np.mean(logs[key])) for key in keys}
+    order = stats.rankdata([round(means[key], 12) for key in keys], method="min")
+    per_sequence = stats.rankdata(np.stack([logs[key] for key in keys]), method="average", axis=0).mean(axis=1)
+    groups = rank_groups(logs)
+    return (
+        {key: int(order[i]) for i, key in enumerate(keys)},
+        groups,
+        {key: float(per_sequence[i]) for i, key in enumerate(keys)},
+    )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-Emphasis = Literal["", "best", "second", "muted"]
+Emphasis = Literal["", "best", "second", "muted", "failed"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class TableCell:
         text: What is written; empty for nothing.
         small: Written smaller behind it: interval, spread, counts.
         value: The number behind the text, for sorting and CSV.
-        emphasis: ``best`` (bold), ``second`` (italic) or ``muted``.
+        emphasis: ``best`` (bold), ``second`` (italic), ``muted``, or ``failed`` (hatched).
         shade: -1 (much better than the reference) to 1 (much worse), None for none.
         tip: Shown when the pointer rests on it.
         tag: A word set as a label, e.g. ``run here``.

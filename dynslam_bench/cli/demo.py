@@ -123,7 +123,8 @@ def leaderboard_text(store: RunStore, protocol: str = DEFAULT_PROTOCOL) -> str:
     from dynslam_bench.evaluation import get_protocol
     from dynslam_bench.reports.board import make_board
     from dynslam_bench.reports.rows import load_runs
-    from dynslam_bench.reports.tables import leaderboard, per_sequence
+    from dynslam_bench.reports.sequence_tables import per_sequence
+    from dynslam_bench.reports.tables import leaderboard
 
     chosen = get_protocol(protocol)
     board = make_board([run.row for run in load_runs([store], chosen).runs])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -33,14 +34,24 @@ def make(
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")] = None,  # noqa: UP045
     protocol: ProtocolId = "tum-rgbd/v1",
     reference: Annotated[str, typer.Option(help="Tracker that errors are divided by.")] = "orb-slam2",
+    on: Annotated[
+        str,
+        typer.Option(help="common: rank on the sequences that all have; all: only trackers that have all."),
+    ] = "common",
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     as_json: AsJson = False,
 ) -> None:
     """Make an offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it."""
+    from dynslam_bench.core.errors import ReportError
     from dynslam_bench.reports import build_report
 
+    if on not in ("common", "all"):
+        raise ReportError(f"--on is 'common' or 'all', got '{on}'")
     folders = results or [Path("results")]
-    paths = build_report(folders, output or folders[0] / "report", protocol=protocol, reference=reference, title=title)
+    paths = build_report(
+        folders, output or folders[0] / "report", protocol=protocol, reference=reference, title=title,
+        on="all" if on == "all" else "common",
+    )  # fmt: skip
     if as_json:
         write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})
     else:
@@ -54,13 +65,18 @@ def compare(
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
-    """Compare two results folders on the runs that both have."""
+    """Compare two results folders on the sequences that both have, with the same settings or with others."""
     from dynslam_bench.reports import compare as compare_results
 
     found = compare_results(a, b, protocol=protocol)
     if as_json:
-        overall = {name: vars(interval) for name, interval in found.overall.items()}
-        write_json({"overall": overall, "only_a": found.only_a, "only_b": found.only_b})
+        overall = {
+            name: {end: None if math.isnan(number) else number for end, number in vars(interval).items()}
+            for name, interval in found.overall.items()
+        }
+        write_json(
+            {"overall": overall, "differences": found.differences, "only_a": found.only_a, "only_b": found.only_b}
+        )
         return
     write(found.to_markdown().rstrip())
     if found.only_a or found.only_b:

@@ -23,7 +23,7 @@ from .machine import git_revision, this_machine, versions
 from .process import start_child
 from .record import RunRecord, SequenceInfo, Status, TrackerInfo
 from .scoring import DEFAULT_PROTOCOL
-from .spec import RunSpec
+from .spec import RunSpec, place_of
 from .store import RunStore
 from .supervise import Verdict, supervise
 
@@ -142,7 +142,7 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         wall_s=wall_s, peak_memory_mb=verdict.peak_memory_mb or None, peak_gpu_memory_mb=final.get("gpu_memory_mb"),
         machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}), versions=versions(),
         git=git_revision(), command=list(sys.argv), identity=identity,
-        notes=[CACHED_TIMES] if spec.cache else [],
+        notes=[CACHED_TIMES] if spec.cache else [], place=place_of(spec.sequence),
     )  # fmt: skip
 
 

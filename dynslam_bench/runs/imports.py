@@ -21,6 +21,7 @@ from dynslam_bench.sequences.part import part_of
 from .execute import part_digest, sequence_info
 from .machine import versions
 from .record import RunRecord, TrackerInfo
+from .spec import place_of
 from .store import RunStore
 
 _TOLERANCE_S = 0.02
@@ -99,6 +100,7 @@ def import_trajectory(
         n_frames=len(opened), n_tracked=covered, n_lost=len(opened) - covered, coverage=covered / len(opened),
         stamps_match=matching, started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(), identity=identity, provenance=provenance or str(file), notes=notes,
+        place=place_of(sequence),
     ).normalised()  # fmt: skip
     store.prepare()
     with store.work_folder(record.run_id) as work:

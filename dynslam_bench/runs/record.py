@@ -115,6 +115,8 @@ class RunRecord(Record):
             without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
             where either is missing.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
         timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
@@ -127,6 +129,7 @@ class RunRecord(Record):
         command: The command line of the parent process.
         identity: What `run_id` stands for.
         provenance: For imported trajectories: where it came from.
+        place: Folder of the sequence where it was named by its path; empty for an id.
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
         notes: Anything a reader should know, one line each.
     """
@@ -161,6 +164,7 @@ class RunRecord(Record):
     map_points: int | None = None
     epipolar_skipped: float | None = None
     mask_iou: float | None = None
+    epipolar_skipped: float | None = None
     timings: dict[str, StageTime] = Field(default_factory=dict)
     finalize_s: float | None = None
     started: str = ""
@@ -173,6 +177,7 @@ class RunRecord(Record):
     command: list[str] = Field(default_factory=list)
     identity: dict[str, Any] = Field(default_factory=dict)
     provenance: str = ""
+    place: str = ""
     stamps_match: bool = True
     notes: list[str] = Field(default_factory=list)
 

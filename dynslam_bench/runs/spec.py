@@ -129,3 +129,9 @@ def _absolute_folder(sequence: str) -> str:
 
 def _absolute_file(name: str | None) -> str | None:
     return str(Path(name).expanduser().absolute()) if name is not None and Path(name).expanduser().is_file() else name
+
+
+def place_of(sequence: str) -> str:
+    """Absolute folder of a sequence that is named by its path; empty for an id."""
+    named = _absolute_folder(sequence)
+    return named if Path(named).is_absolute() else ""

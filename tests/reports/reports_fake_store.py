@@ -57,15 +57,33 @@ def add_run(
     reason="",
     command=("dynslam-bench", "bench", "dynamic"),
     final_error=None,
+    online=True,
+    copy_of=None,
+    offset=0,
+    noise=None,
+    block=None,
+    content=None,
+    camera=None,
+    place="",
+    frames=None,
+    cached=False,
+    skipped=None,
+    died_at=None,
+    duration_s=None,
 ):
-    """Store one run whose trajectory is the truth with noise of the given size."""
-    stamps, truth = stamps_of(n), truth_of(sequence, n)
-    part = hashlib.sha256(sequence.encode()).hexdigest()[:12]
+    """Store one run whose trajectory is the truth with noise of the given size.
+
+    Runs with the same `copy_of` have the same noise: what a deterministic tracker leaves.
+    """
+    stamps, truth = stamps_of(n)[offset:], truth_of(sequence, n)
+    n = len(stamps)
+    part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:12]
     store.prepare()
     store.add_sequence(part, stamps, truth if ground_truth else None)
-    identity = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind}
+    identity = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
+                "extra": (offset, noise, content, camera, frames, online)}  # fmt: skip
     run_id = hashlib.sha256(repr(identity).encode()).hexdigest()[:16]
-    rng = np.random.default_rng(int(run_id[:8], 16))
+    rng = np.random.default_rng(int(run_id[:8], 16) if copy_of is None else copy_of)
     nearest = np.abs(truth.timestamps[:, None] - stamps).argmin(0)
     drift = np.cumsum(rng.normal(0, 1, (n, 6)), axis=0)
     drift = (drift - drift.mean(0)) / drift.std() * error
@@ -73,20 +91,27 @@ def add_run(
     ok = np.ones(n, dtype=bool)
     ok[list(lost)] = False
     if status in ("crashed", "timeout", "invalid", "out-of-memory"):
+        died_at = n // 4 if died_at is None else died_at
+        ok[died_at:] = False
+    if status == "lost":
         ok[n // 4 :] = False
     record = RunRecord(
         kind=kind, run_id=run_id, status=status, reason=reason,
         tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked),
         overrides=overrides or {}, seed=seed, device="cpu",
-        sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=n / 30, fps=30.0,
-                              ground_truth=ground_truth, tags=list(tags)),
-        n_frames=n, n_processed=n, n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
+        sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
+                              content=content or "", block=block or "", noise=noise, ground_truth=ground_truth,
+                              tags=list(tags)),
+        frames=frames, offset=offset, place=place, epipolar_skipped=skipped,
+        identity=({"cache": True} if cached else {}) | ({"camera": camera} if camera else {}),
+        n_frames=n, n_processed=n if died_at is None else died_at,
+        n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
         started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
         mask_iou=mask_iou, command=list(command),
     )  # fmt: skip
     with store.work_folder(run_id) as work:
-        if ok.any():
+        if ok.any() and online:
             (work / "trajectory_online.txt").write_text(format_tum(Trajectory(stamps[ok], poses[ok])))
         if final_error is not None:
             better = truth.T_world_cam[nearest] @ se3.exp(drift * final_error / error)

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dynslam_bench.reports.statistics import critical_difference, holm, paired_p_value, power_note, standings
+from dynslam_bench.reports.statistics import (
+    attainable_p,
+    holm,
+    paired_p_value,
+    power_note,
+    rank_groups,
+    ratio_interval,
+    separable,
+    standings,
+)
 
 
 def cells(rng, trackers, sequences=6, runs=4, spread=0.1):
@@ -24,51 +33,77 @@ def test_ratio_is_the_geometric_mean_of_medians():
     assert a.ratio.value == pytest.approx(expected)
     assert a.ratio.low < a.ratio.value < a.ratio.high
     assert (ref.ratio.value, ref.ratio.low, ref.ratio.high) == (1, 1, 1)
-    assert (a.rank.value, ref.rank.value) == (1, 2)
-    assert a.improvement.value == pytest.approx(
+    assert (a.rank, ref.rank) == (1, 2)
+    assert (a.wins, ref.wins) == (6, 0)
+    assert a.better == pytest.approx(
         np.mean([stats.mannwhitneyu(data["ref"][s], data["a"][s]).statistic / 16 for s in data["a"]])
     )
 
 
-def test_bootstrap_interval_agrees_with_scipy_where_there_is_one_run_a_cell():
-    rng = np.random.default_rng(1)
-    n = 40
-    log_ratio = rng.normal(-0.3, 0.5, n)
-    reference = {f"s{i}": [1.0] for i in range(n)}
-    data = {"a": {f"s{i}": [float(np.exp(log_ratio[i]))] for i in range(n)}}
-    (a,) = standings(data, reference, ["a"])
-    other = stats.bootstrap((log_ratio,), np.mean, method="percentile", n_resamples=20000, rng=np.random.default_rng(0))
-    low, high = np.exp(other.confidence_interval)
-    assert a.ratio.low == pytest.approx(low, rel=0.02)
-    assert a.ratio.high == pytest.approx(high, rel=0.02)
+def test_the_interval_of_a_ratio_is_students():
+    values = np.random.default_rng(1).normal(-0.3, 0.5, 12)
+    found = ratio_interval(np.append(values, np.nan))
+    low, high = np.exp(stats.ttest_1samp(values, 0).confidence_interval(0.95))
+    assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+    few = ratio_interval(values[:4])
+    assert few.value == pytest.approx(np.exp(values[:4].mean()))
+    assert np.isnan(few.low)
+    assert np.isnan(few.high)
 
 
 def test_intervals_cover_the_truth_about_as_often_as_they_say():
     hits = 0
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        log_ratio = rng.normal(np.log(0.8), 0.3, 25)
-        data = {"a": {f"s{i}": [float(np.exp(v))] for i, v in enumerate(log_ratio)}}
-        (a,) = standings(data, {f"s{i}": [1.0] for i in range(25)}, ["a"])
-        hits += a.ratio.low <= 0.8 <= a.ratio.high
-    assert 50 <= hits <= 60
+    for seed in range(400):
+        found = ratio_interval(np.random.default_rng(seed).normal(np.log(0.8), 0.3, 8))
+        hits += found.low <= 0.8 <= found.high
+    assert 0.92 <= hits / 400 <= 0.98
 
 
-def test_ranks_mean_ranks_and_certainty():
+def test_ranks_groups_and_mean_ranks():
     rng = np.random.default_rng(2)
     data = cells(rng, {"best": 0.1, "middle": 0.5, "worst": 5.0}, spread=0.01)
     found = standings(data, data["middle"], ["worst", "middle", "best"])
     assert [s.key for s in found] == ["best", "middle", "worst"]
-    assert [(s.rank.low, s.rank.high) for s in found] == [(1, 1), (2, 2), (3, 3)]
+    assert [s.group for s in found] == [(1, 1), (2, 2), (3, 3)]
     assert [s.mean_rank for s in found] == [1.0, 2.0, 3.0]
-    assert [s.best_probability for s in found] == [1.0, 0.0, 0.0]
 
 
-def test_equal_trackers_share_their_rank_and_their_certainty():
+def test_two_trackers_on_two_sequences_are_never_separated():
+    data = {"a": {"s0": [0.2196], "s1": [0.0101]}, "b": {"s0": [0.2237], "s1": [0.0113]}}
+    found = standings(data, data["b"], ["a", "b"])
+    assert [s.group for s in found] == [(1, 2), (1, 2)]
+    assert [s.p_value for s in found] == [None, None]
+    assert [s.wins for s in found] == [2, 0]
+    assert all(np.isnan(s.ratio.low) for s in found)
+
+
+def test_below_five_sequences_there_is_one_group_and_from_five_on_clear_differences_show():
+    rng = np.random.default_rng(3)
+    for sequences, groups in ((4, [(1, 2), (1, 2)]), (5, [(1, 1), (2, 2)])):
+        data = cells(rng, {"a": 0.1, "b": 1.0}, sequences=sequences)
+        assert [s.group for s in standings(data, data["b"], ["a", "b"])] == groups
+
+
+def test_a_difference_that_one_sequence_decides_is_none():
+    data = {"a": {f"s{i}": [0.1] for i in range(6)}, "b": {f"s{i}": [0.1] for i in range(5)} | {"s5": [3.0]}}
+    assert [s.group for s in standings(data, data["b"], ["a", "b"])] == [(1, 2), (1, 2)]
+
+
+def test_pairs_are_tested_as_scipy_does_and_corrected_together():
+    rng = np.random.default_rng(4)
+    logs = {"a": rng.normal(0, 0.2, 7), "b": rng.normal(0.35, 0.2, 7), "c": rng.normal(2, 0.2, 7)}
+    p = {pair: stats.ttest_rel(logs[pair[0]], logs[pair[1]]).pvalue for pair in separable(logs)}
+    corrected = holm({"".join(pair): value for pair, value in p.items()})
+    assert separable(logs) == {pair: corrected["".join(pair)] <= 0.04 for pair in p}
+    assert separable(logs)["a", "c"]
+
+
+def test_equal_trackers_share_their_rank():
     rng = np.random.default_rng(3)
     one = cells(rng, {"a": 1.0})["a"]
     found = standings({"a": one, "b": {s: list(v) for s, v in one.items()}}, one, ["a", "b"])
-    assert [s.rank.value for s in found] == [1, 1]
+    assert [s.rank for s in found] == [1, 1]
+    assert [s.group for s in found] == [(1, 2), (1, 2)]
     assert [s.mean_rank for s in found] == [1.5, 1.5]
 
 
@@ -81,13 +116,6 @@ def test_unranked_and_incomplete_trackers_come_last_and_take_no_rank():
     assert [s.rank is None for s in found] == [False, False, True, True]
     assert found[3].sequences == 1
     assert found[3].ratio.value == pytest.approx(np.median(data["a"]["s0"]) / np.median(data["ref"]["s0"]))
-
-
-def test_the_same_seed_gives_the_same_intervals_and_order_does_not_matter():
-    rng = np.random.default_rng(5)
-    data = cells(rng, {"a": 0.5, "ref": 1.0})
-    assert standings(data, data["ref"], ["a", "ref"]) == standings(data, data["ref"], ["a", "ref"])
-    assert standings(data, data["ref"], ["a", "ref"], seed=1) != standings(data, data["ref"], ["a", "ref"])
 
 
 def test_an_error_of_zero_has_a_ratio():
@@ -107,6 +135,15 @@ def test_paired_test_is_scipys():
     assert paired_p_value(with_missing, b) == pytest.approx(stats.wilcoxon(np.delete(a, 3), np.delete(b, 3)).pvalue)
 
 
+def test_no_p_is_given_where_it_could_never_be_significant():
+    assert attainable_p(5) == pytest.approx(stats.wilcoxon([1, 2, 3, 4, 5]).pvalue)
+    rng = np.random.default_rng(7)
+    for sequences, trackers, shown in ((5, 2, False), (6, 2, True), (6, 3, False), (7, 3, True)):
+        data = cells(rng, {"ref": 1.0} | {f"t{i}": 0.1 for i in range(trackers - 1)}, sequences=sequences)
+        found = {s.key: s.p_value for s in standings(data, data["ref"], list(data))}
+        assert (found["t0"] is not None) == shown, (sequences, trackers)
+
+
 def test_holm():
     assert holm({"a": 0.01, "b": 0.04, "c": 0.03}) == {
         "a": pytest.approx(0.03),
@@ -117,16 +154,53 @@ def test_holm():
     assert holm({}) == {}
 
 
-def test_critical_difference_is_the_published_one():
-    assert critical_difference(5, 8) == pytest.approx(2.16, abs=0.005)  # 2.728 sqrt(5*6 / (6*8))
-
-
 def test_power_notes():
-    small = power_note(5, 5, 1)
-    assert "can never reach p < 0.05 (the smallest possible p is 0.0625)" in small
-    assert "only 1 run:" in small
-    assert "2.16" in power_note(5, 8, 3)
-    assert "never reach" not in power_note(5, 8, 3)
-    assert "(more than can occur)" in power_note(3, 2, 3)
-    assert "nothing can be compared" in power_note(0, 0, 0)
-    assert power_note(1, 8, 5) == "8 sequences, 1 ranked trackers, at least 5 runs a cell."
+    rng = np.random.default_rng(8)
+
+    def note(trackers, sequences, runs=3):
+        data = cells(rng, {f"t{i}": 10.0**i for i in range(trackers)}, sequences=sequences, runs=runs)
+        return power_note(standings(data, data["t0"], list(data)), sequences, runs)
+
+    assert "below 5 there are no intervals" in note(3, 4)
+    assert "smallest p that a signed-rank test can reach is 0.375" in note(3, 4)
+    assert "3 of 3 pairs can be told apart" in note(3, 7)
+    assert "smallest p" not in note(3, 7)
+    assert "only 1 run that count" in note(2, 7, 1)
+    assert "nothing can be compared" in power_note([], 0, 0)
+
+
+# -- do the rank groups hold the true order?
+
+
+def coverage_of_groups(shape, trackers, sequences, repeats, seed=0):
+    """Share of simulated boards on which every tracker's true rank lies in its group."""
+    rng = np.random.default_rng(seed)
+    quality = np.sort(rng.normal(0, 0.25, trackers))
+    right = 0
+    for _ in range(repeats):
+        hardness = rng.normal(-3, 1, sequences)
+        log = quality[:, None] + hardness + shape(rng, (trackers, sequences))
+        groups = rank_groups({str(k): log[k] for k in range(trackers)})
+        right += all(first <= int(key) + 1 <= last for key, (first, last) in groups.items())
+    return right / repeats
+
+
+SHAPES = {
+    "normal": lambda rng, size: rng.normal(0, 0.4, size),
+    "heavy tails": lambda rng, size: 0.3 * rng.standard_t(3, size),
+    "unequal spread": lambda rng, size: rng.normal(0, 1, size) * np.geomspace(0.05, 1, size[0])[:, None],
+    "skewed": lambda rng, size: 0.4 * (rng.exponential(1, size) - 1),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("sequences", [3, 5, 8, 20])
+def test_groups_hold_the_true_order(shape, sequences):
+    assert coverage_of_groups(SHAPES[shape], 5, sequences, 200) >= 0.95
+
+
+def test_groups_do_separate_what_is_clearly_apart():
+    """Groups that never separate anything would hold any order."""
+    rng = np.random.default_rng(1)
+    data = cells(rng, {"a": 1.0, "b": 1.5, "c": 2.25, "d": 3.4}, sequences=8, runs=3, spread=0.15)
+    assert [s.group for s in standings(data, data["a"], list(data))] == [(1, 1), (2, 2), (3, 3), (4, 4)]

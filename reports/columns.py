@@ -1,0 +1,85 @@
+"""What the columns of a table are called: as short as tells them apart, parts always marked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from .rows import RunRow
+
+
+def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
+    """A name for every column, no two alike.
+
+    Recordings that share a name are told apart by the last parts of their folders' paths, then by camera, content and
+    frames: ``chess/seq-01`` and ``fire/seq-01``.
+
+    Returns:
+        Column id (see `RunRow.column_id`) to its name.
+    """
+    first: dict[str, RunRow] = {}
+    for row in sorted(rows, key=lambda row: (row.noise is not None, row.offset, len(_name(row)), _name(row))):
+        first.setdefault(row.column_id, row)
+    alike: dict[str, dict[str, RunRow]] = {}
+    for column, row in first.items():
+        alike.setdefault(_name(row), {})[column] = row
+    names: dict[str, str] = {}
+    for name, group in alike.items():
+        names |= {column: name for column in group} if len(group) == 1 else _told_apart(name, group)
+    return names
+
+
+def shortened(names: Sequence[str]) -> dict[str, str]:
+    """Names without the folders, and without the ``@...`` or ``?...`` behind them, that all of them share.
+
+    The part of a sequence, `` [0:60]``, always stays.
+    """
+    if len(names) < 2:
+        return {name: name for name in names}
+    folders = [_split(name)[0].split("/")[:-1] for name in names]
+    shared = 0
+    while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
+        shared += 1
+    tails = {_split(name)[1] for name in names}
+    short = {}
+    for name in names:
+        stem, tail, part = _split(name)
+        short[name] = "/".join(stem.split("/")[shared:]) + ("" if len(tails) == 1 else tail) + part
+    return short if len(set(short.values())) == len(names) else {name: name for name in names}
+
+
+def _split(name: str) -> tuple[str, str, str]:
+    """Stem, ``@...?...`` and `` [part] (words)`` of a name."""
+    whole = min((name.partition(mark)[0] for mark in (" [", " (")), key=len)
+    stem = min((whole.partition(mark)[0] for mark in ("@", "?")), key=len)
+    return stem, whole[len(stem) :], name[len(whole) :]
+
+
+def _name(row: RunRow) -> str:
+    """Sequence without its noise, and part of it."""
+    base, _, query = row.sequence.partition("?")
+    kept = "&".join(word for word in query.split("&") if word and not word.startswith("noise="))
+    return base + (f"?{kept}" if kept else "") + (f" [{row.frames}]" if row.frames else "")
+
+
+def _told_apart(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
+    names = dict.fromkeys(group, name)
+    places = {column: Path(row.place).parts for column, row in group.items()}
+    if all(places.values()):
+        for length in range(1, max(map(len, places.values())) + 1):
+            tails = {column: "/".join(parts[-length:]) for column, parts in places.items()}
+            if len(set(tails.values())) == len(set(places.values())):
+                part = _split(name)[2]
+                names = {column: tail + part for column, tail in tails.items()}
+                break
+    marks: tuple[Callable[[str, RunRow], str], ...] = (
+        lambda _, row: row.camera,
+        lambda _, row: f"content {row.content[:6]}" if row.content else "",
+        lambda column, _: f"frames {column[:6]}",
+        lambda column, _: column,
+    )
+    for mark in marks:
+        words = {column: mark(column, row) for column, row in group.items()}
+        if len(set(names.values())) < len(names) and len(set(words.values())) > 1:
+            names = {column: f"{each} ({words[column]})" if words[column] else each for column, each in names.items()}
+    return names

@@ -1,0 +1,62 @@
+"""Errors on the frames that all runs of a sequence tracked, and the runs that stand for a tracker in figures."""
+
+from __future__ import annotations
+
+from statistics import median
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.frames import common_frames
+from dynslam_bench.evaluation.protocol import Protocol
+
+from .board import Board
+from .rows import Loaded, LoadedRun
+
+
+def common_errors(
+    board: Board, protocol: Protocol, loaded: Loaded
+) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
+    """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are."""
+    errors: dict[tuple[str, str], float] = {}
+    frames: dict[str, str] = {}
+    brief = protocol.model_copy(update={"rpe": (), "segments_m": (), "lost_frames": "exclude"})
+    for sequence in board.sequences:
+        runs = successful(board, sequence, loaded)
+        pairs = [(run, run.store.trajectory(run.row.run_id, protocol.trajectory)) for run in runs]
+        held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
+        if len({run.row.variant_key for run, _ in held}) < 2:
+            continue
+        reduced = common_frames([trajectory for _, trajectory in held])
+        total = max(run.row.n_frames for run, _ in held)
+        frames[sequence] = f"{len(reduced[0])} of {total}"
+        values: dict[str, list[float]] = {}
+        for (run, _), trajectory in zip(held, reduced, strict=True):
+            truth = run.store.ground_truth(run.record.sequence.part)
+            if truth is None:
+                continue
+            try:
+                error = evaluate(trajectory, truth, brief).metrics["ate_rmse_m"]
+            except DynslamError:
+                continue
+            values.setdefault(run.row.variant_key, []).append(error)
+        errors |= {(key, sequence): median(found) for key, found in values.items()}
+    return errors, frames
+
+
+def representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:
+    """Of each tracker the successful run on a sequence whose error is the (lower) median one."""
+    runs = successful(board, sequence, loaded)
+    chosen: dict[str, LoadedRun] = {}
+    for key in board.trackers:
+        ordered = sorted((r for r in runs if r.row.variant_key == key), key=lambda r: r.row.metrics["ate_rmse_m"])
+        if ordered:
+            chosen[key] = ordered[(len(ordered) - 1) // 2]
+    return chosen
+
+
+def successful(board: Board, sequence: str, loaded: Loaded) -> list[LoadedRun]:
+    """The runs on a sequence that ended and could be evaluated, copies left out."""
+    kept = {row.run_id for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept}
+    return [
+        run for run in loaded.runs if run.row.run_id in kept and not run.row.failed and "ate_rmse_m" in run.row.metrics
+    ]

@@ -1,0 +1,62 @@
+"""`report` and `report compare` on the command line: the switch of the sequences, and JSON without NaN."""
+
+import json
+
+import pytest
+from reports_fake_store import add_run
+
+from dynslam_bench.cli.app import start
+from dynslam_bench.runs.store import RunStore
+
+
+@pytest.fixture
+def cli(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            start([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return ended.value.code or 0, captured.out, captured.err
+
+    return call
+
+
+def strict(text):
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
+    store = RunStore(tmp_path / "results")
+    for name in ("s/a", "s/b"):
+        add_run(store, "orb-slam2", name)
+        add_run(store, "ours", name, error=0.02)
+    add_run(store, "ours", "s/c", error=0.02)
+    assert cli("report", "results", "-o", "common")[0] == 0
+    assert cli("report", "results", "-o", "all", "--on", "all")[0] == 0
+    common, everything = ((tmp_path / name / "report.md").read_text() for name in ("common", "all"))
+    assert "The ranking stands on the 2 of 3 sequences that all ranked trackers have." in common
+    assert "| 1–2 not separable | 2/2 | orb-slam2 |" in common
+    assert "Not ranked, since they lack sequences: orb-slam2." in everything
+    assert "| – | 2/2 | orb-slam2 |" in everything
+    assert "--on all" in (tmp_path / "all" / "index.html").read_text()
+    code, _, error = cli("report", "results", "--on", "some")
+    assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
+    code, _, error = cli("report", "results", "--reference", "our")
+    assert code == 1
+    assert "no run of the reference 'our' (did you mean 'ours'" in error
+
+
+def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
+    for place, value in (("a", 1), ("b", 2)):
+        add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})
+    code, out, _ = cli("report", "compare", "a", "b", "--json")
+    found = strict(out)
+    assert code == 0
+    assert list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
+    assert [interval["low"] for interval in found["overall"].values()] == [None]
+    code, out, _ = cli("report", "compare", "a", "b")
+    assert "B better on" in out

@@ -1,0 +1,433 @@
+"""What a glance at the report says is true: on uneven, failing, repeated, cached and confusable results."""
+
+import csv
+
+import numpy as np
+import pytest
+from reports_fake_store import add_run
+
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports import build_report, compare, load_frame
+from dynslam_bench.reports.board import make_board
+from dynslam_bench.reports.columns import name_columns
+from dynslam_bench.reports.formats import mm, percent
+from dynslam_bench.reports.missing import missing_commands, missing_note
+from dynslam_bench.reports.reported import is_excerpt
+from dynslam_bench.reports.rows import RunRow, load_runs
+from dynslam_bench.reports.sequence_tables import per_sequence, relative_errors
+from dynslam_bench.reports.tables import leaderboard
+from dynslam_bench.runs.store import RunStore
+
+PROTOCOL = get_protocol("tum-rgbd/v1")
+
+
+def rows_of(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def row(tracker="a", sequence="s", error=0.1, **changes):
+    base = dict(
+        run_id="r", kind="run here", tracker=tracker, label=tracker.upper(), sequence=sequence, protocol_id="p",
+        protocol_digest="d", metrics={"ate_rmse_m": error, "rpe_1s_trans_rmse_m": error / 2}, held_ate_m=error,
+        never_move_m=0.3, coverage=1.0, n_frames=60, n_processed=60, n_tracked=60,
+    )  # fmt: skip
+    return RunRow(**(base | changes))
+
+
+def crashed(tracker="c", sequence="s", error=0.001, **changes):
+    """A run that died at frame 20 of 60, with a tiny error until then."""
+    done = dict(failed=True, status="crashed", n_processed=20, n_tracked=20, coverage=1 / 3, reason="boom")
+    return row(tracker, sequence, error, **(done | changes))
+
+
+def cell_of(table, name, column=1):
+    return next(cells for cells in table.rows if cells[0].text == name)[column]
+
+
+# -- what ranks
+
+
+def test_losing_frames_is_not_free(tmp_path):
+    """The loser is better where it tracks, and far off once its lost frames count as not having moved."""
+    store = RunStore(tmp_path / "r")
+    for name in ("s/a", "s/b"):
+        add_run(store, "steady", name, error=0.02)
+        add_run(store, "loser", name, error=0.005, lost=range(40, 95))
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    assert [board.labels[key] for key in board.trackers] == ["steady", "loser"]
+    loser = next(r for r in board.rows if r.tracker == "loser")
+    assert loser.score_m == loser.held_ate_m > 5 * loser.metrics["ate_rmse_m"]
+    paths = build_report(store, tmp_path / "report")
+    shown = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv["per_sequence"])}
+    excluded = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv["lost_frames_excluded"])}
+    assert shown["loser"] > shown["steady"]
+    assert excluded["loser"] < excluded["steady"]
+    rules = rows_of(paths.csv["failure_rules"])
+    assert [r["tracker"] for r in rules] == ["steady", "loser"]
+    assert float(rules[1]["lost frames held: ATE ratio"]) > float(rules[0]["lost frames held: ATE ratio"])
+    assert float(rules[1]["lost frames left out: ATE ratio"]) < float(rules[0]["lost frames left out: ATE ratio"])
+
+
+def test_a_failure_never_scores_better_than_not_moving():
+    assert crashed().score_m == 0.3
+    assert crashed(held_ate_m=0.7).score_m == 0.7
+    assert crashed(held_ate_m=None, metrics={}).score_m == 0.3
+    assert crashed(never_move_m=None).score_m is None
+
+
+def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised():
+    rows = [row("good", s, 0.1) for s in "st"] + [row("bad", s, 0.5) for s in "st"] + [crashed("c", s) for s in "st"]
+    rows += [row("control", s, 0.4, provenance="control") for s in "st"]
+    board = make_board(rows)
+    assert [board.labels[k] for k in board.trackers] == ["GOOD", "BAD", "CONTROL", "C"]
+    assert [board.labels[k] for k in board.ranked] == ["GOOD", "BAD"]
+    assert [board.labels[k] for k in board.hopeless] == ["C"]
+    table = leaderboard(board, PROTOCOL)
+    assert table.separators == {2, 3}
+    assert [cells[1].text for cells in table.rows] == ["2/2", "2/2", "2/2", "0/2"]
+    assert [cell.text for cell in table.rows[3][:4]] == ["–", "0/2", "C", "nothing succeeded"]
+    errors = per_sequence(board, PROTOCOL)
+    failed = cell_of(errors, "C")
+    assert (failed.text, failed.emphasis, failed.shade, failed.value) == ("crashed at 20/60", "failed", None, None)
+    assert cell_of(errors, "GOOD").emphasis == "best"
+    for each in relative_errors(board, PROTOCOL):
+        assert [cells[0].text for cells in each.rows] == ["GOOD", "BAD", "CONTROL"]
+        assert cell_of(each, "GOOD").emphasis == "best"
+    half = make_board([*rows, row("c", "u"), row("good", "u"), row("bad", "u")])
+    for each in relative_errors(half, PROTOCOL):
+        assert [(cell.text, cell.emphasis) for cell in next(c for c in each.rows if c[0].text == "C")[1:3]] == [
+            ("", "failed"), ("", "failed"),
+        ]  # fmt: skip
+
+
+def test_a_cell_with_one_failure_is_not_bold_and_not_green():
+    rows = [row("good", error=0.2, seed=i) for i in range(3)] + [row("ref", error=0.25, seed=i) for i in range(3)]
+    rows += [row("mixed", error=0.01, seed=0), row("mixed", error=0.02, seed=1), crashed("mixed", seed=2)]
+    board = make_board(rows, reference="ref")
+    cell = cell_of(per_sequence(board, PROTOCOL), "MIXED")
+    assert cell.emphasis == ""
+    assert cell.shade == 0.0
+    assert "2/3 succeeded" in cell.small
+    assert "crashed at 20/60" in cell.tip
+    success = {cells[2].text: cells[1].text for cells in leaderboard(board, PROTOCOL).rows}
+    assert success == {"GOOD": "3/3", "REF": "3/3", "MIXED": "2/3"}
+
+
+def test_ways_to_fail_are_named():
+    assert crashed(status="timeout").ending == "timeout at 20/60"
+    assert crashed(status="lost", n_tracked=12).ending == "lost, 12/60 tracked"
+    assert crashed(status="ok").ending == "not evaluated"
+    assert row().ending == ""
+    board = make_board([crashed(seed=0), crashed(seed=1, n_processed=31), row("g")])
+    assert cell_of(per_sequence(board, PROTOCOL), "C").text == "2 failed: crashed at 20/60; crashed at 31/60"
+
+
+# -- on what it ranks
+
+
+def uneven():
+    """Three trackers on three sequences, one of them on a fourth, one more tracker on a single one."""
+    rows = [row(name, s, error) for name, error in (("a", 0.1), ("b", 0.2), ("orb-slam2", 0.4)) for s in "stu"]
+    return [*rows, row("a", "v", 0.1), row("new", "s", 0.05, part_options=["--frames", "0:60"], frames="0:60")]
+
+
+def test_one_more_sequence_takes_nobodys_rank():
+    board = make_board(uneven())
+    assert [board.labels[k] for k in board.ranked] == ["A", "B", "ORB-SLAM2"]
+    assert board.common == ["s", "t", "u"]
+    assert board.reference_name == "ORB-SLAM2"
+    everything = make_board(uneven(), on="all")
+    assert everything.ranked == []
+
+
+def test_two_trackers_are_ranked_on_what_both_have():
+    board = make_board([row("a", "s"), row("a", "t"), row("b", "t", 0.2)])
+    assert board.common == ["t"]
+    assert len(board.ranked) == 2
+    alone = make_board([row("a", "s"), row("b", "t", 0.2)])
+    assert len(alone.ranked) == 1
+    assert alone.standings
+
+
+def test_missing_cells_are_named_with_the_commands_that_fill_them():
+    board = make_board(uneven())
+    note = missing_note(board)
+    assert note.startswith("The ranking stands on the 3 of 5 sequences that all ranked trackers have.")
+    assert "Not ranked, since they lack too many of the others' sequences: NEW." in note
+    assert "B on s [0:60], v" in note
+    commands = missing_commands(board)
+    assert "dynslam-bench run b s --frames 0:60" in commands
+    assert "dynslam-bench run b v" in commands
+    assert "dynslam-bench run new s t u v" in commands
+    assert missing_note(make_board([row("a"), row("b")])) == ""
+
+
+def test_commands_carry_settings_and_repeats():
+    variant = {"epipolar.threshold_px": 2.0, "device": "cpu", "threads": 4}
+    rows = [row("a", "s", seed=i, offset=o, variant=variant) for i in (0, 1) for o in (0, 2)]
+    rows += [row("b", s, place=f"/data/{s}") for s in "st"]
+    (command,) = missing_commands(make_board(rows))
+    expected = "dynslam-bench run a /data/t --seed 0 1 --offset 0 2 --set epipolar.threshold_px=2.0 --threads 4"
+    assert command == expected
+
+
+# -- what is a column
+
+
+def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for place, error in (("/data/chess/seq-01", 0.01), ("/data/fire/seq-01", 0.2)):
+        for tracker in ("a", "b"):
+            add_run(store, tracker, "folder/seq-01", error=error, content=place, block=place[6:11], place=place)
+    paths = build_report(store, tmp_path / "report")
+    table = {r["tracker"]: r for r in rows_of(paths.csv["per_sequence"])}
+    assert float(table["a"]["chess/seq-01"]) < 0.05 < float(table["a"]["fire/seq-01"])
+    assert len(rows_of(paths.csv["runs"])) == 4
+    assert "Left out" not in paths.markdown.read_text()
+    found = compare(store, store)
+    assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
+
+
+def test_the_camera_is_part_of_the_column_in_old_records_too(tmp_path):
+    """Records without a block: content and frames, and the camera that the identity names."""
+    store = RunStore(tmp_path / "r")
+    right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
+    add_run(store, "a", "folder/s", camera=right)
+    add_run(store, "b", "folder/s", camera=right | {"fx": 400.0})
+    add_run(store, "elsewhere", "folder/s", kind="imported")
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    assert set(board.sequences) == {
+        "folder/s (camera 640x480, f 525 525)", "folder/s (camera 640x480, f 400 525)", "folder/s",
+    }  # fmt: skip
+    alone = RunStore(tmp_path / "q")
+    add_run(alone, "a", "folder/s", camera=right)
+    add_run(alone, "elsewhere", "folder/s", kind="imported")
+    assert len({run.row.column_id for run in load_runs([alone], PROTOCOL).runs}) == 1
+
+
+def test_the_same_frames_are_one_column_in_every_spelling(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "a", "synthetic/walking_xyz?frames=60", block="b1")
+    add_run(store, "b", "synthetic/walking_xyz", frames=(0, 60), block="b1")
+    add_run(store, "b", "synthetic/walking_xyz?noise=3", frames=(0, 60), block="b1", noise=3)
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    assert board.sequences == ["synthetic/walking_xyz [0:60]"]
+    assert [len(cells[board.sequences[0]].rows) for _, cells in sorted(board.cells.items())] == [1, 2]
+
+
+def test_names_of_columns_are_never_alike():
+    same = dict(sequence="folder/x", content="c" * 12)
+    rows = [row(**same, block="b1"), row(**same, block="b2"), row(sequence="folder/x", content="d" * 12, block="b3")]
+    names = name_columns(rows)
+    assert len(set(names.values())) == 3
+    assert all(name.startswith("folder/x (") for name in names.values())
+    deep = [row(sequence="folder/x", block=str(i), place=p, frames="0:9") for i, p in enumerate(["/a/1/x", "/b/1/x"])]
+    assert list(name_columns(deep).values()) == ["a/1/x [0:9]", "b/1/x [0:9]"]
+
+
+def test_parts_get_no_published_rows(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "orb-slam2", "tum/fr3/walking_xyz", frames=(0, 200), block="part", duration_s=6.7)
+    add_run(store, "orb-slam2", "bonn/crowd", block="excerpt", duration_s=6.7)
+    add_run(store, "orb-slam2", "tum/fr3/walking_rpy", block="whole", duration_s=30.6)
+    paths = build_report(store, tmp_path / "report")
+    table = rows_of(paths.csv["per_sequence"])
+    published = [r for r in table if "reported" in r["tracker"] or "claimed" in r["tracker"]]
+    assert published
+    for line in published:
+        assert line["tum/fr3/walking_xyz [0:200]"] == line["bonn/crowd"] == ""
+        assert line["tum/fr3/walking_rpy"] != ""
+    note = "Parts of recordings, beside which no published number stands: bonn/crowd, tum/fr3/walking_xyz [0:200]."
+    assert note in paths.markdown.read_text()
+    assert is_excerpt("tum/fr3/walking_xyz", 20.0)
+    assert not is_excerpt("tum/fr3/walking_xyz", 28.5)
+    assert not is_excerpt("synthetic/walking_xyz", 2.0)
+
+
+def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "orb-slam2", "s/a", error=0.05)
+    add_run(store, "dynaslam", "s/a", error=0.04)
+    add_run(store, "orb-slam3", "s/a", kind="imported", final_error=0.001, online=False)
+    paths = build_report(store, tmp_path / "report")
+    assert {r["tracker"] for r in rows_of(paths.csv["leaderboard"])} == {"orb-slam2", "dynaslam"}
+    assert "orb-slam3 imported" not in {r["tracker"] for r in rows_of(paths.csv["per_sequence"])}
+    assert not any("orb-slam3" in r["tracker"] for r in rows_of(paths.csv["rpe_1s_trans"]))
+    (final,) = rows_of(paths.csv["final_trajectory"])
+    assert final["tracker"] == "orb-slam3"
+    assert float(final["s/a"]) < 0.005
+    assert "Only in the table of final trajectories, as nothing else is known of them: orb-slam3." in (
+        paths.markdown.read_text()
+    )
+    only = RunStore(tmp_path / "only")
+    add_run(only, "orb-slam3", "s/a", kind="imported", final_error=0.001, online=False)
+    alone = build_report(only, tmp_path / "alone")
+    assert len(rows_of(alone.csv["final_trajectory"])) == 1
+
+
+def test_imports_of_several_files_are_repeats_and_not_dropped(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for day in (1, 2, 3):
+        add_run(store, "orb-slam3", "s/a", kind="imported", started=f"2026-01-0{day}T00:00:00+00:00")
+    loaded = load_runs([store], PROTOCOL)
+    assert (len(loaded.runs), loaded.superseded) == (3, 0)
+
+
+# -- repeats
+
+
+def test_copies_are_no_repeats():
+    rows = [row("copy", error=0.1, seed=i) for i in range(4)]
+    rows += [row("real", error=0.1 + 0.01 * i, seed=i) for i in range(4)]
+    board = make_board(rows)
+    table = per_sequence(board, PROTOCOL)
+    assert cell_of(table, "COPY").small == "deterministic"
+    assert cell_of(table, "REAL").small == "±7.5"
+    copies = (
+        board.cells[rows[0].variant_key]["s"]
+        if "s" in board.sequences
+        else next(iter(board.cells[rows[0].variant_key].values()))
+    )
+    assert len(copies.scores) == 1
+    assert len(copies.rows) == 4
+    assert "±0.0000" not in str(table.rows)
+
+
+def test_offsets_and_noise_are_repeats_of_one_cell():
+    rows = [row(error=0.1 + 0.01 * o, offset=o, seed=s, block="b") for o in (0, 1, 2) for s in (0, 1)]
+    rows += [row(error=0.15, noise=5, block="b", sequence="s?noise=5")]
+    board = make_board(rows)
+    assert board.sequences == ["s"]
+    (cell,) = (cells["s"] for cells in board.cells.values())
+    assert len(cell.rows) == 7
+    assert sorted(cell.scores) == pytest.approx([0.1, 0.11, 0.12, 0.15])
+    assert [r.repeat for r in cell.rows][:3] == ["seed 0", "seed 1", "seed 0, noise 5"]
+    assert not cell.deterministic
+
+
+def test_a_deterministic_trackers_offsets_keep_apart_in_the_store(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for offset in (0, 2):
+        for seed in (0, 1):
+            add_run(store, "a", "s/a", seed, offset=offset, block="b", copy_of=offset)
+    loaded = load_runs([store], PROTOCOL)
+    assert (len(loaded.runs), loaded.superseded) == (4, 0)
+    board = make_board([run.row for run in loaded.runs])
+    (cells,) = board.cells.values()
+    assert [(len(c.rows), len(c.scores)) for c in cells.values()] == [(4, 2)]
+
+
+# -- what stands beside the numbers
+
+
+def test_times_from_the_cache_are_marked(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "cached", "s/a", cached=True, frame_s=0.01)
+    add_run(store, "both", "s/a", cached=True, frame_s=0.01)
+    add_run(store, "both", "s/b", frame_s=0.05)
+    add_run(store, "fresh", "s/a", frame_s=0.02)
+    paths = build_report(store, tmp_path / "report")
+    markdown = paths.markdown.read_text()
+    lines = {name: next(x for x in markdown.splitlines() if f"| {name} |" in x) for name in ("cached", "both", "fresh")}
+    assert "10.0 ms†" in lines["cached"]
+    assert "50.0 ms" in lines["both"]
+    assert "†" not in lines["both"] + lines["fresh"]
+    assert "† Times of features and masks come from the stage cache" in markdown
+    flags = {(r["tracker"], r["sequence"]): r["cached"] for r in rows_of(paths.csv["runs"])}
+    assert flags == {("cached", "s/a"): "True", ("both", "s/a"): "True", ("both", "s/b"): "False",
+                     ("fresh", "s/a"): "False"}  # fmt: skip
+    assert '"cached":true' in paths.data.read_text().replace(" ", "")
+
+
+def test_the_share_without_fundamental_matrix_stands_beside_every_number():
+    rows = [row("ours", s, epipolar_skipped=0.98) for s in "st"] + [row("plain", s, 0.2) for s in "st"]
+    board = make_board(rows)
+    table = leaderboard(board, PROTOCOL)
+    column = [c.name for c in table.columns].index("F skipped")
+    assert {cells[2].text: cells[column].text for cells in table.rows} == {"OURS": "98 %", "PLAIN": ""}
+    for each in (per_sequence(board, PROTOCOL), *relative_errors(board, PROTOCOL)):
+        assert cell_of(each, "OURS").small == "F skipped 98 %"
+        assert cell_of(each, "PLAIN").small == ""
+    assert "F skipped" not in [c.name for c in leaderboard(make_board([row()]), PROTOCOL).columns]
+
+
+def test_numbers_have_three_digits_and_no_more():
+    assert [mm(v) for v in (0.2196, 0.0142, 0.009996, 0.00123, 2.5, 0.0)] == [
+        "220",
+        "14.2",
+        "10.0",
+        "1.23",
+        "2500",
+        "0",
+    ]
+    assert mm(float("nan")) == "–"
+    assert [percent(v) for v in (0, 0.5, 1, 0.999, 0.0001)] == ["0 %", "50 %", "100 %", "99.9 %", "< 0.1 %"]
+
+
+def test_little_data_claims_little():
+    rows = [row("orb-slam2", "s", 0.2237), row("orb-slam2", "t", 0.02)]
+    rows += [row("a", "s", 0.2196), row("a", "t", 0.01)]
+    table = leaderboard(make_board(rows), PROTOCOL)
+    names = [c.name for c in table.columns]
+    assert "P(better)" not in names
+    for cells in table.rows:
+        assert (cells[0].text, cells[0].small) == ("1–2", "not separable")
+        assert cells[names.index("ATE ratio")].small == ""
+        assert cells[names.index("ATE ratio")].emphasis == ""
+        assert cells[names.index("p")].text == ""
+    assert [cells[names.index("wins")].text for cells in table.rows] == ["2 of 2", "reference"]
+
+
+# -- frames
+
+
+def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "a", "s/a", offset=2, block="b", skipped=0.5, overrides={"x.y": 3})
+    add_run(store, "b", "s/a", status="crashed", reason="boom", block="b", noise=4)
+    frame = load_frame(store)
+    assert list(frame["tracker"]) == ["a", "b"]
+    assert frame["settings"][0].startswith("x.y=3")
+    assert str(frame["noise"].dtype) == "Int64"
+    assert frame["noise"].isna().tolist() == [True, False]
+    assert frame["failed"].tolist() == [False, True]
+    assert frame["ending"][1] == "crashed at 30/120"
+    assert frame["score_m"].dtype == np.float64
+    assert frame["ate_rmse_m"][0] == frame["score_m"][0] > 0
+    assert np.isnan(frame["epipolar_skipped"][1])
+    paths = build_report(store, tmp_path / "report")
+    assert list(rows_of(paths.csv["runs"])[0]) == list(frame.columns)
+
+
+# -- compare
+
+
+def test_compare_pairs_runs_of_different_settings_and_says_what_differs(tmp_path):
+    before, after = RunStore(tmp_path / "a"), RunStore(tmp_path / "b")
+    names = [f"s/{i}" for i in range(6)]
+    for name in names:
+        add_run(before, "ours", name, error=0.05, overrides={"epipolar.threshold_px": 1.0})
+        add_run(after, "ours", name, error=0.02, overrides={"epipolar.threshold_px": 2.0})
+        add_run(before, "same", name)
+        add_run(after, "same", name)
+    found = compare(before, after)
+    name = "ours · epipolar.threshold_px=1.0 → ours · epipolar.threshold_px=2.0"
+    assert set(found.overall) == {name, "same"}
+    assert found.differences[name] == ["epipolar.threshold_px: 1.0 in A, 2.0 in B"]
+    assert found.differences["same"] == []
+    assert found.overall[name].high < 1
+    assert (found.only_a, found.only_b) == (0, 0)
+    verdicts = {cells[0].text: cells[5].text for cells in found.table.rows if cells[1].text.startswith("all ")}
+    assert verdicts[name] == "better"
+    assert "What differs" in found.table.caption
+
+
+def test_compare_takes_the_nearest_settings_and_leaves_the_rest(tmp_path):
+    before, after = RunStore(tmp_path / "a"), RunStore(tmp_path / "b")
+    add_run(before, "ours", "s/a")
+    add_run(after, "ours", "s/a", overrides={"x": 1})
+    add_run(after, "ours", "s/a", overrides={"x": 1, "y": 2})
+    found = compare(before, after)
+    assert list(found.differences.values()) == [["x: default in A, 1 in B"]]
+    assert (found.only_a, found.only_b) == (0, 1)
