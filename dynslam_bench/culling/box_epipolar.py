@@ -57,7 +57,8 @@ class BoxEpipolarFilter(DynamicFilter):
         if matrix is None:
             return FilterResult.of(keep, {**stats, "failed": 1.0})
         distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
-        limit = np.where(inside[flow.valid], self.settings.inside_px, self.settings.outside_px)
+        outside_px = self.settings.outside_px if self.settings.test_outside else np.inf
+        limit = np.where(inside[flow.valid], self.settings.inside_px, outside_px)
         keep[flow.valid] = distance <= limit
         return FilterResult.of(keep, stats)
 

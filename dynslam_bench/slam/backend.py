@@ -60,6 +60,13 @@ class RgbdBackend:
         self._scales = scale_factor ** np.arange(max(levels, 1), dtype=np.float64)
         self._ready = False
 
+    def configure(self, settings: BackendSettings) -> None:
+        """Put other settings into force from the next frame on."""
+        self.settings = settings
+        if self._ready:
+            self.mapper.settings = settings
+            self._keyframes.settings = settings.keyframes
+
     def reset(self, camera: Camera, seed: int) -> None:
         """Forget everything: a new sequence begins.
 

@@ -15,10 +15,15 @@ if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
-class DynaSlamSettings(SemanticSystemSettings):
-    """Masks of nineteen classes and multi-view geometry, constants of the paper."""
+class DynaSlamMasksSettings(SemanticSystemSettings):
+    """Masks of nineteen classes."""
 
     segmentation: SegmentationSettings = SegmentationSettings(classes="dynaslam19")
+
+
+class DynaSlamSettings(DynaSlamMasksSettings):
+    """Masks and multi-view geometry, constants of the paper."""
+
     multiview: MultiViewSettings = MultiViewSettings()
 
 
@@ -49,7 +54,7 @@ def build(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
     return compose(settings, context, filters)
 
 
-def build_masks_only(settings: DynaSlamSettings, context: TrackerContext) -> SlamPipeline:
+def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -> SlamPipeline:
     """N: B1 alone."""
     from dynslam_bench.culling.semantic import SemanticFilter
 
@@ -69,7 +74,7 @@ UNION = "the masks of N and G are united, as in the code (the paper keeps G's wh
 def _spec(
     suffix: str,
     variant: str,
-    settings: type[DynaSlamSettings],
+    settings: type[DynaSlamMasksSettings],
     factory: str,
     faithful_code: bool,
     published_as: tuple[str, ...],
@@ -96,6 +101,6 @@ def _spec(
 SPECS = [
     _spec("", "N+G", DynaSlamSettings, "build", False, ("DynaSLAM N+G", "DynaSLAM")),
     _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", True, ("DynaSLAM N+G", "DynaSLAM")),
-    _spec("-n", "N", DynaSlamSettings, "build_masks_only", True, ("DynaSLAM N",)),
+    _spec("-n", "N", DynaSlamMasksSettings, "build_masks_only", True, ("DynaSLAM N",)),
     _spec("-g", "G", DynaSlamGeometrySettings, "build", False, ("DynaSLAM G",)),
 ]

@@ -29,14 +29,20 @@ class EmfoaOftSettings(SemanticSystemSettings):
     free_space: FreeSpaceSettings = FreeSpaceSettings()
 
 
+class EmfoaOftNoFlowSettings(SemanticSystemSettings):
+    """The ablation without flow: what needs a flow is no setting of it."""
+
+
 def build(settings: EmfoaOftSettings, context: TrackerContext) -> SlamPipeline:
     """Mask culling, EMFOA-optimised flow, epipolar culling, depth consistency, the shared back end."""
     return _build(settings, context)
 
 
-def build_without_flow(settings: EmfoaOftSettings, context: TrackerContext) -> SlamPipeline:
+def build_without_flow(settings: EmfoaOftNoFlowSettings, context: TrackerContext) -> SlamPipeline:
     """Ablation: mask culling only."""
-    return _build(settings, context, geometry=False)
+    from dynslam_bench.culling.semantic import SemanticFilter
+
+    return compose(settings, context, [SemanticFilter(settings.segmentation)])
 
 
 def build_object_mode(settings: EmfoaOftSettings, context: TrackerContext) -> SlamPipeline:
@@ -44,9 +50,7 @@ def build_object_mode(settings: EmfoaOftSettings, context: TrackerContext) -> Sl
     return _build(settings, context, semantic=False)
 
 
-def _build(
-    settings: EmfoaOftSettings, context: TrackerContext, *, semantic: bool = True, geometry: bool = True
-) -> SlamPipeline:
+def _build(settings: EmfoaOftSettings, context: TrackerContext, *, semantic: bool = True) -> SlamPipeline:
     from dynslam_bench.culling.epipolar import EpipolarFilter
     from dynslam_bench.culling.free_space import FreeSpaceFilter
     from dynslam_bench.culling.motion import MotionFilter
@@ -55,13 +59,12 @@ def _build(
     filters: list[DynamicFilter] = []
     if semantic and settings.segmentation.source != "none":  # the ablation without masks
         filters.append(SemanticFilter(settings.segmentation))
-    if geometry:
-        filters.append(EpipolarFilter(settings.epipolar))
-        if settings.motion.enabled:
-            filters.append(MotionFilter(settings.motion))
-        if settings.free_space.enabled:
-            filters.append(FreeSpaceFilter(settings.free_space))
-    return compose(settings, context, filters, settings.flow if geometry else None)
+    filters.append(EpipolarFilter(settings.epipolar))
+    if settings.motion.enabled:
+        filters.append(MotionFilter(settings.motion))
+    if settings.free_space.enabled:
+        filters.append(FreeSpaceFilter(settings.free_space))
+    return compose(settings, context, filters, settings.flow)
 
 
 OURS = (
@@ -72,7 +75,7 @@ DEPTH_TESTS = ("rigid motion in depth and free space seen before are tested as w
 
 def _spec(name: str, summary: str, defaults: dict[str, Any], factory: str = "build") -> TrackerSpec:
     geometry = factory != "build_without_flow"
-    settings = EmfoaOftSettings
+    settings: type[SemanticSystemSettings] = EmfoaOftSettings if geometry else EmfoaOftNoFlowSettings
     if defaults:
         settings = _variant(name, defaults)
     return TrackerSpec(
