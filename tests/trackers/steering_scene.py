@@ -29,7 +29,7 @@ class SmallScene:
         camera: At half the resolution.
     """
 
-    def __init__(self, name: str = "synthetic/walking_xyz@107", frames: int = FRAMES, stride: int = STRIDE) -> None:
+    def __init__(self, name: str = "synthetic/walking_xyz@103", frames: int = FRAMES, stride: int = STRIDE) -> None:
         whole = open_sequence(f"{name}?frames={frames * stride}")
         self.id = whole.id
         self.camera = whole.camera.resized(whole.camera.width // 2, whole.camera.height // 2)
@@ -72,9 +72,9 @@ SEGMENTER = SegmenterSpec("erring", f"{__file__}:build_erring")
 
 def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
     """A tracker for the scene, with fewer features as its images are smaller."""
-    given: dict[str, object] = {"features.n_features": 400, "features.levels": 4}
+    given: dict[str, object] = {"features.n_features": 500, "features.levels": 4}
     if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto":
-        given["segmentation.source"] = f"plugin:{__file__}:SEGMENTER"
+        given |= {"segmentation.dilation_px": 4, "segmentation.source": f"plugin:{__file__}:SEGMENTER"}
     return build_tracker(spec, given | settings, TrackerContext(sequence_id=scene.id, masks=scene))
 
 
