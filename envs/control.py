@@ -10,7 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SettingsError, did_you_mean
-from dynslam_bench.core.settings import Parameter, Scalar, Settings, apply_overrides, flatten, parameters
+from dynslam_bench.core.settings import Parameter, Scalar, Settings, apply_overrides, flatten, parameters, value_of
+from dynslam_bench.core.steering import why_idle
 
 
 class ActionMap:
@@ -23,17 +24,30 @@ class ActionMap:
     - int: the same, rounded to the nearest integer;
     - bool and categorical: the ``floor(u * n)``-th of the n choices, each with an equal share of the axis.
 
+    A coordinate that is that of the neutral action leaves its setting exactly as it is in `settings`; an action has 24
+    bits a coordinate, from which most values come back changed in the last places.
+
     Args:
         settings: The settings of the episode; what is not steered stays as it is here.
         control: Dotted names of online settings.
 
     Raises:
-        SettingsError: A name is unknown, given twice, or its setting may not change in mid-episode.
+        SettingsError: A name is unknown or given twice, or its setting may not change in mid-episode, has no effect
+            with these settings, or has a value outside the range that actions span.
     """
 
     def __init__(self, settings: Settings, control: Sequence[str]) -> None:
         self.base = settings
         self.parameters: tuple[Parameter, ...] = _select(settings, control)
+        for parameter in self.parameters:
+            _check_effect(settings, parameter)
+        self._values = {parameter.name: value_of(settings, parameter.name) for parameter in self.parameters}
+        self._neutral = self.encode(settings)
+
+    @property
+    def neutral(self) -> NDArray[np.float32]:
+        """The action ``[k]`` that leaves the settings exactly as they are."""
+        return self._neutral.copy()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,7 +83,8 @@ class ActionMap:
         if np.isnan(vector).any():
             raise SettingsError(f"the action holds NaN: {vector.tolist()}")
         shares = (np.clip(vector, -1.0, 1.0) + 1.0) / 2.0
-        return {p.name: _decode(p, float(u)) for p, u in zip(self.parameters, shares, strict=True)}
+        asked = zip(self.parameters, shares, vector.astype(np.float32) == self._neutral, strict=True)
+        return {p.name: self._values[p.name] if same else _decode(p, float(u)) for p, u, same in asked}
 
     def encode(self, settings: Settings) -> NDArray[np.float32]:
         """The action ``[k]`` that asks for given settings; values beyond the search range are clipped to its ends."""
@@ -94,6 +109,17 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
             raise SettingsError(f"setting '{name}' is given twice in control")
         chosen.append(online[name])
     return tuple(chosen)
+
+
+def _check_effect(settings: Settings, parameter: Parameter) -> None:
+    if idle := why_idle(settings, parameter):
+        raise SettingsError(f"setting '{parameter.name}' in control has no effect: {idle}", "leave it out of control")
+    value = value_of(settings, parameter.name)
+    if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
+        raise SettingsError(
+            f"setting '{parameter.name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
+            "set it within, or leave it out of control",
+        )
 
 
 def _decode(parameter: Parameter, share: float) -> Scalar:

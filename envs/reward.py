@@ -10,17 +10,24 @@ from dynslam_bench.evaluation.online import OnlineSample
 
 RewardKind = Literal["neg_rpe", "neg_pose_error"]
 
+
+def _pose_error(error: OnlineSample) -> float:
+    return -min(error.trans_m, error.way_m) if error.tracked else -error.way_m
+
+
 REWARDS: dict[str, Callable[[OnlineSample], float]] = {
     "neg_rpe": lambda error: -(error.frame_trans_m or 0.0),
-    "neg_pose_error": lambda error: -error.trans_m,
+    "neg_pose_error": _pose_error,
 }
 """Reward in metres of a frame that has ground truth, by name; other frames earn 0.
 
 - ``neg_rpe``: minus the translational error of the motion since the previous frame; needs no alignment and adds up.
-- ``neg_pose_error``: minus the causal translational pose error.
+  A frame without a tracked pose earns what not moving would (see `OnlineError`).
+- ``neg_pose_error``: minus the causal translational pose error, at most the length of the true way so far (an error of
+  100 %). A frame without a tracked pose earns minus that length: no pose, however far it has drifted, earns less, so
+  that getting lost pays nowhere but before the first tracked pose, which begins the episode's frame of reference.
 
-A frame without a tracked pose earns what not moving would (see `OnlineError`). The sum over an episode is not the ATE,
-which the last step's ``episode_metrics`` give under the protocol.
+The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the protocol.
 """
 
 

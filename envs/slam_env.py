@@ -16,6 +16,7 @@ from dynslam_bench.core.cache import default_folder
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Settings, apply_overrides
+from dynslam_bench.core.steering import Steerable
 from dynslam_bench.evaluation.online import OnlineError, OnlineSample
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
@@ -53,14 +54,15 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     **Action.** ``Discrete(1)`` without `control` (pure evaluation); otherwise ``Box(-1, 1, (k,))`` over the named
     online settings (see `ActionMap`), in force from the frame of the step on; an episode begins with `settings`.
-    The tracker then needs a method ``update_settings(settings)``, which takes the complete settings, of which only
-    online fields differ from those it was built with.
+    The tracker then needs the method of `core.steering.Steerable`, ``configure(settings)``: it takes the complete
+    settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
 
     **Observation.** ``stats``: float32 ``[24]`` (see `observation.STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
     ``depth`` and ``stats``. Neither holds anything of the ground truth.
 
-    **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`); frames without a tracked pose, and
-    all remaining ones when `lost_after` ends an episode, cost the error of not moving (see `OnlineError`).
+    **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`). Frames without a tracked pose, and
+    all remaining ones when `lost_after` ends an episode, cost the error of not moving (``neg_rpe``), or the length of
+    the true way so far (``neg_pose_error``).
 
     **Info**: ``frame_index``, ``timestamp``, ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the
     tracker's diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames;
@@ -166,7 +168,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     @property
     def neutral_action(self) -> Any:
         """The action that keeps the settings the episode begins with."""
-        return self._actions.encode(self.settings) if self._actions.parameters else 0
+        return self._actions.neutral if self._actions.parameters else 0
 
     @property
     def timings(self) -> list[dict[str, float]]:
@@ -211,9 +213,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         super().reset(seed=seed)
         self._apply_options(options or {})
         tracker = self._ready_tracker()
+        if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
+            tracker.configure(self.settings)  # type: ignore[attr-defined]
         tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
-        if self._actions.parameters:
-            self._steer(tracker, self.settings)
         self.episode = Episode()
         self._errors = OnlineError(self.sequence.ground_truth, self.protocol.max_dt)
         self._final = None
@@ -231,7 +233,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """
         tracker = self._running_tracker()
         if self._actions.parameters:
-            self._steer(tracker, self._actions.settings(action))
+            tracker.configure(self._actions.settings(action))  # type: ignore[attr-defined]
         self._track_next(tracker)
         reward = self.episode.outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
@@ -357,15 +359,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             )
             self._tracker = build_tracker(self.tracker_spec, self.settings, context)
             self._tracker_key = key
-            if self._actions.parameters and not hasattr(self._tracker, "update_settings"):
+            if self._actions.parameters and not isinstance(self._tracker, Steerable):
                 raise TrackerError(
                     f"tracker '{self.tracker_spec.id}' cannot be steered in mid-episode",
-                    "it has no update_settings(settings) method: leave control empty",
+                    "it has no configure(settings) method: leave control empty",
                 )
         return self._tracker
-
-    def _steer(self, tracker: Tracker, settings: Settings) -> None:
-        tracker.update_settings(settings)  # type: ignore[attr-defined]
 
     def _running_tracker(self) -> Tracker:
         if self._tracker is None or not self.episode.outcomes:

@@ -15,6 +15,7 @@ Example:
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import types
@@ -26,6 +27,7 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
 
 from .errors import SettingsError, did_you_mean
 
@@ -39,6 +41,18 @@ class Settings(BaseModel):
     """Base of all settings: immutable, JSON-able, unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Refuse a class with a default that lies outside its own range: studies and actions could not name it."""
+        for name, field in _leaves(cls):
+            if _annotation(field) is not None:
+                _check_default(cls, _describe(name, field))
+
+    @property
+    def idle(self) -> str:
+        """Why nothing of this group has an effect as it is set, for a message; empty where it has one."""
+        return ""
 
     def verify(self) -> None:
         """Raise `SettingsError` where values, each valid by itself, do not go together; asked before anything runs."""
@@ -198,7 +212,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
 
 def flatten(settings: Settings) -> dict[str, Any]:
     """Dotted name to value of every leaf field."""
-    return {name: _get(settings, name) for name in field_names(type(settings))}
+    return {name: value_of(settings, name) for name in field_names(type(settings))}
 
 
 def field_names(cls: type[Settings]) -> list[str]:
@@ -235,13 +249,33 @@ def _span(p: Parameter) -> str:
     return f"{p.low:g} to {p.high:g}{' (log)' if p.scale == 'log' else ''}"
 
 
-def _leaves(cls: type[Settings], prefix: str = "") -> Iterable[tuple[str, FieldInfo]]:
+def _leaves(
+    cls: type[Settings], prefix: str = "", defaults: Settings | None = None
+) -> Iterable[tuple[str, FieldInfo]]:
+    """Leaf fields by dotted name; the defaults are those of `cls`, also where it gives a group other ones."""
     for key, field in cls.model_fields.items():
         nested = _nested(field)
+        given = getattr(defaults, key) if defaults is not None else field.get_default(call_default_factory=True)
         if nested is not None:
-            yield from _leaves(nested, f"{prefix}{key}.")
+            yield from _leaves(nested, f"{prefix}{key}.", given if isinstance(given, Settings) else None)
         else:
-            yield f"{prefix}{key}", field
+            yield f"{prefix}{key}", field if defaults is None else _with_default(field, given)
+
+
+def _with_default(field: FieldInfo, default: Any) -> FieldInfo:
+    changed = copy.copy(field)
+    changed.default, changed.default_factory = default, None
+    return changed
+
+
+def _check_default(cls: type[Settings], p: Parameter) -> None:
+    """Numbers only: pydantic holds the defaults of the others to their types."""
+    if p.low is None or p.high is None or p.default is None or p.default is PydanticUndefined:
+        return
+    if not p.low <= float(p.default) <= p.high:
+        raise TypeError(
+            f"{cls.__name__}: the default of '{p.name}' is {p.default!r}, outside its range {p.low:g} to {p.high:g}"
+        )
 
 
 def _nested(field: FieldInfo) -> type[Settings] | None:
@@ -294,7 +328,8 @@ def _walk(values: dict[str, Any], path: list[str]) -> tuple[Any, ...]:
     return (node,) if isinstance(node, dict) else (node, path[-1])
 
 
-def _get(settings: Settings, name: str) -> Any:
+def value_of(settings: Settings, name: str) -> Any:
+    """The value of a field by its dotted name."""
     node: Any = settings
     for key in name.split("."):
         node = getattr(node, key)

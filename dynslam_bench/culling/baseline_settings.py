@@ -48,9 +48,10 @@ class BoxEpipolarSettings(Settings):
         0.5, low=0.1, high=3.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
         meaning="epipolar distance above which a point inside a dynamic box is dropped",
     )  # fmt: skip
+    test_outside: bool = tunable(True, meaning="whether points outside all boxes are tested too")
     outside_px: float = tunable(
         1.0, low=0.2, high=10.0, scale="log", limits=(0.01, 1000.0), unit="px", online=True,
-        meaning="epipolar distance above which a point outside all boxes is dropped",
+        when={"test_outside": [True]}, meaning="epipolar distance above which a point outside all boxes is dropped",
     )  # fmt: skip
     inlier_px: float = tunable(
         1.0, low=0.1, high=3.0, scale="log", limits=(0.01, 20.0), unit="px", meaning="RANSAC's inlier threshold"
@@ -233,11 +234,11 @@ class ClassRuleSettings(Settings):
         meaning="epipolar distance above which a point on a movable object is dropped",
     )  # fmt: skip
     depth_m: float = tunable(
-        0.3, low=0.1, high=1.0, limits=(0.0, 10.0), unit="m", online=True,
+        0.3, low=0.0, high=1.0, limits=(0.0, 10.0), unit="m", online=True,
         meaning="a point this near to the depth of a moving object goes with it",
     )  # fmt: skip
     vote_share: float = tunable(
-        0.3, low=0.05, high=0.9, limits=(0.0, 1.0), meaning="share of an object's points that must fail"
+        0.3, low=0.05, high=1.0, limits=(0.0, 1.0), meaning="share of an object's points that must fail"
     )
     unmatched: Unmatched = tunable(
         "keep",

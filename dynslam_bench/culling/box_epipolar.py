@@ -43,7 +43,7 @@ class BoxEpipolarFilter(DynamicFilter):
         keep = np.ones(len(frame), dtype=bool)
         flow = state.flow
         boxes = dynamic_boxes(frame, self.segmentation)
-        stats = {"matches": 0.0, "boxes": float(len(boxes)), "lost": 0.0, "failed": 0.0, "f_asked": 0.0, "f_judged": 0.0}
+        stats = dict.fromkeys(("matches", "lost", "failed", "f_asked", "f_judged"), 0.0) | {"boxes": float(len(boxes))}
         if flow is None or state.previous is None:
             return FilterResult.of(keep, stats)
         stats["f_asked"] = 1.0
@@ -66,7 +66,8 @@ class BoxEpipolarFilter(DynamicFilter):
             return FilterResult.of(keep, {**stats, "failed": 1.0})
         stats["f_judged"] = 1.0
         distance = epipolar_distance(matrix, before[judged], frame.xy[judged])
-        limit = np.where(inside[judged], self.settings.inside_px, self.settings.outside_px)
+        outside_px = self.settings.outside_px if self.settings.test_outside else np.inf
+        limit = np.where(inside[judged], self.settings.inside_px, outside_px)
         keep[judged] = distance <= limit
         return FilterResult.of(keep, stats)
 

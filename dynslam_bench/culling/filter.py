@@ -9,10 +9,12 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.keypoints import Keypoints
 from dynslam_bench.flow.estimator import FlowResult
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
 Provenance = Literal["faithful-code", "faithful-paper", "inspired", "assumed"]
 Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
@@ -145,6 +147,17 @@ class DynamicFilter(Protocol):
     name: str
     needs: frozenset[Need]
     provenance: Provenance
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Groups of a system's settings that it takes: its own, and ``segmentation`` where it looks at objects."""
+        own = getattr(self, "group", self.name)
+        return (own, "segmentation") if hasattr(self, "segmentation") else (own,)
+
+    def configure(self, settings: Settings) -> None:
+        """Put settings of one of its groups into force from the next frame on."""
+        objects = isinstance(settings, SegmentationSettings) and hasattr(self, "segmentation")
+        setattr(self, "segmentation" if objects else "settings", settings)
 
     def reset(self, camera: Camera) -> None:
         """Forget everything: a new sequence begins."""

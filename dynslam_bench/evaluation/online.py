@@ -23,19 +23,23 @@ class OnlineSample:
         frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None where the frame
             before has no ground truth.
         frame_rot_deg: Frame-to-frame rotational error in degrees, likewise.
+        way_m: Length in metres of the true path since the first frame with ground truth; no tracker changes it.
+        tracked: Whether the frame was tracked.
     """
 
     trans_m: float
     rot_deg: float
     frame_trans_m: float | None
     frame_rot_deg: float | None
+    way_m: float = 0.0
+    tracked: bool = True
 
 
 class OnlineError:
     """Follows the pose error of a running tracker; what is known at a frame never changes later.
 
     A frame that is lost counts as not having moved: cumulatively it stays at the last tracked pose, and frame to frame
-    an interval with a lost frame at either end is charged with the whole true motion, so that getting lost never pays.
+    an interval with a lost frame at either end is charged with the whole true motion.
     Until a first pose is tracked the camera counts as standing at the first true pose.
 
     Args:
@@ -54,6 +58,8 @@ class OnlineError:
         self._held: Array | None = None
         self._previous_truth: Array | None = None
         self._previous_pose: Array | None = None
+        self._last_truth: Array | None = None
+        self._way_m = 0.0
 
     def truth_at(self, timestamp: float) -> Array | None:
         """The true pose ``[4, 4]`` nearest in time, or None in a hole."""
@@ -94,6 +100,9 @@ class OnlineError:
             self._held = self._align @ pose
         if self._held is None:
             self._held = truth.copy()
+        if self._last_truth is not None:
+            self._way_m += float(np.linalg.norm(truth[:3, 3] - self._last_truth[:3, 3]))
+        self._last_truth = truth
         error = se3.inverse(truth) @ self._held
         frame_trans = frame_rot = None
         if self._previous_truth is not None:
@@ -102,7 +111,7 @@ class OnlineError:
             if pose is not None and self._previous_pose is not None:
                 estimated = se3.inverse(self._previous_pose) @ pose
             frame_trans, frame_rot = _size(se3.inverse(moved) @ estimated)
-        return OnlineSample(*_size(error), frame_trans, frame_rot)
+        return OnlineSample(*_size(error), frame_trans, frame_rot, self._way_m, pose is not None)
 
 
 def _size(error: Array) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from dynslam_bench.core.cache import StageCache
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.steering import Steerable
 
 from .keypoints import FeatureExtractor, Keypoints
 from .registry import FEATURES
@@ -40,20 +41,17 @@ class CachedExtractor:
         self._cache = cache
         self._threads = threads
         self._code = code_of(settings)
-        self.settings = settings
+        self._address(settings)
         self.hit = False
         self.saved_s = 0.0
 
-    @property
-    def settings(self) -> Settings:
-        """The settings in force; replacing them replaces the extractor's."""
-        return self._settings
+    def configure(self, settings: Settings) -> None:
+        """Put other settings into force, the extractor's too."""
+        if isinstance(self._extractor, Steerable):
+            self._extractor.configure(settings)
+        self._address(settings)
 
-    @settings.setter
-    def settings(self, settings: Settings) -> None:
-        self._settings = settings
-        if hasattr(self._extractor, "settings"):
-            self._extractor.settings = settings
+    def _address(self, settings: Settings) -> None:
         weights = named_digests(settings)
         self._prefix = digest([self._code, weights, settings.model_dump(mode="json"), machine_digest(), self._threads])
 

@@ -50,6 +50,11 @@ class OrbExtractor:
         )  # fmt: skip
         self._half_widths = patch_half_widths(PATCH_RADIUS)
 
+    def configure(self, settings: FeatureSettings) -> None:
+        """Put other FAST thresholds into force; a second threshold above the first leaves the second alone in force."""
+        self.settings = settings
+        self._detector.setThreshold(settings.fast_threshold_min)
+
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
         gray = np.ascontiguousarray(gray, dtype=np.uint8)

@@ -8,6 +8,8 @@ from pydantic import Field, field_validator
 
 from dynslam_bench.core.settings import Settings, names, tunable
 
+_ORB = {"extractor": ["orb"]}
+
 
 class FeatureSettings(Settings):
     """How keypoints are found and described."""
@@ -23,10 +25,11 @@ class FeatureSettings(Settings):
         1.2, low=1.1, high=1.5, limits=(1.01, 3.0), meaning="ratio of the sizes of consecutive pyramid levels"
     )
     fast_threshold: int = tunable(
-        20, low=8, high=40, limits=(1, 254), unit="grey levels", online=True, meaning="FAST contrast sought first"
-    )
+        20, low=8, high=40, limits=(1, 254), unit="grey levels", online=True, when=_ORB,
+        meaning="FAST contrast sought first",
+    )  # fmt: skip
     fast_threshold_min: int = tunable(
-        7, low=3, high=20, limits=(1, 254), unit="grey levels", online=True,
+        7, low=3, high=20, limits=(1, 254), unit="grey levels", online=True, when=_ORB,
         meaning="FAST contrast accepted in cells where the first threshold finds nothing",
     )  # fmt: skip
     cell_px: int = tunable(

@@ -26,6 +26,10 @@ class DisFlow:
         self.settings = settings or FlowSettings(method="dis")
         self._dis = cv2.DISOpticalFlow.create(_PRESETS[self.settings.dis_preset])
 
+    def configure(self, settings: FlowSettings) -> None:
+        """Put other settings into force from the next call on."""
+        self.settings = settings
+
     def prepare(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image itself."""
         return np.ascontiguousarray(gray)

@@ -22,6 +22,10 @@ class LucasKanadeFlow:
         side = self.settings.window_px | 1
         self._window = (side, side)
 
+    def configure(self, settings: FlowSettings) -> None:
+        """Put other settings into force from the next call on."""
+        self.settings = settings
+
     def prepare(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image itself: OpenCV's Python binding takes no ready pyramid."""
         return np.ascontiguousarray(gray)

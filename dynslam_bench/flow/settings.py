@@ -180,3 +180,8 @@ class FlowSettings(Settings):
         160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px", when=_DENSE,
         meaning="dense mode: `range_px`",
     )  # fmt: skip
+
+    @property
+    def idle(self) -> str:
+        """What a plug-in does with these settings is not known, so that none of them is offered for steering."""
+        return f"flow.plugin is {self.plugin!r}" if self.plugin else ""

@@ -52,6 +52,10 @@ class SparseDaisyFlow:
         self.pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
         self._buffers = BufferPool()
 
+    def configure(self, settings: FlowSettings) -> None:
+        """Put other settings into force from the next call on."""
+        self.settings = settings
+
     def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
         """The orientation maps of a uint8 ``[H, W]`` image."""
         return orientation_maps(gray, threads=self.threads, pool=self.pool, buffers=self._buffers)

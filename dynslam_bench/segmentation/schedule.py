@@ -18,8 +18,6 @@ from .settings import SegmentationSettings
 class MaskScheduler:
     """The segmentation stage of a pipeline (`slam.pipeline.MaskStage`): one call a frame, in order.
 
-    `settings` may be replaced by others with the same source while a run lasts.
-
     Args:
         settings: When to segment, how to carry masks, how long to bridge misses.
         segmenter: Who segments.
@@ -37,20 +35,15 @@ class MaskScheduler:
         self._age = 0
         self.segmented = False
         self.runs = 0
-        self.settings = settings
+        self.configure(settings)
 
     @property
     def segmenter(self) -> Segmenter:
         """Who segments."""
         return self._segmenter
 
-    @property
-    def settings(self) -> SegmentationSettings:
-        """The settings in force."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: SegmentationSettings) -> None:
+    def configure(self, settings: SegmentationSettings) -> None:
+        """Put other settings with the same source into force."""
         self._settings = settings
         self._missed.limit = settings.compensate
         if isinstance(self._segmenter, ConfiguredSegmenter):

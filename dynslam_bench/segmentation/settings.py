@@ -115,6 +115,11 @@ class SegmentationSettings(Settings):
                 raise ValueError(str(error)) from None
         return value
 
+    @property
+    def idle(self) -> str:
+        """Without a source nothing here has an effect."""
+        return "segmentation.source is 'none'" if self.source == "none" else ""
+
     def class_names(self) -> frozenset[str]:
         """The COCO names of the classes held for dynamic."""
         return expand_classes(self.classes)

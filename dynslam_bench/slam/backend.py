@@ -60,6 +60,13 @@ class RgbdBackend:
         self._scales = scale_factor ** np.arange(max(levels, 1), dtype=np.float64)
         self._ready = False
 
+    def configure(self, settings: BackendSettings) -> None:
+        """Put other settings into force from the next frame on."""
+        self.settings = settings
+        if self._ready:
+            self.mapper.settings = settings
+            self._keyframes.settings = settings.keyframes
+
     def reset(self, camera: Camera, seed: int) -> None:
         """Forget everything: a new sequence begins.
 
@@ -75,11 +82,9 @@ class RgbdBackend:
         self.state: State = "initialising"
         self._last: Tracked | None = None
         self._motion: MotionState | None = None
-        self._dt = 1.0 / 30.0
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
         self._frame = -1
-        self._next_stamp: float | None = None
         self._depth_images: dict[int, NDArray[np.float32]] = {}
         self._views: dict[int, tuple[KeyframeView, ...]] = {}
         self._cloud: tuple[NDArray[np.int64], Array] | None = None
@@ -87,41 +92,50 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ prediction
 
-    def predict(self) -> Array | None:
-        """The motion model's camera-to-world pose for the next frame; None when nothing is known yet.
+    def predict(self, timestamp: float) -> Array | None:
+        """The motion model's camera-to-world pose at a time; None when nothing is known yet.
 
-        While lost this is the last tracked pose.
+        While lost, and after a gap that nothing is assumed about, this is the last tracked pose.
+
+        Args:
+            timestamp: The stamp of the frame to come, seconds.
         """
-        if self._last is None:
-            return None
-        return se3.inverse(self._predicted(None))
+        return None if self._last is None else se3.inverse(self._predicted(self._last, timestamp))
 
-    def motion_covariance(self) -> Array | None:
+    def motion_covariance(self, timestamp: float) -> Array | None:
         """How far the camera's motion since the last frame may be from the predicted one.
+
+        Args:
+            timestamp: The stamp of the frame to come, seconds.
 
         Returns:
             Covariance ``[6, 6]`` of (position in the world in metres, rotation in the camera frame in radians); None
-            while lost or when nothing is known yet.
+            while lost, when nothing is known yet, and after a gap that nothing is assumed about.
         """
-        if self._motion is None or self.state != "ok":
+        if self._last is None or (dt := self._known_gap(self._last, timestamp)) is None or self._motion is None:
             return None
-        return self._motion.motion_covariance(self._dt, self.settings.motion)
+        return self._motion.motion_covariance(dt, self.settings.motion)
 
-    def _predicted(self, stamp: float | None) -> Array:
-        assert self._last is not None
-        dt = self._dt if stamp is None else stamp - self._last.timestamp
-        if self._motion is None or self.state != "ok" or not 0 < dt <= self.settings.motion.max_gap_s:
-            return self._last.T_cam_world
+    def _known_gap(self, last: Tracked, timestamp: float) -> float | None:
+        """Seconds since the last frame; None where the motion model says nothing of them."""
+        dt = timestamp - last.timestamp
+        known = self._motion is not None and self.state == "ok" and 0 < dt <= self.settings.motion.max_gap_s
+        return dt if known else None
+
+    def _predicted(self, last: Tracked, timestamp: float) -> Array:
+        dt = self._known_gap(last, timestamp)
+        if dt is None or self._motion is None:
+            return last.T_cam_world
         return self._motion.predicted(dt, self.settings.motion).T_cam_world
 
-    def _filtered(self, measured: Array, information: Array, dt: float) -> Array:
+    def _filtered(self, last: Tracked, timestamp: float, measured: Array, information: Array) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion."""
         s = self.settings.motion
         covariance = pose_covariance(measured, information, s.inflation)
-        if self._motion is None or self.state != "ok" or not 0 < dt <= s.max_gap_s:
+        dt = self._known_gap(last, timestamp)
+        if dt is None or self._motion is None:
             self._motion = MotionState.at(measured, covariance)
             return measured
-        self._dt = dt
         self._motion = self._motion.predicted(dt, s).updated(measured, covariance)
         return self._motion.T_cam_world if s.filter else measured
 
@@ -187,7 +201,7 @@ class RgbdBackend:
     ) -> Array:
         assert self._last is not None
         last = self._last
-        prediction = self._predicted(frame.timestamp)
+        prediction = self._predicted(last, frame.timestamp)
         matches, pose = self._first_pose(seen, last, prediction, stats)
         inliers: NDArray[np.bool_] = np.zeros(0, bool)
         residual = 0.0
@@ -220,8 +234,7 @@ class RgbdBackend:
         point = np.full(len(seen), -1, np.int64)
         point[matches.feature[inliers]] = points
         tracked = Tracked(seen, point, pose, frame.timestamp)
-        dt = frame.timestamp - last.timestamp
-        tracked.T_cam_world = self._filtered(pose, estimate.information, dt)
+        tracked.T_cam_world = self._filtered(last, frame.timestamp, pose, estimate.information)
         self.state = "ok"
         self._last = tracked
         near, _ = self.world.covisible_of(points)

@@ -6,7 +6,7 @@ Every published system runs this file; it differs only in its list of filters, i
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Protocol
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.steering import Steerable, Steering
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
 from dynslam_bench.culling.guard import restore_starved
@@ -69,9 +70,13 @@ class SlamPipeline:
         filters: Dynamic feature filters in the order of application.
         flow: Flow of the keypoints that are left to the previous image; run before the first filter that needs it.
         backend: Tracking and mapping.
-        guard: What the filters must leave.
+        settings: The system's complete settings; their group ``guard`` says what the filters must leave.
         cached: Stages that answer from the stage cache, by name (``features``, ``segmentation``); their times are
             reported as they are without it, and ``cached_stages`` in `stats` says how many answered from it.
+
+    Raises:
+        TrackerError: A filter needs a flow and there is none.
+        SettingsError: No part takes an online setting that has an effect.
     """
 
     def __init__(
@@ -82,7 +87,7 @@ class SlamPipeline:
         filters: Sequence[DynamicFilter],
         flow: FlowEstimator | None,
         backend: RgbdBackend,
-        guard: GuardSettings,
+        settings: Settings,
         cached: Mapping[str, CachedStage] | None = None,
     ) -> None:
         needing = [f.name for f in filters if "flow" in f.needs]
@@ -93,12 +98,14 @@ class SlamPipeline:
         self._filters = tuple(filters)
         self._flow = flow
         self._backend = backend
-        self._guard = guard
+        self._guard: GuardSettings = getattr(settings, "guard", GuardSettings())
+        self._steering = Steering(settings, self._takers(settings))
         self._cached = dict(cached or {})
         self._camera: Camera | None = None
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
-        """Begin a new sequence."""
+        """Begin a new sequence with the settings that the system was built with."""
+        self._steering.restore()
         self._camera = camera
         self._seed = derive_seed(rng)
         self._backend.reset(camera, seed=self._seed)
@@ -132,8 +139,8 @@ class SlamPipeline:
             previous=self._previous,
             previous_keep=self._previous_keep,
             T_world_prev=self._previous_pose,
-            T_world_pred=self._backend.predict(),
-            motion_covariance=self._backend.motion_covariance(),
+            T_world_pred=self._backend.predict(frame.timestamp),
+            motion_covariance=self._backend.motion_covariance(frame.timestamp),
             keyframes=self._backend.keyframe_views(KEYFRAMES_SHOWN),
             map_points=self._backend.map_points(),
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
@@ -200,14 +207,17 @@ class SlamPipeline:
         self._begun("map_outputs")
         return self._backend.outputs()
 
-    def update_settings(self, settings: Settings) -> None:
-        """Put new values of online settings into force from the next frame on.
+    def configure(self, settings: Settings) -> None:
+        """Put other values of online settings into force from the next frame on; `reset` undoes it.
 
-        Each part takes the group of the settings that bears its name: filters their own, ``features``, ``flow``,
-        ``backend``, ``guard`` and ``segmentation``, which also goes to the filters that have a ``segmentation``.
+        Args:
+            settings: The complete settings, of which only online fields differ from those it was built with.
         """
-        self._guard = getattr(settings, "guard", self._guard)
-        parts: list[tuple[str, Any]] = [(getattr(each, "group", each.name), each) for each in self._filters]
+        self._steering.configure(settings)
+
+    def _takers(self, settings: Settings) -> Iterator[tuple[str, Callable[[Any], None]]]:
+        """Each group of the settings with every part that takes it."""
+        parts: list[tuple[str, Any]] = [(group, each) for each in self._filters for group in groups_of(each)]
         parts += [
             ("features", self._extractor),
             ("segmentation", self._masks),
@@ -215,11 +225,13 @@ class SlamPipeline:
             ("backend", self._backend),
         ]
         for group, part in parts:
-            if part is not None and hasattr(part, "settings") and hasattr(settings, group):
-                part.settings = getattr(settings, group)
-        for each in self._filters:
-            if hasattr(each, "segmentation") and hasattr(settings, "segmentation"):
-                each.segmentation = settings.segmentation
+            if isinstance(part, Steerable) and hasattr(settings, group):
+                yield group, part.configure
+        if hasattr(settings, "guard"):
+            yield "guard", self._use_guard
+
+    def _use_guard(self, guard: GuardSettings) -> None:
+        self._guard = guard
 
     def _begun(self, method: str) -> Camera:
         if self._camera is None:
@@ -288,6 +300,11 @@ def _keys_of(flow: FlowEstimator, camera: Camera) -> dict[str, float]:
     """The flow's stats at zero, for frames without a previous one."""
     blank = flow.prepare(np.zeros((camera.height, camera.width), np.uint8))
     return dict.fromkeys(flow.track(blank, blank, np.full((1, 2), 100.0, np.float32)).stats, 0.0)
+
+
+def groups_of(each: DynamicFilter) -> tuple[str, ...]:
+    """The groups of settings that a filter takes; its name alone where it does not say."""
+    return tuple(getattr(each, "groups", (each.name,)))
 
 
 def _union(masks: list[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:

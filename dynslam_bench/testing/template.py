@@ -42,10 +42,15 @@ class @CLASS@:
     """Frame-to-frame visual odometry: corners of the last frame with depth, found again, solved as PnP."""
 
     def __init__(self, settings):
+        self.settings = self.built_with = settings
+
+    def configure(self, settings):
+        """Other values of the fields marked `online`, in force from the next frame on; `reset` undoes it."""
         self.settings = settings
 
     def reset(self, camera, *, rng):
         """A new sequence begins; all randomness must come from `rng`."""
+        self.settings = self.built_with
         self.camera = camera
         self.rng = rng
         self.last = None

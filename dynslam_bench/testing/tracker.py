@@ -19,6 +19,7 @@ from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_set
 
 from .report import ConformanceError, ConformanceReport, NotApplicable, require
 from .scenes import CornerSequence, hard_frames
+from .steering import check_steering
 
 Subject = TrackerSpec | str | Callable[[], Tracker]
 
@@ -83,6 +84,7 @@ def tracker_report(
     for name in hard_frames(scene[0]):
         report.run(f"{name} frame", lambda name=name: _hard_frame(run, name))  # type: ignore[misc]
     report.run("one frame", lambda: _one_frame(run))
+    report.run("steering", lambda: _steering(run, spec, settings, context))
     report.run("final trajectory", lambda: _finalize(run))
     report.run("closing", lambda: _closing(run))
     return report
@@ -287,6 +289,15 @@ def _one_frame(run: _Runner) -> None:
     if callable(finalize := getattr(tracker, "finalize", None)):
         _check_final(finalize(), run.frames[:1])
     _close(tracker)
+
+
+def _steering(
+    run: _Runner, spec: TrackerSpec | None, settings: Settings | Mapping[str, Any] | None, context: TrackerContext
+) -> None:
+    if spec is None or not spec.deterministic:
+        raise NotApplicable("no spec says what may be steered" if spec is None else "it is not deterministic")
+    start = settings if isinstance(settings, Settings) else resolve_settings(spec, settings)
+    check_steering(lambda given: build_tracker(spec, given, context), start, run.scene.camera, run.frames, run.seed)
 
 
 def _finalize(run: _Runner) -> None:

@@ -114,11 +114,31 @@ def test_bad_annotations_are_bugs_of_the_author():
     with pytest.raises(ValueError, match="log scale needs low > 0"):
         tunable(1.0, low=0.0, high=1.0, scale="log", meaning="")
 
-    class NoRange(Settings):
-        value: float = tunable(1.0, meaning="no range")
-
     with pytest.raises(TypeError, match=r"'value'.*needs low and high"):
-        parameters(NoRange)
+
+        class NoRange(Settings):
+            value: float = tunable(1.0, meaning="no range")
+
+
+def test_a_default_outside_its_range_is_a_bug_of_the_author():
+    with pytest.raises(TypeError, match=r"Outside: the default of 'value' is 1000.0, outside its range 0.2 to 10"):
+
+        class Outside(Settings):
+            value: float = tunable(1000.0, low=0.2, high=10.0, limits=(0.0, 1e4), meaning="x")
+
+    with pytest.raises(TypeError, match=r"Other: the default of 'epipolar.wide' is 9.0, outside its range 0.5 to 2"):
+
+        class Other(Root):
+            epipolar: Epipolar = Epipolar(wide=9.0)
+
+
+def test_a_group_with_other_defaults_is_described_with_them():
+    class Other(Root):
+        epipolar: Epipolar = Epipolar(threshold_px=2.5)
+
+    assert {p.name: p.default for p in parameters(Other)}["epipolar.threshold_px"] == 2.5
+    assert {p.name: p.default for p in parameters(Root)}["epipolar.threshold_px"] == 1.0
+    assert "| `epipolar.threshold_px` | `2.5` |" in settings_table(Other)
 
 
 def test_did_you_mean():

@@ -43,19 +43,19 @@ def test_back_end_is_surer_of_the_motion_once_it_knows_the_speed_and_says_nothin
     words = rng.integers(0, 256, (400, 32), dtype=np.uint8)
     backend = RgbdBackend()
     backend.reset(CAMERA, seed=0)
-    assert backend.motion_covariance() is None
+    assert backend.motion_covariance(0.0) is None
     ones, weight = np.ones(400, bool), np.ones(400, np.float32)
     widths = []
     for i in range(6):
         pose = se3.exp(np.array([0.003 * i, 0, 0, 0, 0, 0]))
         result = backend.track(_frame(points, words, pose, i / 30), ones, weight)
         assert result.state == "ok"
-        covariance = backend.motion_covariance()
+        covariance = backend.motion_covariance((i + 1) / 30)
         widths.append(np.nan if covariance is None else float(np.sqrt(covariance[:3, :3].trace())))
     assert widths[-1] < 0.5 * np.nanmax(widths) and widths[-1] < 0.01
     blind = _frame(points, rng.integers(0, 256, (400, 32), dtype=np.uint8), np.eye(4), 6 / 30)
     assert backend.track(blind, ones, weight).state == "lost"
-    assert backend.motion_covariance() is None
+    assert backend.motion_covariance(7 / 30) is None
 
 
 def test_information_turns_with_the_camera() -> None:

@@ -125,15 +125,16 @@ class ToyTracker:
     """Knows the toy camera's motion and adds seeded noise; misbehaves from frame `at` to `until` if told to."""
 
     def __init__(self, settings: ToySettings) -> None:
-        self.settings = settings
+        self.settings = self._built = settings
         self.closed = False
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         assert camera.width > 0
+        self.settings = self._built
         self._rng = rng
         self._poses: dict[float, np.ndarray] = {}
 
-    def update_settings(self, settings: ToySettings) -> None:
+    def configure(self, settings: ToySettings) -> None:
         self.settings = settings
 
     def track(self, frame: Frame) -> TrackResult:

@@ -11,7 +11,9 @@ from envs_toys import TARGET, ToySequence
 
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.steering import steerable_parameters
 from dynslam_bench.envs import ActionMap, SlamEnv
+from dynslam_bench.trackers.specs import all_specs
 
 
 class Group(Settings):
@@ -52,6 +54,47 @@ def test_encoding_is_the_inverse() -> None:
         assert again.group.model_dump(exclude={"linear", "log"}) == settings.group.model_dump(exclude={"linear", "log"})
         assert again.group.linear == pytest.approx(settings.group.linear, abs=1e-6)
         assert again.group.log == pytest.approx(settings.group.log, rel=1e-6)
+
+
+def test_the_neutral_action_is_the_settings_bit_for_bit() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        settings = Root(
+            group=Group(
+                linear=rng.uniform(0, 4), log=10 ** rng.uniform(-2, 2), count=int(rng.integers(1, 6)),
+                log_count=int(rng.integers(1, 65)), flag=bool(rng.integers(2)), kind=rng.choice(list("abc")).item(),
+            )
+        )  # fmt: skip
+        actions = ActionMap(settings, NAMES)
+        assert actions.settings(actions.neutral) == settings
+        assert actions.settings(actions.neutral.astype(np.float64)) == settings
+        moved = actions.neutral
+        moved[0] = 1.0 if moved[0] < 0 else -1.0  # one coordinate: the others stay exactly as they are
+        changed = actions.settings(moved)
+        assert changed.group.linear in (0.0, 4.0)
+        assert changed.group.model_copy(update={"linear": settings.group.linear}) == settings.group
+
+
+def test_every_neutral_action_of_every_tracker_is_its_default() -> None:
+    count = 0
+    for spec in all_specs():
+        names = [parameter.name for parameter in steerable_parameters(spec.settings())]
+        actions = ActionMap(spec.settings(), names)
+        assert actions.settings(actions.neutral) == spec.settings() if names else not actions.parameters
+        count += len(names)
+    assert count > 500
+
+
+class Wide(Settings):
+    on: bool = tunable(True, meaning="x")
+    value: float = tunable(1.0, low=0.2, high=10.0, limits=(0.0, 1e4), online=True, when={"on": [True]}, meaning="x")
+
+
+def test_what_an_action_could_not_keep_or_would_not_change_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"'value' in control is 1000, actions span 0.2 to 10"):
+        ActionMap(Wide(value=1000.0), ["value"])
+    with pytest.raises(SettingsError, match="'value' in control has no effect: on is False"):
+        ActionMap(Wide(on=False), ["value"])
 
 
 def test_every_choice_has_an_equal_share() -> None:

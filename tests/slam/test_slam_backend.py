@@ -221,13 +221,43 @@ def test_tracks_on_through_frames_without_depth(room, tracked):
 
 def test_prediction_is_the_motion_models(room, tracked):
     backend = make(room)
-    assert backend.predict() is None
+    assert backend.predict(0.0) is None
     truth = room.path(20)
     results = tracked(backend, [room.see(pose, i) for i, pose in enumerate(truth[:19])])
     start = results[0].T_world_cam @ se3.inverse(truth[0])
-    ahead = np.linalg.norm((se3.inverse(start @ truth[19]) @ backend.predict())[:3, 3])
+    ahead = np.linalg.norm((se3.inverse(start @ truth[19]) @ backend.predict(19 / 30))[:3, 3])
     stay = np.linalg.norm((se3.inverse(truth[19]) @ truth[18])[:3, 3])
     assert ahead < 0.6 * stay
+
+
+def test_the_prediction_is_for_the_time_of_the_frame_not_for_the_interval_before(room, tracked):
+    """Intervals of one, two and four thirtieths in turn, as when frames are dropped."""
+    steps = np.cumsum([0, *([1, 2, 4] * 10)])
+    path = room.path(int(steps[-1]) + 1)
+    backend, ahead, old = make(room), [], []
+    start = np.eye(4)
+    for number, step in enumerate(steps):
+        stamp, before = step / 30.0, steps[number - 1] / 30.0
+        if number > 6:
+            truth = start @ path[step]
+            previous = before - steps[number - 2] / 30.0
+            ahead.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(stamp))[:3, 3]))
+            old.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(before + previous))[:3, 3]))
+            shorter, longer = backend.motion_covariance(stamp), backend.motion_covariance(stamp + 1 / 30)
+            assert np.trace(shorter) < np.trace(longer)
+        (result,) = tracked(backend, [room.see(path[step], number, stamp=stamp)])
+        if number == 0:
+            start = result.T_world_cam @ se3.inverse(path[0])
+    assert np.mean(ahead) < 0.5 * np.mean(old), (np.mean(ahead), np.mean(old))
+
+
+def test_nothing_is_assumed_of_a_long_gap(room, tracked):
+    backend = make(room)
+    last = tracked(backend, [room.see(pose, i) for i, pose in enumerate(room.path(12))])[-1].T_world_cam
+    assert backend.motion_covariance(12 / 30) is not None
+    beyond = 11 / 30 + backend.settings.motion.max_gap_s + 1e-6
+    assert backend.motion_covariance(beyond) is None
+    np.testing.assert_allclose(backend.predict(beyond), last, atol=1e-12)
 
 
 def test_views_and_points_fit_each_other(room, tracked):

@@ -1,10 +1,13 @@
 """Each check finds the fault that it is for, and names it."""
 
+import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.culling.filter import FilterResult
 from dynslam_bench.geometry.se3 import inverse
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -52,8 +55,8 @@ def gave(change):
 
 def test_a_good_tracker_passes():
     report = tracker_report(Good, frames=4)
-    assert report.ok and {check.status for check in report.checks} == {"passed"}
-    assert len(report.checks) == 15
+    assert report.ok and {c.status for c in report.checks if c.name != "steering"} == {"passed"}
+    assert len(report.checks) == 16
 
 
 class Drifting:
@@ -288,3 +291,79 @@ def test_faulty_segmenters(change, words):
 
 def test_a_good_segmenter_passes():
     check_segmenter(type("Segmenter", (), {"segment": lambda self, frame: instances(frame)}))
+
+
+class Online(Settings):
+    shift: float = tunable(0.0, low=0.0, high=1.0, online=True, meaning="added to a statistic")
+
+
+class Steered(Good):
+    """Obeys and forgets, as it should."""
+
+    def __init__(self, settings):
+        self.settings = self.built_with = settings
+
+    def configure(self, settings):
+        self.settings = settings
+
+    def reset(self, camera, *, rng):
+        super().reset(camera, rng=rng)
+        self.settings = self.built_with
+
+    def track(self, frame):
+        return replace(super().track(frame), stats={"shift": self.settings.shift})
+
+
+class Fixed(Steered):
+    configure = None
+
+
+class Deaf(Steered):
+    def configure(self, settings):
+        pass
+
+
+class Leaky(Steered):
+    def reset(self, camera, *, rng):
+        Good.reset(self, camera, rng=rng)
+
+
+class Late(Steered):
+    """Obeys one frame late."""
+
+    def track(self, frame):
+        before, self.seen = getattr(self, "seen", self.settings), self.settings
+        return replace(Good.track(self, frame), stats={"shift": before.shift})
+
+    def reset(self, camera, *, rng):
+        super().reset(camera, rng=rng)
+        self.seen = self.settings
+
+
+class Inert(Steered):
+    def track(self, frame):
+        return Good.track(self, frame)
+
+
+def steering_of(tracker):
+    module = sys.modules[tracker.__module__]
+    setattr(module, tracker.__name__, tracker)
+    spec = TrackerSpec("t", f"{__file__}:{tracker.__name__}", "T", settings=Online)
+    (check,) = [c for c in tracker_report(spec, frames=4).checks if c.name == "steering"]
+    return check
+
+
+@pytest.mark.parametrize(
+    ("tracker", "status", "words"),
+    [
+        (Steered, "passed", ""),
+        (Fixed, "failed", "marked online: shift; but a Fixed has no configure"),
+        (Deaf, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (Leaky, "failed", "reset.. does not bring back the settings: frame 0, shift"),
+        (Late, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (Inert, "skipped", "shift change nothing on this scene"),
+    ],
+)
+def test_steering_is_checked(tracker, status, words):
+    check = steering_of(tracker)
+    assert check.status == status and re.search(words, check.message), check

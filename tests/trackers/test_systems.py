@@ -129,7 +129,7 @@ def test_online_settings_come_into_force_at_once(walking) -> None:
     tracker.reset(walking.camera, rng=np.random.default_rng(0))
     before = tracker.track(walking[0]).stats["mask_fraction"]
     wider = spec.settings.model_validate({"segmentation": {"source": "oracle", "dilation_px": 60}})
-    tracker.update_settings(wider)
+    tracker.configure(wider)
     assert tracker.track(walking[1]).stats["mask_fraction"] > 1.2 * before
 
 
@@ -143,7 +143,7 @@ def test_online_segmentation_settings_reach_every_filter(walking) -> None:
         )
         assert isinstance(tracker, SlamPipeline)
         changed = spec.settings.model_validate({"segmentation": {"source": "oracle", "confidence": 0.77}})
-        tracker.update_settings(changed)
+        tracker.configure(changed)
         for each in tracker._filters:
             for held in (getattr(each, "segmentation", None), getattr(each, "settings", None)):
                 if isinstance(held, SegmentationSettings):

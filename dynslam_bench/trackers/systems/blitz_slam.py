@@ -20,7 +20,7 @@ class BlitzSlamSettings(SemanticSystemSettings):
 
     segmentation: SegmentationSettings = SegmentationSettings(dilation_px=0)
     depth_blocks: DepthBlockSettings = DepthBlockSettings()
-    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.5, outside_px=1000.0)
+    box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.5, test_outside=False)
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 

@@ -86,6 +86,7 @@ def compose(
 
     Raises:
         SegmentationError: The semantic source is not available.
+        SettingsError: The settings hold an online setting that has an effect and that no part takes.
     """
     from dynslam_bench.core.cache import StageCache
     from dynslam_bench.features.build import build_extractor
@@ -130,6 +131,6 @@ def compose(
         backend=RgbdBackend(
             settings.backend, scale_factor=settings.features.scale_factor, levels=settings.features.levels
         ),
-        guard=settings.guard,
+        settings=settings,
         cached=cached,
     )

@@ -1,0 +1,93 @@
+"""What episodes earn, over random ones: with `neg_pose_error`, getting lost never pays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dynslam_bench.envs.reward import reward_named
+from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+
+EPISODES = 12
+
+
+def walk(rng: np.random.Generator, step: float, frames: int = 40) -> np.ndarray:
+    """Random poses ``[N, 4, 4]``; `step` metres and radians a frame."""
+    poses = [se3.exp(rng.normal(size=6))]
+    for _ in range(frames - 1):
+        poses.append(poses[-1] @ se3.exp(rng.normal(0, step, 6)))
+    return np.array(poses)
+
+
+def episode(seed: int) -> tuple[Trajectory, np.ndarray, np.ndarray]:
+    """A true path with holes, estimates that drift little or wildly, and which frames are tracked."""
+    rng = np.random.default_rng(seed)
+    true = walk(rng, 0.02)
+    drift = np.cumsum(rng.normal(0, 10 ** rng.uniform(-4, 0), (len(true), 6)), axis=0)
+    stamps = np.arange(len(true)) / 30.0
+    known = rng.random(len(true)) > rng.choice([0.0, 0.3])
+    known[0] = True
+    return Trajectory(stamps[known], true[known]), true @ se3.exp(drift), rng.random(len(true)) > rng.choice([0.0, 0.4])
+
+
+def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
+    error, reward = OnlineError(truth), reward_named(name)
+    stamps = np.arange(len(poses)) / 30.0
+    return np.array([reward(error.update(*frame)) for frame in zip(stamps, poses, tracked, strict=True)])
+
+
+@pytest.mark.parametrize("seed", range(EPISODES))
+def test_losing_a_tracked_frame_raises_no_frames_reward(seed: int) -> None:
+    """Of every frame but the one that begins the frame of reference, alone, and from it on to the end."""
+    truth, poses, tracked = episode(seed)
+    earned = rewards("neg_pose_error", truth, poses, tracked)
+    first = int(np.argmax(tracked))
+    for frame in range(first + 1, len(poses)):
+        once, ever = tracked.copy(), tracked.copy()
+        once[frame] = ever[frame:] = False
+        for lost in (once, ever):
+            assert (rewards("neg_pose_error", truth, poses, lost) <= earned + 1e-12).all()
+
+
+@pytest.mark.parametrize("seed", range(EPISODES))
+def test_no_episode_earns_less_than_one_that_is_lost_throughout(seed: int) -> None:
+    truth, poses, tracked = episode(seed)
+    nothing = rewards("neg_pose_error", truth, poses, np.zeros(len(poses), bool))
+    way = np.r_[0, np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))]
+    known = np.isin(np.arange(len(poses)) / 30.0, truth.timestamps)
+    assert nothing[known] == pytest.approx(-way, abs=1e-12) and not nothing[~known].any()
+    assert (rewards("neg_pose_error", truth, poses, tracked) >= nothing - 1e-12).all()
+    still = rewards("neg_pose_error", truth, np.repeat(np.eye(4)[None], len(poses), axis=0), np.ones(len(poses), bool))
+    assert (still >= nothing - 1e-12).all()
+
+
+def test_a_tracker_that_drifts_does_not_gain_by_giving_up_half_way() -> None:
+    """The case that showed it: the held pose is nearer than the drifted one, and giving up earned half the penalty."""
+    stamps = np.arange(400) / 30.0
+    true = np.repeat(np.eye(4)[None], 400, axis=0)
+    true[:, 0, 3] = 0.3 * np.sin(stamps)
+    poses = true.copy()
+    poses[:, 1, 3] += 0.2 * stamps
+    truth = Trajectory(stamps, true)
+    tracked = np.ones(400, bool)
+    whole = rewards("neg_pose_error", truth, poses, tracked).sum()
+    tracked[100:] = False
+    assert rewards("neg_pose_error", truth, poses, tracked).sum() < whole < -100
+
+
+@pytest.mark.parametrize("seed", range(EPISODES))
+def test_under_neg_rpe_a_lost_frame_earns_the_true_motion_and_a_wrong_motion_may_earn_less(seed: int) -> None:
+    truth, poses, tracked = episode(seed)
+    known = np.isin(np.arange(len(poses)) / 30.0, truth.timestamps)
+    motion = np.zeros(len(poses))
+    true = np.full((len(poses), 4, 4), np.nan)
+    true[known] = truth.T_world_cam
+    both = np.flatnonzero(known[1:] & known[:-1]) + 1
+    motion[both] = np.linalg.norm((se3.inverse(true[both - 1]) @ true[both])[:, :3, 3], axis=1)
+    earned = rewards("neg_rpe", truth, poses, tracked)
+    lost = ~tracked
+    lost[1:] |= ~tracked[:-1]
+    lost[0] = False
+    assert earned[lost] == pytest.approx(-motion[lost], abs=1e-12)

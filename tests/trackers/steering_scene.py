@@ -1,0 +1,105 @@
+"""A short, small excerpt on which nearly every online setting of every tracker shows, and a segmenter that errs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.segmentation.instances import Instances
+from dynslam_bench.segmentation.oracle import instances_of
+from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.frame import Frame, FrameMasks
+from dynslam_bench.slam.result import TrackResult
+from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
+from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
+
+STRIDE = 3
+FRAMES = 14
+
+
+class SmallScene:
+    """Every third frame of a rendered sequence at half the resolution, in memory.
+
+    Attributes:
+        id: Of the whole sequence.
+        frames: Numbered from 0.
+        camera: At half the resolution.
+    """
+
+    def __init__(self, name: str = "synthetic/walking_xyz@103", frames: int = FRAMES, stride: int = STRIDE) -> None:
+        whole = open_sequence(f"{name}?frames={frames * stride}")
+        self.id = whole.id
+        self.camera = whole.camera.resized(whole.camera.width // 2, whole.camera.height // 2)
+        self.frames = []
+        self._masks = []
+        for number in range(frames):
+            frame, masks = whole[number * stride], whole.masks[number * stride]
+            rgb = frame.rgb.reshape(self.camera.height, 2, self.camera.width, 2, 3).mean(axis=(1, 3))
+            self.frames.append(Frame(number, frame.timestamp, rgb.astype(np.uint8), frame.depth[::2, ::2].copy()))
+            self._masks.append(FrameMasks(masks.instances[::2, ::2].copy(), masks.class_names, masks.moving))
+
+    def __getitem__(self, index: int) -> FrameMasks:
+        """The masks of a frame: the scene is its own `MaskSource`."""
+        return self._masks[index]
+
+
+class Erring:
+    """Sees the true objects with scores of all sizes, the same for the same frame, and misses some."""
+
+    def __init__(self, masks: SmallScene) -> None:
+        self._masks = masks
+
+    def segment(self, frame: Frame) -> Instances:
+        """The objects of a frame."""
+        true = instances_of(self._masks[frame.index], where="the scene")
+        draw = np.random.default_rng([3, frame.index]).uniform(size=(2, len(true)))
+        scores = np.where(draw[0] < 0.25, 0.15 + 0.3 * draw[1], 0.55 + 0.4 * draw[1])
+        found = np.flatnonzero(draw[1] > 0.15)
+        names = tuple(true.class_names[index] for index in found)
+        return Instances(true.masks[found], true.boxes[found], names, scores[found].astype(np.float32))
+
+
+def build_erring(settings: Settings, context: SegmenterContext) -> Erring:
+    """The factory of the segmenter plug-in."""
+    return Erring(context.masks)
+
+
+SEGMENTER = SegmenterSpec("erring", f"{__file__}:build_erring")
+
+
+def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
+    """A tracker for the scene, with fewer features as its images are smaller."""
+    given: dict[str, object] = {"features.n_features": 500, "features.levels": 4}
+    if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto":
+        given |= {"segmentation.dilation_px": 4, "segmentation.source": f"plugin:{__file__}:SEGMENTER"}
+    return build_tracker(spec, given | settings, TrackerContext(sequence_id=scene.id, masks=scene))
+
+
+def play(
+    tracker, scene: SmallScene, frames: int = FRAMES, before: Callable[[int], None] | None = None
+) -> list[TrackResult]:
+    """Reset a tracker and track the scene; `before` is called before each frame, with its number."""
+    tracker.reset(scene.camera, rng=np.random.default_rng(0))
+    results = []
+    for frame in scene.frames[:frames]:
+        if before is not None:
+            before(frame.index)
+        results.append(tracker.track(frame))
+    return results
+
+
+def difference(first: list[TrackResult], second: list[TrackResult]) -> str:
+    """The first thing in which two episodes differ, bit for bit; empty if in none."""
+    for index, (a, b) in enumerate(zip(first, second, strict=True)):
+        if a.state != b.state:
+            return f"frame {index}: states {a.state} and {b.state}"
+        for name in ("T_world_cam", "keypoints_xy", "keypoints_keep", "dynamic_mask"):
+            if not np.array_equal(getattr(a, name), getattr(b, name)):
+                return f"frame {index}: {name}"
+        if dict(a.stats) != dict(b.stats):
+            changed = [key for key in a.stats if a.stats[key] != b.stats.get(key)]
+            return f"frame {index}: stats {changed[:4]}"
+    return ""

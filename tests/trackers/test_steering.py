@@ -1,0 +1,141 @@
+"""Steering acts as building with the same value does, ends with the episode, and is refused where nothing takes it.
+
+An episode steered from before its first frame is the episode of a tracker built with those settings, bit for bit; one
+after `reset` is that of a fresh tracker. All online settings of a tracker at once, and each by itself where it shows.
+"""
+
+from __future__ import annotations
+
+import pytest
+from steering_scene import SmallScene, construct, difference, play
+
+from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.settings import Parameter, Settings, apply_overrides, tunable
+from dynslam_bench.core.steering import Steering, steerable_parameters
+from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.systems.composition import SystemSettings
+
+SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
+SHORT = 8
+"""Frames of the episodes in which all settings of a tracker are steered at once."""
+
+
+def online() -> dict[str, tuple[str, Parameter]]:
+    """Every online setting, with the first tracker in which it has an effect."""
+    found: dict[str, tuple[str, Parameter]] = {}
+    for spec in SYSTEMS.values():
+        for parameter in steerable_parameters(spec.settings()):
+            found.setdefault(parameter.name, (spec.id, parameter))
+    return found
+
+
+ONLINE = online()
+KEYFRAMES = {"backend.keyframes.tracked_share": 1.0, "free_space.min_share": 0.0}
+CASES: dict[str, tuple[str, dict[str, object]]] = {
+    "backend.keyframes.view_share": ("orb-slam2", {
+        "backend.keyframes.tracked_share": 0.4, "backend.keyframes.new_close": 400,
+        "backend.keyframes.moved_share": 0.8,
+    }),
+    "backend.keyframes.moved_share": ("orb-slam2", {
+        "backend.keyframes.tracked_share": 0.95, "backend.keyframes.new_close": 400,
+        "backend.keyframes.established": 5, "backend.keyframes.view_share": 0.5,
+    }),
+    "epipolar.threshold_px": ("emfoa-oft-object", {}),
+    "epipolar.min_share": ("emfoa-oft-paper-no-masks", {}),
+    "free_space.threshold_m": ("emfoa-oft-no-masks", {
+        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,
+    }),
+    "free_space.threshold_sigma": ("emfoa-oft-no-masks", {
+        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01,
+    }),
+    "free_space.min_votes": ("emfoa-oft-no-masks", {
+        **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
+    }),
+}  # fmt: skip
+"""Where a setting shows on the excerpt, if not in the first tracker that has it: the tracker and what else is set."""
+UNSEEN: frozenset[str] = frozenset()
+"""Settings that change nothing on the excerpt, built with or steered: nothing is proved of them here."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SmallScene:
+    return SmallScene()
+
+
+def settings_of(tracker) -> Settings:
+    return tracker._steering._built
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene) -> None:
+    spec = SYSTEMS[name]
+    tracker = construct(spec, scene)
+    settings = settings_of(tracker)
+    ends = {p.name: p.low if number % 2 else p.high for number, p in enumerate(steerable_parameters(settings))}
+    ends |= {"features.fast_threshold": 12, "features.fast_threshold_min": 3}
+    extreme = apply_overrides(settings, ends)
+    fresh = play(tracker, scene, SHORT)
+    steered = play(tracker, scene, SHORT, before=lambda number: tracker.configure(extreme) if number == 0 else None)
+    again = play(tracker, scene, SHORT)
+    static = play(construct(spec, scene, **ends), scene, SHORT)
+    assert difference(fresh, static), "the extremes change nothing at all"
+    assert not difference(static, steered), "steered is not what building with the same values gives"
+    assert not difference(fresh, again), "reset() leaves something of the steered episode"
+
+
+@pytest.mark.parametrize("name", ONLINE)
+def test_each_setting_acts_when_steered_where_it_acts_when_built_with(name: str, scene: SmallScene) -> None:
+    parameter = ONLINE[name][1]
+    system, others = CASES.get(name, (ONLINE[name][0], {}))
+    tracker = construct(SYSTEMS[system], scene, **others)
+    settings = settings_of(tracker)
+    fresh = play(tracker, scene)
+    for value in (parameter.low, parameter.high):
+        static = play(construct(SYSTEMS[system], scene, **others, **{name: value}), scene)
+        if not difference(fresh, static):
+            continue
+        changed = apply_overrides(settings, {name: value})
+        steered = play(tracker, scene, before=lambda number: tracker.configure(changed) if number == 0 else None)
+        assert not difference(static, steered), f"{system}: {name} = {value:g}"
+        assert name not in UNSEEN, "it shows: take it off the list"
+        return
+    assert name in UNSEEN, f"{name} changes nothing in {system}, at {parameter.low:g} and at {parameter.high:g}"
+
+
+def test_a_setting_is_in_force_from_the_very_next_frame(scene: SmallScene) -> None:
+    """Both ways, in mid-episode: what lies on people is judged by the confidence that was asked for."""
+    tracker = construct(SYSTEMS["mask-rcnn"], scene, **{"segmentation.compensate": 0})
+    sure, any_ = (apply_overrides(settings_of(tracker), {"segmentation.confidence": c}) for c in (0.9, 0.1))
+    asked = [any_, any_, sure, any_, sure, sure, any_]
+    results = play(tracker, scene, len(asked), before=lambda number: tracker.configure(asked[number]))
+    always = {id(each): play(tracker, scene, len(asked), before=lambda _, s=each: tracker.configure(s)) for each in (sure, any_)}
+    counts = [result.stats["semantic_objects"] for result in results]
+    assert counts == [always[id(each)][number].stats["semantic_objects"] for number, each in enumerate(asked)]
+    assert len({tuple(r.stats["semantic_objects"] for r in each) for each in always.values()}) == 2
+
+
+def test_only_what_differs_is_handed_on() -> None:
+    class Part(Settings):
+        value: float = tunable(1.0, low=0.0, high=2.0, online=True, meaning="x")
+
+    class Whole(Settings):
+        one: Part = Part()
+        two: Part = Part()
+
+    given: list[tuple[str, float]] = []
+    takers = [(name, lambda s, name=name: given.append((name, s.value))) for name in ("one", "two")]
+    steering = Steering(Whole(), takers)
+    steering.configure(Whole(two=Part(value=2.0)))
+    steering.configure(Whole(two=Part(value=2.0)))
+    assert given == [("two", 2.0)]
+    steering.restore()
+    assert given[1:] == [("one", 1.0), ("two", 1.0)]
+    with pytest.raises(SettingsError, match=r"'two.value' of Whole is taken by no part .*configure\(settings\)"):
+        Steering(Whole(), takers[:1])
+
+
+def test_what_is_switched_off_needs_nobody_who_takes_it() -> None:
+    names = {p.name.split(".")[0] for p in steerable_parameters(SYSTEMS["emfoa-oft-no-masks"].settings())}
+    assert "segmentation" not in names and {"flow", "motion"} <= names
+    names = {p.name.split(".")[0] for p in steerable_parameters(SYSTEMS["emfoa-oft-no-depth-test"].settings())}
+    assert not {"motion", "free_space"} & names
