@@ -152,7 +152,7 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
     for name, field in _leaves(type(settings)):
         extra = field.json_schema_extra
         note = extra.get(_NAMES) if isinstance(extra, dict) else None
-        value = _get(settings, name)
+        value = value_of(settings, name)
         if isinstance(note, dict):
             value = value or os.environ.get(str(note["otherwise"]), "")
             found[name] = (str(note["kind"]), str(value))

@@ -104,7 +104,10 @@ class MultiViewSettings(Settings):
         "nearest", meaning="which keyframes are asked (the paper means nearest, the code takes farthest)"
     )
     references: int = tunable(5, low=1, high=10, limits=(1, 20), meaning="keyframes that are asked")
-    min_keyframes: int = tunable(5, low=1, high=10, limits=(1, 20), meaning="keyframes before the test is active")
+    min_keyframes: int = tunable(
+        1, low=1, high=10, limits=(1, 20),
+        meaning="keyframes before the test is active (not stated in the paper; the code waits for 5)",
+    )  # fmt: skip
     max_parallax_deg: float = tunable(
         30.0, low=10.0, high=60.0, limits=(1.0, 180.0), unit="deg", meaning="largest angle between the two views"
     )
@@ -120,6 +123,10 @@ class MultiViewSettings(Settings):
     dilation_px: int = tunable(
         15, low=0, high=30, limits=(0, 100), unit="px", meaning="radius by which the result is grown"
     )
+    border_px: int = tunable(
+        15, low=0, high=30, limits=(0, 100), unit="px",
+        meaning="further radius within which features at the result's border are dropped (the code does so)",
+    )  # fmt: skip
 
 
 class DepthRansacSettings(Settings):
@@ -137,7 +144,10 @@ class CorrelationSettings(Settings):
     """B7, Dai et al.'s point correlations on a Delaunay graph."""
 
     window: int = tunable(
-        8, low=2, high=20, limits=(1, 60), unit="frames", meaning="frames between the observations that are compared"
+        8, low=2, high=20, limits=(1, 60), unit="frames", meaning="largest age of the observation that is compared"
+    )
+    settled: int = tunable(
+        4, low=1, high=10, limits=(1, 60), unit="frames", meaning="age from which a point's edges make up components"
     )
     quantile: float = tunable(
         0.95, low=0.8, high=0.999, limits=(0.5, 0.99999), online=True, meaning="chi-square quantile that cuts an edge"

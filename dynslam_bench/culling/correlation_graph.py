@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -27,15 +25,21 @@ _WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 class CorrelationFilter(DynamicFilter):
     """Drops the points outside the largest rigid component of a Delaunay graph.
 
-    An edge compares the vector between its two points now with the one `window` frames ago; it is cut where the
-    Mahalanobis distance of the difference exceeds the chi-square quantile. Vectors are compared in the world frame
-    under the predicted pose: only its rotation matters. Stats: ``dropped``, ``tracked``, ``edges``, ``cut``,
-    ``components``.
+    An edge compares the vector between its two points now with that in the oldest frame, at most `window` frames ago,
+    in which both were observed; it is cut where the Mahalanobis distance of the difference exceeds the chi-square
+    quantile. Vectors are compared in the world frame: only the rotations of the poses matter.
+
+    The graph's components are those of its settled points, observed over at least `settled` frames: one edge that is
+    too young to show a motion would join two bodies. A younger point joins the static body if it agrees with at least
+    as many of the settled points around it as it contradicts. A point that was a keypoint in the last frame inherits
+    that one's observations; any other point has been where its flow ends, at the depth that the last frame has there.
+
+    Stats: ``dropped``, ``tracked`` (points judged), ``settled``, ``edges``, ``cut``, ``components`` (of the settled).
     """
 
     name = "correlation"
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
-    provenance: Provenance = "faithful-paper"
+    provenance: Provenance = "inspired"
 
     def __init__(self, settings: CorrelationSettings) -> None:
         self.settings = settings
@@ -43,48 +47,98 @@ class CorrelationFilter(DynamicFilter):
 
     def reset(self, camera: Camera | None) -> None:
         """Forget all tracks."""
-        self._history: deque[NDArray[np.float64]] = deque()
+        self._past = np.zeros((0, 0, 12))  # [frames ago - 1, point of the previous frame, position and covariance]
+        self._last: NDArray[np.float64] | None = None  # the previous frame's points in its camera
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Build the graph over the points that were tracked for the whole window."""
+        """Build the graph over the points that have been observed before."""
         keep = np.ones(len(frame), dtype=bool)
-        stats = dict.fromkeys(("tracked", "edges", "cut", "components"), 0.0)
-        now = self._observe(frame, state)  # positions and their covariances
-        link = link_to_previous(frame, state)
-        if self._history and (state.previous is None or len(self._history[-1]) != len(state.previous)):
-            self._history.clear()
-        carried = deque(_follow(past, link) for past in self._history)
-        self._history = carried
-        self._history.append(now)
-        while len(self._history) > self.settings.window + 1:
-            self._history.popleft()
-        then = self._history[0]
-        rows = np.flatnonzero(np.isfinite(now).all(axis=1) & np.isfinite(then).all(axis=1))
-        stats["tracked"] = float(len(rows))
-        if len(self._history) < 2 or len(rows) < MIN_POINTS:
+        stats = dict.fromkeys(("tracked", "settled", "edges", "cut", "components"), 0.0)
+        local = self._observe(frame.xy, frame.keypoints.xy, frame.z, frame.depth, state.camera)
+        past = self._recall(frame, state)
+        self._past, self._last = past, local
+        if state.T_world_pred is None or not len(past):
             return FilterResult.of(keep, stats)
-        edges = _delaunay_edges(frame.xy[rows])
-        change = _edge(now[rows], edges) - _edge(then[rows], edges)
-        covariance = (now[rows, 3:] + then[rows, 3:]).reshape(-1, 3, 3)
-        total = covariance[edges[:, 0]] + covariance[edges[:, 1]]
-        distance = (change * np.linalg.solve(total, change[:, :, None])[:, :, 0]).sum(axis=1)
-        whole = distance <= chi2.ppf(self.settings.quantile, 3)
-        stats |= {"edges": float(len(edges)), "cut": float(np.count_nonzero(~whole))}
-        kept, stats["components"] = self._static_component(edges[whole], now[rows, :3])
-        keep[rows[~kept]] = False
+        now = _in_world(local, state.T_world_pred)
+        known = np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1)
+        rows = np.flatnonzero(known.any(axis=0))
+        if len(rows) < MIN_POINTS:
+            return FilterResult.of(keep, stats)
+        age = len(past) - known[::-1, rows].argmax(axis=0)
+        settled = age >= min(self.settings.settled, len(past))
+        now, past, known, xy = now[rows], past[:, rows], known[:, rows], frame.xy[rows]
+        static, cut, total = np.ones(len(rows), dtype=bool), 0, 0
+        old = np.flatnonzero(settled)
+        stats |= {"tracked": float(len(rows)), "settled": float(len(old))}
+        if len(old) < MIN_POINTS:
+            return FilterResult.of(keep, stats)
+        edges = _delaunay_edges(xy[old])
+        whole = self._agree(now[old], past[:, old], known[:, old], edges)
+        static[old], stats["components"] = self._static_component(edges[whole], now[old, :3])
+        total, cut = len(edges), int(np.count_nonzero(~whole))
+        if len(old) < len(rows):
+            edges = _delaunay_edges(xy)
+            edges = edges[settled[edges].sum(axis=1) == 1]
+            edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)  # the younger point first
+            whole = self._agree(now, past, known, edges)
+            total, cut = total + len(edges), cut + int(np.count_nonzero(~whole))
+            vote = np.where(static[edges[:, 1]], np.where(whole, 1, -1), np.where(whole, -1, 0))
+            static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
+        stats |= {"edges": float(total), "cut": float(cut)}
+        keep[rows[~static]] = False
         return FilterResult.of(keep, stats)
 
-    def _observe(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
-        """World points and their covariances ``[N, 3 + 9]`` under the predicted pose; NaN without depth or pose."""
-        pose = np.eye(4) if state.T_world_pred is None and state.previous is None else state.T_world_pred
-        seen = np.full((len(frame), 12), np.nan)
-        valid = frame.z > 0
-        if pose is not None and valid.any():
-            seen[valid, :3] = se3.transform(pose, state.camera.unproject(frame.xy[valid], frame.z[valid]))
-            variance = depth_variance(frame.depth, frame.keypoints.xy[valid])
-            local = point_covariance(frame.xy[valid], frame.z[valid], variance, state.camera, self.settings.pixel_sigma)
-            seen[valid, 3:] = (pose[:3, :3] @ local @ pose[:3, :3].T).reshape(-1, 9)
+    def _recall(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
+        """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
+        previous, pose, flow = state.previous, state.T_world_prev, state.flow
+        if previous is None or pose is None or flow is None or self._last is None or len(self._last) != len(previous):
+            return np.zeros((0, len(frame), 12))
+        link = link_to_previous(frame, state)
+        before = np.concatenate([_in_world(self._last, pose)[None], self._past])[: self.settings.window]
+        past = np.full((len(before), len(frame), 12), np.nan)
+        past[:, link >= 0] = before[:, link[link >= 0]]
+        loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
+        if len(loose):
+            raw = flow.xy[loose]
+            height, width = previous.depth.shape
+            column, row = np.rint(raw).astype(np.intp).T
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            z = np.where(inside, previous.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
+            seen = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
+            past[0, loose] = _in_world(seen, pose)
+        return past
+
+    def _observe(
+        self, xy: NDArray[np.floating], raw: NDArray[np.floating], z: NDArray[np.floating],
+        depth: NDArray[np.float32], camera: Camera,
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
+        seen = np.full((len(xy), 12), np.nan)
+        valid = np.isfinite(z) & (z > 0)
+        if valid.any():
+            seen[valid, :3] = camera.unproject(xy[valid], z[valid])
+            variance = depth_variance(depth, raw[valid])
+            local = point_covariance(
+                np.asarray(xy[valid], np.float64), z[valid], variance, camera, self.settings.pixel_sigma
+            )
+            seen[valid, 3:] = local.reshape(-1, 9)
         return seen
+
+    def _agree(
+        self, now: NDArray[np.float64], past: NDArray[np.float64], known: NDArray[np.bool_], edges: NDArray[np.intp]
+    ) -> NDArray[np.bool_]:
+        """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed."""
+        both = known[:, edges[:, 0]] & known[:, edges[:, 1]]
+        oldest = len(past) - 1 - both[::-1].argmax(axis=0)
+        first, second = edges.T
+        then = past[oldest, first], past[oldest, second]
+        change = now[first, :3] - now[second, :3] - then[0][:, :3] + then[1][:, :3]
+        total = (now[first, 3:] + now[second, 3:] + then[0][:, 3:] + then[1][:, 3:]).reshape(-1, 3, 3)
+        comparable = both.any(axis=0)
+        distance = np.zeros(len(edges))
+        solved = np.linalg.solve(total[comparable], change[comparable, :, None])[:, :, 0]
+        distance[comparable] = (change[comparable] * solved).sum(axis=1)
+        return np.asarray(distance <= chi2.ppf(self.settings.quantile, 3))
 
     def _static_component(
         self, edges: NDArray[np.intp], points: NDArray[np.float64]
@@ -101,10 +155,11 @@ class CorrelationFilter(DynamicFilter):
         return np.asarray(label == static), float(len(size))
 
 
-def _follow(past: NDArray[np.float64], link: NDArray[np.intp]) -> NDArray[np.float64]:
-    carried = np.full((len(link), past.shape[1]), np.nan)
-    carried[link >= 0] = past[link[link >= 0]]
-    return carried
+def _in_world(seen: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points and covariances ``[N, 3 + 9]`` of a camera's frame in the world's."""
+    R = T_world_cam[:3, :3]
+    covariance = R @ seen[:, 3:].reshape(-1, 3, 3) @ R.T
+    return np.column_stack([se3.transform(T_world_cam, seen[:, :3]), covariance.reshape(-1, 9)])
 
 
 def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -115,10 +170,6 @@ def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
         return np.zeros((0, 2), np.intp)
     pairs = np.sort(np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]), axis=1)
     return np.asarray(np.unique(pairs, axis=0), dtype=np.intp)
-
-
-def _edge(points: NDArray[np.float64], edges: NDArray[np.intp]) -> NDArray[np.float64]:
-    return points[edges[:, 0], :3] - points[edges[:, 1], :3]
 
 
 def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -13,21 +13,23 @@ from dynslam_bench.segmentation.postprocess import dilate
 from .baseline_settings import MultiViewSettings
 from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
 from .light_track import light_track
+from .multiview_kernels import BIN_M, grow, hidden
 from .semantic import inside
 
 MAX_REFERENCE_DEPTH_M = 6.0
 MAX_PROJECTED_DEPTH_M = 7.0
+MAX_DEPTH_M = 40.0
+"""Measured depth beyond this counts as missing, as in the back end."""
 MARGIN_PX = 20
-WINDOW = np.array([(dx, dy) for dy in range(-20, 21, 4) for dx in range(-20, 21, 4)])
-"""Offsets searched around a projected point: DynaSLAM's 41x41 window on every fourth pixel, for speed."""
+"""Half side of the window around a projected point; points nearer to the image's border are not judged."""
 
 
 class MultiViewFilter(DynamicFilter):
     """Drops what lies on something that hides points which earlier keyframes saw there.
 
-    Differences from the authors' code: the parallax angle is taken between the camera centres (the code uses a
-    translation in the wrong frame), and a region grows around the depth of its seed instead of its running mean.
-    Stats: ``dropped``, ``references``, ``seeds`` (hidden points), ``mask_fraction``.
+    A region of like depth grows around every hidden point; features go on the region and within `border_px` of it.
+    Difference from the authors' code: the parallax angle is taken between the camera centres (the code uses a
+    translation in the wrong frame). Stats: ``dropped``, ``references``, ``seeds`` (hidden points), ``mask_fraction``.
     """
 
     name = "multiview"
@@ -50,13 +52,15 @@ class MultiViewFilter(DynamicFilter):
         assert pose is not None
         references = self._choose(state.keyframes, pose)
         depth = np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0)
+        depth = np.ascontiguousarray(np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0), dtype=np.float32)
         seeds = self._hiding(references, depth, pose, state.camera)
         stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
         if not len(seeds):
             return FilterResult.of(keep, stats)
         mask = self._region(seeds, depth)
         stats["mask_fraction"] = float(mask.mean())
-        return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
+        dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
+        return FilterResult.of(~dropped, stats, mask)
 
     def _choose(self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]) -> list[KeyframeView]:
         """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""
@@ -69,8 +73,8 @@ class MultiViewFilter(DynamicFilter):
 
     def _hiding(
         self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
-    ) -> NDArray[np.intp]:
-        """Pixels ``[M, 2]`` of the surfaces that hide the references' points now, reference by reference."""
+    ) -> NDArray[np.int64]:
+        """Pixels ``[M, 2]`` at which something hides the references' points now, reference by reference."""
         world, then = [], []
         for view in views:
             usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
@@ -85,34 +89,19 @@ class MultiViewFilter(DynamicFilter):
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
         shown = ahead & (cosine > np.cos(np.deg2rad(self.settings.max_parallax_deg)))
         shown &= local[:, 2] < MAX_PROJECTED_DEPTH_M
-        size = (camera.width - MARGIN_PX - 1, camera.height - MARGIN_PX - 1)
+        size = (camera.width - MARGIN_PX - 2, camera.height - MARGIN_PX - 2)
         shown &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
         if not shown.any():
-            return np.zeros((0, 2), np.intp)
-        centre = np.rint(pixels[shown]).astype(np.intp)
-        expected = local[shown, 2].astype(np.float32)
-        # the smallest positive gap belongs to the largest of the measured depths that are nearer than expected
-        around = (centre @ (1, camera.width))[:, None] + WINDOW @ (1, camera.width)
-        measured = np.ascontiguousarray(depth).ravel().take(around)
-        nearer = np.where(measured < expected[:, None], measured, np.float32(0))
-        best = nearer.argmax(axis=1)
-        hiding = nearer[np.arange(len(best)), best]
-        where = (centre + WINDOW[best])[(hiding > 0) & (expected - hiding > self.settings.tau_m)]
-        return np.asarray(where[_depth_variance(depth, where) < self.settings.max_variance])
+            return np.zeros((0, 2), np.int64)
+        centre = np.ceil(pixels[shown]).astype(np.int64)
+        seeds = centre[hidden(depth, centre, local[shown, 2], self.settings.tau_m, MARGIN_PX)]
+        return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
 
-    def _region(self, seeds: NDArray[np.intp], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        height, width = depth.shape
-        mask: NDArray[np.integer | np.floating] = np.zeros((height, width), np.uint8)
+    def _region(self, seeds: NDArray[np.int64], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         if self.settings.grow:
-            small = np.ascontiguousarray(depth[::2, ::2])
-            grown = np.zeros((small.shape[0] + 2, small.shape[1] + 2), np.uint8)
-            flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
-            for x, y in seeds // 2:
-                if not grown[y + 1, x + 1] and small[y, x] > 0:
-                    step = self.settings.grow_m
-                    cv2.floodFill(small, grown, (int(x), int(y)), 0, step, step, flags)
-            mask = cv2.resize(grown[1:-1, 1:-1], (width, height), interpolation=cv2.INTER_NEAREST)
-            mask[depth <= 0] = 0
+            mask = grow(depth, np.ascontiguousarray(seeds), self.settings.grow_m, BIN_M)
+        else:
+            mask = np.zeros(depth.shape, np.uint8)
         mask[seeds[:, 1], seeds[:, 0]] = 1
         return dilate(mask.astype(bool), self.settings.dilation_px)
 
@@ -123,18 +112,19 @@ def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
     return np.asarray((first * second).sum(axis=1) / np.maximum(norms, 1e-12))
 
 
-def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Variance ``[N]`` of the depth in the 41x41 neighbourhoods of pixels ``[N, 2]``, m^2; missing depth aside."""
+def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Variance ``[N]`` of the depth in the 41x41 neighbourhoods of pixels ``[N, 2]``, m^2.
+
+    Missing depth counts as the 0 that it is stored as, as in the authors' code: beside it nothing is a seed.
+    """
     if not len(xy):
         return np.zeros(0)
     height, width = depth.shape
     total, squares = cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
-    count = cv2.integral((depth > 0).view(np.uint8), sdepth=cv2.CV_32S)
-    low, high = (xy - MARGIN_PX).clip(0), np.minimum(xy + MARGIN_PX + 1, (width, height))
+    (x0, y0), (x1, y1) = (xy - MARGIN_PX).clip(0).T, np.minimum(xy + MARGIN_PX + 1, (width, height)).T
 
     def within(table: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
-        (x0, y0), (x1, y1) = low.T, high.T
         return np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64)
 
-    n = np.maximum(within(count), 1)
+    n = (x1 - x0) * (y1 - y0)
     return np.asarray(within(squares) / n - np.square(within(total) / n))

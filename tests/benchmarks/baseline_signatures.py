@@ -4,9 +4,12 @@ Reads the results folder of ``dynslam-bench bench dynamic`` and prints, in Markd
 rendered twin beside the class that published figures put it in, and which filters cull nothing or take long.
 
     dynslam-bench bench dynamic --results results
-    python tests/benchmarks/baseline_signatures.py results
+    python tests/benchmarks/baseline_signatures.py results --instances 100:200
 
-Measured class (medians over the seeds):
+Each instance of a twin is a row of its own. Its repeats (start offsets, sensor-noise seeds, seeds) are one cell: the
+median counts, the range stands beside it.
+
+Measured class (medians over the repeats):
   fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not end;
   survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same twin;
   between   neither.
@@ -38,6 +41,7 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.reported import published
 from dynslam_bench.reports.rows import LoadedRun, load_runs, open_stores
 from dynslam_bench.runs.scoring import DEFAULT_PROTOCOL
+from dynslam_bench.sequences.synthetic.settings import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
 
 FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
@@ -47,14 +51,25 @@ FAITHFUL = ("faithful-code", "faithful-paper")
 
 @dataclass
 class Cell:
-    """One system on one twin, over its seeds."""
+    """One system on one twin, over its repeats."""
 
     ates: list[float] = field(default_factory=list)
     coverages: list[float] = field(default_factory=list)
     broken: int = 0
     filter_ms: list[float] = field(default_factory=list)
     culled: list[float] = field(default_factory=list)
-    never_move: float | None = None
+    standstills: list[float] = field(default_factory=list)
+
+    @property
+    def never_move(self) -> float | None:
+        """Median ATE in metres of a camera that never moves; None where no run says it."""
+        return float(np.median(self.standstills)) if self.standstills else None
+
+    @property
+    def spread(self) -> str:
+        """Range of the ATE over repeats that differ, `` (0.0102-0.0140)``; empty for a single value."""
+        low, high = (min(self.ates), max(self.ates)) if self.ates else (0.0, 0.0)
+        return f" ({low:.4f}-{high:.4f})" if high - low >= 5e-5 else ""
 
     @property
     def ate(self) -> float:
@@ -81,6 +96,23 @@ def classify(
 def recorded(twin: str) -> str:
     """The recorded sequence that a twin is modelled on: ``synthetic/walking_xyz@3`` -> ``tum/fr3/walking_xyz``."""
     return "tum/fr3/" + twin.removeprefix("synthetic/").partition("@")[0].partition("?")[0]
+
+
+def instance_of(sequence: str) -> int | None:
+    """The instance of a rendered twin; None for any other sequence."""
+    return parse_synthetic_id(sequence).instance if sequence.startswith("synthetic/") else None
+
+
+def instance_range(text: str) -> range:
+    """``100`` or ``100:200`` (one past the last).
+
+    Raises:
+        argparse.ArgumentTypeError: It is neither.
+    """
+    first, colon, last = text.partition(":")
+    if not first.isdigit() or (colon and not last.isdigit()):
+        raise argparse.ArgumentTypeError(f"'{text}' is no range of instances; write 100 or 100:200")
+    return range(int(first), int(last) if colon else int(first) + 1)
 
 
 def published_values(names: Iterable[str], sequence: str) -> list[float]:
@@ -114,8 +146,14 @@ def published_class(tracker: str, sequence: str) -> str | None:
     return FAILS if fails else SURVIVES
 
 
-def read_cells(folder: Path) -> tuple[dict[tuple[str, str], Cell], dict[str, Cell], dict[str, str]]:
+def read_cells(
+    folder: Path, instances: range | None = None
+) -> tuple[dict[tuple[str, str], Cell], dict[str, Cell], dict[str, str]]:
     """Everything that the table needs.
+
+    Args:
+        folder: Results of the suite.
+        instances: Which instances of the twins count; None for all.
 
     Returns:
         Cells by (tracker with its default settings, sequence), the yardstick's by sequence, provenance by tracker.
@@ -126,6 +164,8 @@ def read_cells(folder: Path) -> tuple[dict[tuple[str, str], Cell], dict[str, Cel
     for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).runs:
         if run.record.kind != "run" or run.record.degrade or run.record.drop_share or run.record.realtime:
             continue
+        if instances is not None and instance_of(run.row.sequence) not in instances:
+            continue
         if run.row.tracker == "mask-rcnn" and run.record.overrides == {"segmentation.source": "oracle"}:
             add(yardstick.setdefault(run.row.sequence, Cell()), run)
         elif not run.record.overrides:
@@ -135,13 +175,14 @@ def read_cells(folder: Path) -> tuple[dict[tuple[str, str], Cell], dict[str, Cel
 
 
 def add(cell: Cell, run: LoadedRun) -> None:
-    """Take one seed's run into its cell."""
+    """Take one repeat's run into its cell."""
     ate = run.row.metrics.get("ate_rmse_m")
     if ate is not None:
         cell.ates.append(ate)
     cell.coverages.append(run.row.coverage)
     cell.broken += run.record.failed
-    cell.never_move = run.row.never_move_m if run.row.never_move_m is not None else cell.never_move
+    if run.row.never_move_m is not None:
+        cell.standstills.append(run.row.never_move_m)
     stages = [time.median_s for name, time in run.record.timings.items() if name.startswith("culling_")]
     cell.filter_ms.append(1e3 * sum(stages))
     cell.culled += culled(run.store.folder(run.record.run_id) / "frames.csv")
@@ -155,15 +196,24 @@ def culled(path: Path) -> list[float]:
         return [float(line["stat_culled"]) for line in csv.DictReader(file) if line.get("stat_culled")]
 
 
-def report(folder: Path) -> str:
+def report(folder: Path, instances: range | None = None) -> str:
     """The whole Markdown text.
 
+    Args:
+        folder: Results of the suite.
+        instances: Which instances of the twins count; None for all.
+
     Raises:
-        DynslamError: The folder holds no runs, or not the yardstick's.
+        DynslamError: The folder holds no runs, or not the yardstick's, or none on these instances.
     """
-    cells, yardstick, provenance = read_cells(folder)
+    cells, yardstick, provenance = read_cells(folder, instances)
     twins = [twin for twin in dict.fromkeys(twin for _, twin in cells) if twin.startswith("synthetic/")]
     missing = [twin for twin in twins if twin not in yardstick or not np.isfinite(yardstick[twin].ate)]
+    if not twins and instances is not None:
+        raise DynslamError(
+            f"{folder} holds no runs on instances {instances.start} to {instances.stop - 1} of the rendered twins",
+            "run the suite 'dynamic', or ask for other --instances",
+        )
     if missing or not twins:
         raise DynslamError(
             f"{folder} holds no run of mask-rcnn with exact masks on {missing[0] if missing else 'any twin'}",
@@ -201,7 +251,7 @@ def report(folder: Path) -> str:
                     misses.append(f"{tracker} on {short(twin)}: {measured} ({cell.ate:.4f} m), published {expected}")
             elif verdict != "not clear":
                 verdict += " (not counted)"
-            lines.append(f"| `{tracker}` | {provenance[tracker]} | {short(twin)} | {cell.ate:.4f} "
+            lines.append(f"| `{tracker}` | {provenance[tracker]} | {short(twin)} | {cell.ate:.4f}{cell.spread} "
                          f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |")  # fmt: skip
     share, other, single = (
         f"{100 * n / of:.0f} %" if of else "-"
@@ -262,8 +312,12 @@ def main() -> int:
     """Print the tables of one results folder."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("results", type=Path, help="folder that 'dynslam-bench bench dynamic' wrote")
+    parser.add_argument(
+        "--instances", type=instance_range, help="instances that count, e.g. 100:200 (held out); default all"
+    )
+    arguments = parser.parse_args()
     try:
-        sys.stdout.write(report(parser.parse_args().results) + "\n")
+        sys.stdout.write(report(arguments.results, arguments.instances) + "\n")
     except DynslamError as error:
         sys.stderr.write(f"{error}\n")
         return 1

@@ -89,7 +89,7 @@ def test_multiview_drops_what_hides_a_keyframe_s_points() -> None:
     z = now[np.rint(xy[:, 1]).astype(int), np.rint(xy[:, 0]).astype(int)]
     frame = bundle(xy, z, now, 1.0)
     state = FilterState(camera=CAMERA, keep=np.ones(400, bool), T_world_pred=np.eye(4), keyframes=(view,) * 5)
-    block = MultiViewFilter(MultiViewSettings(dilation_px=0))
+    block = MultiViewFilter(MultiViewSettings(dilation_px=0, border_px=0))
     verdict = block.apply(frame, state)
     np.testing.assert_array_equal(verdict.keep, z > 2)
     empty = bundle(xy, np.full(400, 3.0), wall, 1.0)

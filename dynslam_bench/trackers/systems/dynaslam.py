@@ -30,7 +30,7 @@ class DynaSlamSettings(DynaSlamMasksSettings):
 class DynaSlamCodeSettings(DynaSlamSettings):
     """The constants of the authors' code where they differ from the paper."""
 
-    multiview: MultiViewSettings = MultiViewSettings(tau_m=0.6, order="farthest")
+    multiview: MultiViewSettings = MultiViewSettings(tau_m=0.6, order="farthest", min_keyframes=5)
 
 
 class DynaSlamGeometrySettings(SystemSettings):
@@ -62,12 +62,14 @@ def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -
 
 
 GEOMETRY = (
-    "regions grow around the depth of their seed, not around a running mean, at half the resolution",
-    "a seed needs a neighbourhood of nearly one depth (variance below 0.001 m^2), as in the code",
-    "the search window is sampled on every fourth pixel",
-    "the low-cost tracking matches the last frame, not the local map",
+    "a seed needs a neighbourhood of nearly one depth (variance below 0.001 m^2, missing depth as 0), as in the code",
+    "features within 15 px of the geometric mask go as well, as in the code",
+    "the next pixel of a region is the one nearest to its mean to 5 mm",
+    "the low-cost tracking matches the last frame alone",
     "parallax is taken between camera centres (the code's translation is in another frame)",
 )
+START = "the geometric test acts from the first keyframe on (the paper is silent, the code waits for five)"
+BORDER = "features within another 15 px of the grown semantic masks, which the code drops, stay"
 UNION = "the masks of N and G are united, as in the code (the paper keeps G's where both find an object)"
 
 
@@ -91,7 +93,9 @@ def _spec(
         citation="Bescos et al., DynaSLAM, IEEE RA-L 2018",
         assumptions=(
             *(() if settings is DynaSlamGeometrySettings else (SHARED_MASKS,)),
+            *((BORDER,) if faithful_code else ()),
             *(() if factory == "build_masks_only" else GEOMETRY),
+            *(() if factory == "build_masks_only" or faithful_code else (START,)),
             *((UNION,) if variant.startswith("N+G") else ()),
         ),
         remarks="background inpainting is left out: it rejects nothing",
