@@ -21,6 +21,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.tum_file import write_tum
 
 from .child import FRAMES_FILE
+from .failures import at
 from .sheet import SheetWriter
 from .spec import RunSpec
 
@@ -59,7 +60,9 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     sheet = SheetWriter(folder / "sheet.png", base) if spec.sheet else None
     with (folder / FRAMES_FILE).open("w") as log:
         writer = _FrameWriter(base, log)
-        env.reset(seed=spec.seed)
+        position = _Position(base)
+        with at(position):
+            env.reset(seed=spec.seed)
         over = False
         reported = 0
         while True:
@@ -78,13 +81,25 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             if stopping():
                 env.close()
                 return {"type": "stopped", "frames": done}
-            _, _, terminated, truncated, _ = env.step(0)
+            with at(position):
+                _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
     if video is not None:
         video.close()
-    outcome = _finish(base, folder, sheet)
-    env.close()
+    with at("after the last frame"):
+        outcome = _finish(base, folder, sheet)
+        env.close()
     return {"type": "done", **outcome}
+
+
+class _Position:
+    """Says which frame is being tracked."""
+
+    def __init__(self, env: SlamEnv) -> None:
+        self._env = env
+
+    def __str__(self) -> str:
+        return f"frame {self._env.episode.next_index} of {len(self._env.sequence)}"
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:

@@ -76,14 +76,14 @@ LIMITS = Limits(frame_s=3.0)
 @pytest.mark.parametrize(
     ("mode", "status", "reason"),
     [
-        ("raise", "crashed", "ValueError: the toy tracker raised on purpose"),
+        ("raise", "crashed", "frame 4 of 60: ValueError: the toy tracker raised on purpose (envs_toys.py:"),
         ("segfault", "crashed", "SIGSEGV (segmentation fault), after frame 3 of 60"),
         ("exit", "crashed", "the process left with exit code 3, after frame 3 of 60"),
         ("nan", "invalid", "tracker 'toy' at frame 4 returned a pose with 16 values that are not finite"),
         ("scaled", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
         ("mirrored", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
         ("string", "invalid", "tracker 'toy' at frame 4 returned a str"),
-        ("memoryerror", "out-of-memory", "MemoryError: the toy tracker ran out of memory on purpose"),
+        ("memoryerror", "out-of-memory", "frame 4 of 60: MemoryError: the toy tracker ran out of memory on purpose (envs_toys.py:"),
         ("hang", "timeout", "no sign of life for 3 s, after frame 3 of 60"),
         ("lost", "lost", "tracked on 4 of 60 frames"),
         ("initialising", "lost", "tracked on 4 of 60 frames"),
