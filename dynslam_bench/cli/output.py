@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -12,9 +13,11 @@ SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
 
 
-def write(text: str = "") -> None:
-    """Write a line to standard output."""
+def write(text: str = "", *, now: bool = False) -> None:
+    """Write a line to standard output; `now` also where nobody watches, ahead of what follows."""
     sys.stdout.write(text + "\n")
+    if now:
+        sys.stdout.flush()
 
 
 def note(text: str) -> None:
@@ -50,6 +53,30 @@ def write_fields(fields: Mapping[str, object]) -> None:
     width = max(map(len, shown), default=0)
     for name, value in shown.items():
         write(f"{name.ljust(width)}  {value}")
+
+
+HEARTBEAT_S = 10.0
+"""Off a terminal something that lasts says so this often."""
+
+
+@contextmanager
+def heartbeat() -> Iterator[Callable[[str], None]]:
+    """A line on standard error every `HEARTBEAT_S` seconds while something lasts.
+
+    Yields:
+        Call it as often as you like with what is going on; threads may.
+    """
+    began = told = time.monotonic()
+
+    def beat(text: str) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told >= HEARTBEAT_S:
+            told = now
+            sys.stderr.write(f"{text}, {now - began:.0f} s\n")
+            sys.stderr.flush()
+
+    yield beat
 
 
 @contextmanager

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from .options import AsJson, Assignments, SettingsFile, gather_settings
-from .output import VERIFICATION_FAILED, write, write_fields, write_json, write_table
+from .output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.trackers import TrackerSpec
@@ -114,17 +114,31 @@ def test(
     assignments: Assignments = None,
     settings: SettingsFile = None,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each check.")] = 6,
+    time_limit: Annotated[
+        float, typer.Option(min=0.1, help="Seconds for a frame or another step; five times that for the first.")
+    ] = 60.0,
+    memory_limit: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(min=0, help="MB that it may take; default is a share of the machine's, 0 is no limit."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check that a tracker keeps its contract."""
-    from dynslam_bench.testing import tracker_report
+    """Check that a tracker keeps its contract, in a process of its own."""
+    from dynslam_bench.testing import Check, isolated_tracker_report
 
-    report = tracker_report(tracker, settings=gather_settings(assignments, settings, {}), frames=frames)
+    def told(check: Check) -> None:
+        if not as_json:
+            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""), now=True)
+
+    with heartbeat() as beat:
+        report = isolated_tracker_report(
+            tracker, settings=gather_settings(assignments, settings, {}), frames=frames, frame_s=time_limit,
+            start_s=5 * time_limit, memory_mb=memory_limit, on_check=told,
+            on_wait=lambda running: beat(f"checking: {running}"),
+        )  # fmt: skip
     if as_json:
         write_json({"subject": report.subject, "ok": report.ok, "checks": [check.__dict__ for check in report.checks]})
     else:
-        for check in report.checks:
-            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""))
         write(f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed")
     if not report.ok:
         raise typer.Exit(VERIFICATION_FAILED)

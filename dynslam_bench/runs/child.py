@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import json
+import logging
 import os
 import resource
 import signal
@@ -102,6 +103,9 @@ def _redirect(log: Path) -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(line_buffering=True)
     faulthandler.enable(file=2, all_threads=False)
+    programs = logging.getLogger("dynslam_bench.trackers.adapters.program")
+    programs.setLevel(logging.INFO)
+    programs.addHandler(logging.StreamHandler(sys.stderr))
 
 
 def _prepare(job: dict[str, Any]) -> None:

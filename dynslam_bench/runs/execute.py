@@ -136,7 +136,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         tracker=TrackerInfo(
             id=tracker.id, label=spec.label or tracker.label, version=tracker.version,
             distribution=identity["distribution"], provenance=tracker.provenance, ranked=tracker.ranked,
-            deterministic=tracker.deterministic, license=tracker.license, citation=tracker.citation, remarks=tracker.remarks,
+            deterministic=tracker.deterministic, license=tracker.license, citation=tracker.citation,
+            remarks=tracker.remarks,
         ),
         overrides=spec.settings, settings=flatten(resolved.settings),
         sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity)),

@@ -13,6 +13,7 @@ from typing import Any
 
 import dynslam_bench
 from dynslam_bench.core.errors import RunError, SequenceError
+from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.envs.degrade_frames import Degradation
@@ -90,6 +91,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "settings": flatten(settings),
         "segmentation": source,
         "weights": weights_of(settings, source),
+        **files_of(tracker, settings),
         "sequence": sequence.id,
         "content": sequence.digest(),
         "camera": asdict(sequence.camera),
@@ -145,6 +147,13 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
         if weights is not None:
             found["embedded"] = _digest_path(Path(str(weights)))
     return found
+
+
+def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, list[str]]:
+    """``files``: digests of what the tracker's spec says decides its results beside its settings; else nothing."""
+    if not tracker.files:
+        return {}
+    return {"files": [_digest_path(path) for path in load_object(tracker.files)(settings)]}
 
 
 def _segmentation_source(settings: Settings, sequence: Sequence) -> str:

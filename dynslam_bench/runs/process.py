@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from multiprocessing.connection import Connection, Pipe
+from multiprocessing.connection import Connection, Pipe, wait
 
 from .family import end_family, family
 from .forkserver import SERVER, child_environment
@@ -97,7 +96,7 @@ class ForkedChild(Child):
         super().close()
         deadline = time.monotonic() + _BURIAL_S
         while self.poll() is None and time.monotonic() < deadline:
-            select.select([self._status_fd], [], [], 0.1)
+            wait([self._status_fd], 0.1)
         if self._status_fd >= 0:
             os.close(self._status_fd)
             self._status_fd = -1
