@@ -19,8 +19,7 @@ from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
 from dynslam_bench.envs.source import open_frames, preprocessing_of
-from dynslam_bench.segmentation.build import resolve_source
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.availability import segmentation_source
 from dynslam_bench.sequences.frame import Sequence
 from dynslam_bench.trackers.protocol import TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
@@ -81,7 +80,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
     _check_degradation(spec.degrade)
     device = resolve_device(spec.device)
-    source = _segmentation_source(settings, sequence)
+    source = segmentation_source(settings, sequence)
     known = versions()
     identity = {
         "tracker": tracker.id,
@@ -154,13 +153,6 @@ def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, list[str]]:
     if not tracker.files:
         return {}
     return {"files": [_digest_path(path) for path in load_object(tracker.files)(settings)]}
-
-
-def _segmentation_source(settings: Settings, sequence: Sequence) -> str:
-    group = getattr(settings, "segmentation", None)
-    if not isinstance(group, SegmentationSettings):
-        return ""
-    return resolve_source(group, sequence.id, sequence.masks)
 
 
 def _check_degradation(strengths: dict[str, float]) -> None:

@@ -109,9 +109,7 @@ def _outcome(name: str, check: Callable[[], None]) -> Check:
     except Exception as error:  # the subject's own code may raise anything: that is what is tested
         return Check(name, "failed", f"raised {type(error).__name__}: {error}")
     except SystemExit as error:
-        return Check(
-            name, "failed", f"called sys.exit({error.code!r}) (a tracker raises, it never exits)"
-        )
+        return Check(name, "failed", f"called sys.exit({error.code!r}) (a tracker raises, it never exits)")
     return Check(name, "passed")
 
 
