@@ -119,6 +119,7 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
     began = time.perf_counter()
     final = env.final_trajectory()
     outcome: dict[str, Any] = {"finalize_s": None, "keyframes": None, "map_points": None, "gpu_memory_mb": None}
+    notes: list[str] = []
     if final is not None:
         outcome["finalize_s"] = time.perf_counter() - began
         write_tum(folder / "trajectory_final.txt", final)
@@ -131,12 +132,14 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
         if sheet is not None:
             sheet.write(outputs, env.online_trajectory() if final is None else final)
         outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
+    elif sheet is not None:
+        notes.append("no sheet.png: the tracker offers neither keyframes nor a map")
     if env.device.startswith("cuda"):
         import torch
 
         outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
         outcome["gpu"] = torch.cuda.get_device_name(env.device)
-    return outcome
+    return outcome | {"notes": notes}
 
 
 class _FrameWriter:
