@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import AsJson, Assignments, SettingsFile, gather_settings
+from .options import AsJson, Assignments, MemoryLimit, SettingsFile, gather_settings
 from .output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.settings import Settings
     from dynslam_bench.trackers import TrackerSpec
 
 app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
@@ -60,7 +61,8 @@ def info(
         "remarks": spec.remarks,
     }  # fmt: skip
     if as_json:
-        write_json({**facts, "settings": flatten(spec.settings()), "reported": numbers})
+        described = parameter_facts(spec.settings)
+        write_json({**facts, "settings": flatten(spec.settings()), "parameters": described, "reported": numbers})
         return
     write_fields(facts)
     write()
@@ -70,6 +72,19 @@ def info(
         write_table(
             ("sequence", "reported metric", "value", "source", "remarks"), [tuple(row.values()) for row in numbers]
         )
+
+
+def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
+    """Every setting with its default; of those that studies may tune also what they need to know."""
+    from dataclasses import asdict
+
+    from dynslam_bench.core.settings import flatten, parameters
+
+    tunable = {parameter.name: asdict(parameter) for parameter in parameters(settings)}
+    return [
+        {"name": name, "default": default, "tunable": name in tunable, "online": False} | tunable.get(name, {})
+        for name, default in flatten(settings()).items()
+    ]
 
 
 def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
@@ -117,10 +132,7 @@ def test(
     time_limit: Annotated[
         float, typer.Option(min=0.1, help="Seconds for a frame or another step; five times that for the first.")
     ] = 60.0,
-    memory_limit: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(min=0, help="MB that it may take; default is a share of the machine's, 0 is no limit."),
-    ] = None,
+    memory_limit: MemoryLimit = None,
     as_json: AsJson = False,
 ) -> None:
     """Check that a tracker keeps its contract, in a process of its own."""

@@ -53,12 +53,13 @@ def run_many(
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
+    cancelled: Callable[[], bool] | None = None,
 ) -> list[RunRecord]:
     """Make the runs that are not stored yet, and score all of them.
 
-    Everything is looked up before the first run begins. A stored run is made again if a video or a sheet is asked for that
-    it lacks; one that is given another label gets that. Each run is a child process; a failure is a record like any
-    other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on where it stopped.
+    Everything is looked up before the first run begins. A stored run is made again if a video or a sheet is asked for
+    that it lacks; one that is given another label gets that. Each run is a child process; a failure is a record like
+    any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from there.
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -71,6 +72,7 @@ def run_many(
         on_event: Told of everything that happens, from several threads but never two at a time.
         on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
         protocol: Protocol to score under.
+        cancelled: Asked many times a second; True ends the runs on this machine at once, as stopped.
 
     Returns:
         The records in the order of `specs`.
@@ -85,7 +87,7 @@ def run_many(
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
     resolved = [resolve(spec) for spec in specs]
     store.prepare()
-    bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs)
+    bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs, cancelled)
     todo: dict[str, ResolvedRun] = {}
     done: dict[str, RunRecord] = {}
     for run in resolved:
@@ -109,8 +111,10 @@ class _Bench:
         on_event: Callable[[RunEvent], None] | None,
         on_progress: OnProgress | None,
         jobs: int,
+        cancelled: Callable[[], bool] | None,
     ) -> None:
         self.jobs = jobs
+        self.cancelled_outside = cancelled or (lambda: False)
         self.store, self.protocol, self.total = store, protocol, total
         self.on_event, self.on_progress = on_event, on_progress
         self.lock = threading.Lock()
@@ -160,13 +164,16 @@ class _Bench:
             return self.on_progress is None or self.on_progress(run_id, partial)
 
         record = run_one(
-            run, self.store, on_progress=progress, protocol=self.protocol, cancelled=self.cancelled.is_set,
+            run, self.store, on_progress=progress, protocol=self.protocol, cancelled=self._is_cancelled,
             at_a_time=self.jobs,
         )  # fmt: skip
         if record.status != "stopped":
             score(self.store, record, self.protocol)
         self.tell("finished", run, record=record)
         return record
+
+    def _is_cancelled(self) -> bool:
+        return self.cancelled.is_set() or self.cancelled_outside()
 
     def tell(
         self,

@@ -66,9 +66,7 @@ def test_coco_without_a_network(store: RunStore, toy_folder: str, monkeypatch, t
 
     monkeypatch.setattr("urllib.request.urlopen", refuse)
     spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": "coco"})
-    with pytest.raises(
-        DynslamError, match=r"cannot fetch the checkpoint 'coco': network is unreachable \(put"
-    ):
+    with pytest.raises(DynslamError, match=r"cannot fetch the checkpoint 'coco': network is unreachable \(put"):
         run_one(spec, store)
     assert store.ids() == []
 
