@@ -60,7 +60,9 @@ def test_bench_has_limits(cli, walk, tmp_path):
 def test_a_sheet_of_a_stored_run_is_made(cli, walk, tmp_path):
     from pathlib import Path
 
-    folder = Path(json.loads(cli("run", "orb-slam2", walk, "--json")[1])[0]["folder"])
+    (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
+    folder = Path(row["folder"])
+    assert row["status"] == "ok", row
     assert not (folder / "sheet.png").exists()
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--sheet", "--json")[1])
     assert row["from_store"] is False and (folder / "sheet.png").is_file()
