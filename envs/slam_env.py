@@ -21,6 +21,7 @@ from dynslam_bench.evaluation.online import OnlineError, OnlineSample
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.segmentation.availability import segmentation_source
 from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.sequences.frame import Sequence as FrameSequence
 from dynslam_bench.trackers.protocol import Tracker, TrackerContext, TrackerSpec
@@ -150,6 +151,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._tracker_key: object = None
         self._use_settings(settings)
         self._use_sequence(sequence)
+        segmentation_source(self.settings, self.sequence, fetch=False)
         self.action_space = self._actions.space()
         self.observation_space = (
             stats_space() if observation == "stats" else rgbd_space(self.sequence.camera)

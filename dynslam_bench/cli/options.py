@@ -50,6 +50,19 @@ Retry = Annotated[
 ]
 
 
+TimeLimit = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option("--time-limit", help="Seconds that a run may take; default is no limit on the whole run."),
+]
+MemoryLimit = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option(
+        "--memory-limit", min=0,
+        help="MB that a run may take; default is 80 % of the machine's memory, shared by --jobs; 0 is no limit.",
+    ),
+]  # fmt: skip
+
+
 def gather_settings(assignments: list[str] | None, file: Path | None, preset: dict[str, Any]) -> dict[str, Any]:
     """Overrides by dotted name: the preset's, then the file's, then the assignments'.
 

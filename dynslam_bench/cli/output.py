@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -12,9 +15,11 @@ SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
 
 
-def write(text: str = "") -> None:
-    """Write a line to standard output."""
+def write(text: str = "", *, now: bool = False) -> None:
+    """Write a line to standard output; `now` also where nobody watches, ahead of what follows."""
     sys.stdout.write(text + "\n")
+    if now:
+        sys.stdout.flush()
 
 
 def note(text: str) -> None:
@@ -28,12 +33,41 @@ def write_json(value: Any) -> None:
     sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
 
 
-def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write a table as aligned text; nothing is cut off, whatever the terminal's width."""
-    head, *body = aligned([list(columns), *([_text(value) for value in row] for row in rows)]).split("\n")
+def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, shrink: Sequence[str] = ()) -> None:
+    """Write a table as aligned text; nothing is cut off, whatever the terminal's width.
+
+    Args:
+        columns: Headings.
+        rows: Cells.
+        shrink: Columns of long text that may be shortened, the first one first, to fit a terminal; where the output
+            is none, they are whole.
+    """
+    cells = [list(columns), *([_text(value) for value in row] for row in rows)]
+    if sys.stdout.isatty():
+        cells = fitted(cells, [columns.index(name) for name in shrink if name in columns], _terminal_width())
+    head, *body = aligned(cells).split("\n")
     write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
     for line in body:
         write(line)
+
+
+def fitted(rows: list[list[str]], columns: Sequence[int], width: int, least: int = 12) -> list[list[str]]:
+    """Rows with the named columns shortened, one after the other, until a line has at most `width` characters."""
+    rows = [list(row) for row in rows]
+    for column in columns:
+        widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+        over = sum(widths) + 2 * (len(widths) - 1) - width
+        if over <= 0:
+            break
+        room = max(widths[column] - over, least)
+        for row in rows:
+            if len(row[column]) > room:
+                row[column] = row[column][: room - 1] + "…"
+    return rows
+
+
+def _terminal_width() -> int:
+    return shutil.get_terminal_size().columns
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -52,15 +86,67 @@ def write_fields(fields: Mapping[str, object]) -> None:
         write(f"{name.ljust(width)}  {value}")
 
 
+HEARTBEAT_S = 10.0
+"""Off a terminal something that lasts says so this often."""
+
+
 @contextmanager
-def progress(label: str, *, unit: str = "") -> Iterator[Callable[[float, float | None], None]]:
-    """A progress bar on standard error where that is a terminal; elsewhere silence.
+def heartbeat() -> Iterator[Callable[[str], None]]:
+    """A line on standard error every `HEARTBEAT_S` seconds while something lasts.
 
     Yields:
-        Call it with what is done and the total, None if unknown.
+        Call it as often as you like with what is going on; threads may.
+    """
+    began = told = time.monotonic()
+
+    def beat(text: str) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told >= HEARTBEAT_S:
+            told = now
+            sys.stderr.write(f"{text}, {now - began:.0f} s\n")
+            sys.stderr.flush()
+
+    yield beat
+
+
+class _Lines:
+    """Progress where there is no terminal: a line every `HEARTBEAT_S` seconds, from a thread of its own."""
+
+    def __init__(self, label: str) -> None:
+        self.label, self.began, self.text = label, time.monotonic(), ""
+        self.ended = threading.Event()
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def told(self, done: float, total: float | None, what: str = "") -> None:
+        share = "" if not total else f" {done:.1f} of {total:.0f}"
+        spent = time.monotonic() - self.began
+        left = f", about {spent * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
+        self.text = f"{share}{left}" + (f" ({what})" if what else "")
+
+    def _run(self) -> None:
+        while not self.ended.wait(HEARTBEAT_S):
+            sys.stderr.write(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far\n")
+            sys.stderr.flush()
+
+
+Advance = Callable[..., None]
+"""Called with what is done, the total (None if unknown) and, if there is more to say, what is going on."""
+
+
+@contextmanager
+def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
+    """A progress bar on standard error where that is a terminal; elsewhere a line every `HEARTBEAT_S` seconds.
+
+    Yields:
+        See `Advance`.
     """
     if not sys.stderr.isatty():
-        yield lambda done, total: None
+        lines = _Lines(label)
+        try:
+            yield lines.told
+        finally:
+            lines.ended.set()
         return
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
@@ -69,7 +155,12 @@ def progress(label: str, *, unit: str = "") -> Iterator[Callable[[float, float |
     columns = [TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn()]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=1)
-        yield lambda done, total: bar.update(task, completed=done, total=total if total is not None else done + 1)
+
+        def told(done: float, total: float | None, what: str = "") -> None:
+            shown = f"{label}: {what}" if what else label
+            bar.update(task, completed=done, total=total if total is not None else done + 1, description=shown)
+
+        yield told
 
 
 def _text(value: object) -> str:

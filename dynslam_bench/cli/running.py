@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -16,6 +16,7 @@ from .options import (
     Device,
     Frames,
     Jobs,
+    MemoryLimit,
     Offsets,
     ProtocolId,
     Results,
@@ -24,6 +25,7 @@ from .options import (
     SettingsFile,
     Stride,
     Threads,
+    TimeLimit,
     gather_settings,
 )
 from .output import SOME_RUNS_FAILED, note, progress, write_json, write_table
@@ -68,8 +70,9 @@ def run(
         bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
     ] = False,
     retry: Retry = None,
-    time_limit: Annotated[Optional[float], typer.Option(help="Seconds that a run may take.")] = None,  # noqa: UP045
-    memory_limit: Annotated[Optional[float], typer.Option(help="MB that a run may take.")] = None,  # noqa: UP045
+    label: Annotated[str, typer.Option(help="Name in tables, in place of the tracker's.")] = "",
+    time_limit: TimeLimit = None,
+    memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -92,7 +95,7 @@ def run(
         RunSpec(
             tracker=tracker, sequence=sequence, settings=overrides, frames=part, offset=skipped, stride=stride,
             seed=number, device=device, threads=threads, realtime=realtime, video=video, sheet=sheet, camera=camera,
-            cache=cache, drop_share=drop, degrade=strengths,
+            cache=cache, label=label, drop_share=drop, degrade=strengths,
             data_root=None if data_root is None else str(data_root),
             limits=Limits(time_s=time_limit, memory_mb=memory_limit),
         )
@@ -142,6 +145,8 @@ def bench(
         typer.Option(metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs."),
     ] = None,
     retry: Retry = None,
+    time_limit: TimeLimit = None,
+    memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -153,6 +158,9 @@ def bench(
         data_root=data_root, device=device, threads=threads, trackers=tuple(tracker or ()), seeds=tuple(seed or ()),
         offsets=tuple(offset or ()), frames=None if frames is None else parse_frames(frames),
     )  # fmt: skip
+    own = {"time_s": time_limit, "memory_mb": memory_limit}
+    changes = {name: value for name, value in own.items() if value is not None}
+    specs = [spec.model_copy(update={"limits": spec.limits.model_copy(update=changes)}) for spec in specs]
     finish(
         specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json, scheduler=scheduler
     )
@@ -172,8 +180,9 @@ def finish(
     from dynslam_bench.runs import RunStore
 
     store = RunStore(results)
-    records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler)
-    show_runs(records, store, protocol, as_json=as_json)
+    reused: set[str] = set()
+    records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
+    show_runs(records, store, protocol, as_json=as_json, reused=reused)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if any(record.failed for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
@@ -187,21 +196,27 @@ def make_runs(
     retry: Sequence[str] = (),
     protocol: str = "tum-rgbd/v1",
     scheduler: str | None = None,
+    reused: set[str] | None = None,
 ) -> list[RunRecord]:
-    """`run_many` with a progress bar."""
+    """`run_many` with a progress bar; the ids of runs that were stored already are added to `reused`."""
     from dynslam_bench.runs import RunEvent, run_many
 
     with progress(f"{len(specs)} runs") as advance:
         shares: dict[str, float] = {}
 
         def told(event: RunEvent) -> None:
+            what = f"{event.spec.tracker} on {event.spec.sequence}"
             if event.kind == "progress" and event.partial is not None:
-                shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)
+                done, frames = event.partial["frames_done"], event.partial["frames"]
+                shares[event.run_id] = done / max(frames, 1)
+                what = f"{event.spec.tracker} on {event.spec.sequence}, frame {done} of {frames}"
             elif event.kind in ("finished", "reused"):
                 shares[event.run_id] = 1.0
+                if event.kind == "reused" and reused is not None:
+                    reused.add(event.run_id)
                 if event.record is not None:
                     note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
-            advance(sum(shares.values()), event.total)
+            advance(sum(shares.values()), event.total, what)
 
         with_executor: dict[str, Any] = {}
         if scheduler is not None:
@@ -229,8 +244,10 @@ def dask_executor(address: str) -> Any:
         raise RunError(f"no Dask scheduler answers at {address}: {error}", "for example tcp://host:8786") from error
 
 
-def show_runs(records: Sequence[RunRecord], store: Any, protocol: str, *, as_json: bool) -> None:
-    """A table, or JSON, of runs with their errors under a protocol."""
+def show_runs(
+    records: Sequence[RunRecord], store: Any, protocol: str, *, as_json: bool, reused: Collection[str] = ()
+) -> None:  # fmt: skip
+    """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are said to be from the store."""
     from dynslam_bench.runs import score
 
     rows = []
@@ -242,6 +259,9 @@ def show_runs(records: Sequence[RunRecord], store: Any, protocol: str, *, as_jso
                 "tracker": record.tracker.id,
                 "sequence": record.sequence.id,
                 "seed": record.seed,
+                "part": part_words(record),
+                "settings": ", ".join(f"{name}={value}" for name, value in record.overrides.items()),
+                "from_store": record.run_id in reused,
                 "status": record.status,
                 "ate_rmse_m": metrics.get("ate_rmse_m"),
                 "never_move_m": metrics.get("never_move_ate_rmse_m"),
@@ -257,8 +277,26 @@ def show_runs(records: Sequence[RunRecord], store: Any, protocol: str, *, as_jso
         write_json(rows)
         return
     names = {
-        "run": "run", "tracker": "tracker", "sequence": "sequence", "seed": "seed", "status": "status",
+        "run": "run", "tracker": "tracker", "sequence": "sequence", "part": "part", "seed": "seed", "status": "status",
         "ate_rmse_m": "ATE (m)", "never_move_m": "not moving (m)", "coverage": "coverage", "frame_ms": "ms/frame",
     }  # fmt: skip
-    names |= {name: name for name in ("masks", "reason") if any(row[name] for row in rows)}
-    write_table(list(names.values()), [[row[name] for name in names] for row in rows])
+    if not any(row["part"] for row in rows):
+        del names["part"]
+    more = {"masks": "masks", "from_store": "from the store", "settings": "settings", "reason": "reason"}
+    names |= {name: title for name, title in more.items() if any(row[name] for row in rows)}
+    cells = [[row[name] for name in names] for row in rows]
+    write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
+
+
+def part_words(record: RunRecord) -> str:
+    """Which frames of its sequence a run saw, e.g. ``0:60, every 2nd, offset 1``; empty for all of them."""
+    offset = getattr(record, "offset", 0)
+    words = []
+    if record.frames is not None:
+        start, stop = record.frames
+        words.append(f"{start}:{'' if stop is None else stop}")
+    if record.stride > 1:
+        words.append(f"every {record.stride}{ {2: 'nd', 3: 'rd'}.get(record.stride, 'th') }")
+    if offset:
+        words.append(f"offset {offset}")
+    return ", ".join(words)

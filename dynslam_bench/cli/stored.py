@@ -10,7 +10,7 @@ import typer
 
 from .options import AsJson, ProtocolId, Results
 from .output import write, write_fields, write_json, write_table
-from .running import show_runs
+from .running import part_words, show_runs
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
@@ -23,9 +23,17 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List the runs of a results folder, oldest first."""
-    from dynslam_bench.runs import RunStore
+    from typing import get_args
 
+    from dynslam_bench.core.errors import RunError, did_you_mean
+    from dynslam_bench.runs import RunStore
+    from dynslam_bench.runs.record import Status
+
+    if status is not None and status not in get_args(Status):
+        raise RunError(f"unknown status '{status}'", did_you_mean(status, get_args(Status)))
     store = RunStore(results)
+    if not store.runs.is_dir():
+        raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     records, unreadable = store.all()
     show_runs(
         [record for record in records if status in (None, record.status)], store, protocol, as_json=as_json
@@ -53,8 +61,9 @@ def show(
     facts: dict[str, Any] = {
         "run": record.run_id, "folder": store.folder(record.run_id), "status": record.status, "reason": record.reason,
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
-        "sequence": record.sequence.id, "frames": record.n_frames, "tracked": record.n_tracked,
-        "lost": record.n_lost, "coverage": record.coverage, "seed": record.seed, "masks": record.segmentation,
+        "sequence": record.sequence.id, "part": part_words(record), "frames": record.n_frames,
+        "tracked": record.n_tracked, "lost": record.n_lost, "coverage": record.coverage, "seed": record.seed,
+        "masks": record.segmentation,
         "device": record.device, "threads": record.threads, "started": record.started, "wall_s": record.wall_s,
         "peak_memory_mb": record.peak_memory_mb, "keyframes": record.keyframes, "map_points": record.map_points,
         "overrides": [f"{name}={value}" for name, value in record.overrides.items()], "notes": record.notes,

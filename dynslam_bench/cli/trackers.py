@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .options import AsJson, Assignments, SettingsFile, gather_settings
-from .output import VERIFICATION_FAILED, write, write_fields, write_json, write_table
+from .options import AsJson, Assignments, MemoryLimit, SettingsFile, gather_settings
+from .output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.settings import Settings
     from dynslam_bench.trackers import TrackerSpec
 
 app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
@@ -62,7 +63,9 @@ def info(
     }  # fmt: skip
     skipped = epipolar_skipped(spec.id)
     if as_json:
-        write_json({**facts, "epipolar_skipped": skipped, "settings": flatten(spec.settings()), "reported": numbers})
+        described = parameter_facts(spec.settings)
+        facts |= {"epipolar_skipped": skipped, "settings": flatten(spec.settings()), "parameters": described}
+        write_json({**facts, "reported": numbers})
         return
     if skipped:
         facts["epipolar_skipped"] = [f"{100 * share:.0f} % of {where}" for where, share in skipped.items()]
@@ -74,6 +77,19 @@ def info(
         write_table(
             ("sequence", "reported metric", "value", "source", "remarks"), [tuple(row.values()) for row in numbers]
         )
+
+
+def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
+    """Every setting with its default; of those that studies may tune also what they need to know."""
+    from dataclasses import asdict
+
+    from dynslam_bench.core.settings import flatten, parameters
+
+    tunable = {parameter.name: asdict(parameter) for parameter in parameters(settings)}
+    return [
+        {"name": name, "default": default, "tunable": name in tunable, "online": False} | tunable.get(name, {})
+        for name, default in flatten(settings()).items()
+    ]
 
 
 def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
@@ -118,17 +134,28 @@ def test(
     assignments: Assignments = None,
     settings: SettingsFile = None,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each check.")] = 6,
+    time_limit: Annotated[
+        float, typer.Option(min=0.1, help="Seconds for a frame or another step; five times that for the first.")
+    ] = 60.0,
+    memory_limit: MemoryLimit = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check that a tracker keeps its contract."""
-    from dynslam_bench.testing import tracker_report
+    """Check that a tracker keeps its contract, in a process of its own."""
+    from dynslam_bench.testing import Check, isolated_tracker_report
 
-    report = tracker_report(tracker, settings=gather_settings(assignments, settings, {}), frames=frames)
+    def told(check: Check) -> None:
+        if not as_json:
+            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""), now=True)
+
+    with heartbeat() as beat:
+        report = isolated_tracker_report(
+            tracker, settings=gather_settings(assignments, settings, {}), frames=frames, frame_s=time_limit,
+            start_s=5 * time_limit, memory_mb=memory_limit, on_check=told,
+            on_wait=lambda running: beat(f"checking: {running}"),
+        )  # fmt: skip
     if as_json:
         write_json({"subject": report.subject, "ok": report.ok, "checks": [check.__dict__ for check in report.checks]})
     else:
-        for check in report.checks:
-            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""))
         write(f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed")
     if not report.ok:
         raise typer.Exit(VERIFICATION_FAILED)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.geometry import se3
 
+from .conditioning import RELIABLE_DEG, rotation_uncertainty_deg
 from .protocol import Alignment
 
 Array = NDArray[np.float64]
@@ -26,12 +27,20 @@ class Similarity:
         degenerate: Whether the positions did not determine the rotation (no motion, or motion on a line); it then
             follows from the orientations, which leaves translational errors at their minimum all the same. Of a
             camera that does not move the scale is 1.
+        uncertainty_deg: Standard error of the rotation, see `conditioning`; None where the rotation does not come from
+            the positions alone or there are too few of them.
     """
 
     rotation: Array
     translation: Array
     scale: float = 1.0
     degenerate: bool = False
+    uncertainty_deg: float | None = None
+
+    @property
+    def rotation_reliable(self) -> bool:
+        """Whether absolute rotational errors under this alignment are errors of the estimate."""
+        return self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG
 
     def apply(self, poses: Array) -> Array:
         """Poses ``[N, 4, 4]`` moved; rotations stay rotations."""
@@ -76,7 +85,10 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         variance = float(((source - centre_source) ** 2).sum() / len(source))
         moves = variance > np.finfo(float).eps * max(1.0, float((source**2).max()))
         scale = weighted / variance if moves else 1.0  # without motion every scale gives the same positions
-    return Similarity(rotation, centre_target - scale * rotation @ centre_source, scale, degenerate)
+    uncertainty = None if degenerate else rotation_uncertainty_deg(source, target, rotation)
+    return Similarity(
+        rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, uncertainty
+    )  # fmt: skip
 
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:

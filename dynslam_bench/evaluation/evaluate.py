@@ -16,6 +16,7 @@ from . import frames
 from .alignment import Similarity, align
 from .ape import absolute_errors
 from .association import Association, match
+from .conditioning import RELIABLE_DEG
 from .never_move import never_move
 from .protocol import Alignment, Protocol, get_protocol
 from .rpe import RelativeErrors, evo_relative_errors, tum_relative_errors
@@ -26,13 +27,22 @@ SCHEMA_VERSION = 1
 
 
 class AlignmentRecord(Record):
-    """The alignment that was applied: ``p_gt = scale * R p_est + t``."""
+    """The alignment that was applied: ``p_gt = scale * R p_est + t``; see `Similarity`.
+
+    Records of earlier versions lack `uncertainty_deg`.
+    """
 
     mode: Alignment
     rotation: list[list[float]]
     translation_m: list[float]
     scale: float
     degenerate: bool
+    uncertainty_deg: float | None = None
+
+    @property
+    def rotation_reliable(self) -> bool:
+        """Whether the metrics ``ape_rot_*`` are errors of the estimate rather than of the alignment."""
+        return self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG
 
 
 class AssociationRecord(Record):
@@ -142,6 +152,8 @@ def evaluate(
     similarity = align(matched, truth, protocol.alignment)
     if similarity.degenerate:
         diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
+    if not similarity.rotation_reliable:
+        diagnostics.append(_unreliable(similarity, truth))
     aligned = similarity.apply(matched)
     translation, rotation = absolute_errors(aligned, truth)
     metrics = {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
@@ -169,6 +181,7 @@ def evaluate(
             translation_m=similarity.translation.tolist(),
             scale=similarity.scale,
             degenerate=similarity.degenerate,
+            uncertainty_deg=similarity.uncertainty_deg,
         ),
         association=AssociationRecord(
             n_estimate=association.n_estimate,
@@ -224,6 +237,17 @@ def pose_errors(
         Trajectory(stamps, aligned[first]),
         Trajectory(stamps, truth[first]),
         {"trans_m": translation[first], "rot_deg": rotation[first]},
+    )
+
+
+def _unreliable(similarity: Similarity, truth: np.ndarray) -> str:
+    """Says why the absolute rotational error is none of the tracker's."""
+    positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+    along, *across = np.linalg.svd(positions, compute_uv=False) / np.sqrt(len(positions))
+    return (
+        f"the path (spread {along:.3f} m along, {across[0]:.3f} and {across[1]:.3f} m across) hardly determines the "
+        f"alignment's rotation with such errors: +-{similarity.uncertainty_deg:.0f} degrees; the absolute rotational "
+        "error (ape_rot) is unreliable, the translational and the relative ones are not affected"
     )
 
 

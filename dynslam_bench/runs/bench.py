@@ -53,11 +53,13 @@ def run_many(
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
+    cancelled: Callable[[], bool] | None = None,
 ) -> list[RunRecord]:
     """Make the runs that are not stored yet, and score all of them.
 
-    Everything is looked up before the first run begins. Each run is a child process; a failure is a record like any
-    other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on where it stopped.
+    Everything is looked up before the first run begins. A stored run is made again if a video or a sheet is asked for
+    that it lacks; one that is given another label gets that. Each run is a child process; a failure is a record like
+    any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from there.
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -70,6 +72,7 @@ def run_many(
         on_event: Told of everything that happens, from several threads but never two at a time.
         on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
         protocol: Protocol to score under.
+        cancelled: Asked many times a second; True ends the runs on this machine at once, as stopped.
 
     Returns:
         The records in the order of `specs`.
@@ -84,14 +87,14 @@ def run_many(
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
     resolved = [resolve(spec) for spec in specs]
     store.prepare()
-    bench = _Bench(store, protocol, len(resolved), on_event, on_progress)
+    bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs, cancelled)
     todo: dict[str, ResolvedRun] = {}
     done: dict[str, RunRecord] = {}
     for run in resolved:
         if run.run_id in todo or run.run_id in done:
             continue
         stored = store.get(run.run_id)
-        if stored is not None and stored.status not in again:
+        if stored is not None and stored.status not in again and not _lacks_pictures(store, run, stored):
             done[run.run_id] = bench.reuse(run, stored)
         else:
             todo[run.run_id] = run
@@ -107,13 +110,19 @@ class _Bench:
         total: int,
         on_event: Callable[[RunEvent], None] | None,
         on_progress: OnProgress | None,
+        jobs: int,
+        cancelled: Callable[[], bool] | None,
     ) -> None:
+        self.jobs = jobs
+        self.cancelled_outside = cancelled or (lambda: False)
         self.store, self.protocol, self.total = store, protocol, total
         self.on_event, self.on_progress = on_event, on_progress
         self.lock = threading.Lock()
         self.cancelled = threading.Event()
 
     def reuse(self, run: ResolvedRun, record: RunRecord) -> RunRecord:
+        if run.spec.label not in ("", record.tracker.label):
+            record = self.store.relabel(record, run.spec.label)
         score(self.store, record, self.protocol)
         self.tell("reused", run, record=record)
         return record
@@ -155,12 +164,16 @@ class _Bench:
             return self.on_progress is None or self.on_progress(run_id, partial)
 
         record = run_one(
-            run, self.store, on_progress=progress, protocol=self.protocol, cancelled=self.cancelled.is_set
+            run, self.store, on_progress=progress, protocol=self.protocol, cancelled=self._is_cancelled,
+            at_a_time=self.jobs,
         )  # fmt: skip
         if record.status != "stopped":
             score(self.store, record, self.protocol)
         self.tell("finished", run, record=record)
         return record
+
+    def _is_cancelled(self) -> bool:
+        return self.cancelled.is_set() or self.cancelled_outside()
 
     def tell(
         self,
@@ -173,6 +186,14 @@ class _Bench:
         if self.on_event is not None:
             with self.lock:
                 self.on_event(RunEvent(kind, run.run_id, run.spec, self.total, record, partial))
+
+
+def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
+    """Whether a stored run has to be made again for a video or a sheet that is asked for now."""
+    folder = store.folder(stored.run_id)
+    wanted = [name for name, asked in (("video.mp4", run.spec.video), ("sheet.png", run.spec.sheet)) if asked]
+    excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
+    return not stored.failed and any(not (folder / name).is_file() for name in set(wanted) - excused)
 
 
 def _statuses(retry: Collection[str]) -> set[str]:

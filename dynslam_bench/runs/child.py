@@ -9,9 +9,9 @@ that a crash loses nothing, and at the end the final trajectory and the map.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import json
+import logging
 import os
 import resource
 import signal
@@ -22,9 +22,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.plugins import load_object
+
+from .failures import describe_failure
+from .family import adopt_orphans, die_with_parent, end_descendants
 
 FRAMES_FILE = "frames.jsonl"
+LOG_FILE = "log.txt"
+WORK = "dynslam_bench.runs.loop:run_loop"
+"""What a job does that does not say so itself."""
 
 
 def main(connection: Connection) -> int:
@@ -39,21 +45,21 @@ def main(connection: Connection) -> int:
     with contextlib.suppress(OSError):
         os.setsid()  # so that the parent can end this process together with what a tracker starts
     die_with_parent()
+    adopt_orphans()  # so that what a tracker starts and forgets is still seen below this process
     try:
         job = json.loads(connection.recv_bytes())
     except EOFError:
         return 0
-    _redirect(Path(job["folder"]) / "log.txt")
+    _redirect(Path(job["folder"]) / LOG_FILE)
     stop = threading.Event()
     threading.Thread(target=_listen, args=(connection, stop), daemon=True).start()
     try:
         _prepare(job)
-        from .loop import run_loop
-
-        message = run_loop(job, lambda message: _send(connection, message), stop.is_set)
+        work = load_object(job.get("work", WORK))
+        message = work(job, lambda message: _send(connection, message), stop.is_set)
     except BaseException as error:
         traceback.print_exc()
-        message = _failure(error)
+        message = describe_failure(error)
     _send(connection, message | {"peak_memory_mb": peak_memory_mb()})
     sys.stdout.flush()
     sys.stderr.flush()
@@ -64,13 +70,6 @@ def peak_memory_mb() -> float:
     """Largest resident memory of this process so far."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
-
-
-def die_with_parent() -> None:
-    """Ask Linux to kill this process when the one that forked it ends; elsewhere the closing connection has to do."""
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGKILL, 0, 0, 0)
 
 
 def _listen(connection: Connection, stop: threading.Event) -> None:
@@ -104,6 +103,9 @@ def _redirect(log: Path) -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(line_buffering=True)
     faulthandler.enable(file=2, all_threads=False)
+    programs = logging.getLogger("dynslam_bench.trackers.adapters.program")
+    programs.setLevel(logging.INFO)
+    programs.addHandler(logging.StreamHandler(sys.stderr))
 
 
 def _prepare(job: dict[str, Any]) -> None:
@@ -131,17 +133,31 @@ def limit_threads(threads: int) -> None:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
 
 
-def _failure(error: BaseException) -> dict[str, Any]:
-    from dynslam_bench.envs.contract import TrackerContractError
+def keep(connection_fd: int) -> int:
+    """Make the run in a process below this one, which adopts and ends whatever the run leaves behind.
 
-    text = (str(error).strip().splitlines() or [""])[0]
-    if isinstance(error, MemoryError) or "out of memory" in text.lower() or type(error).__name__ == "OutOfMemoryError":
-        return {"type": "failed", "status": "out-of-memory", "reason": f"{type(error).__name__}: {text}".rstrip(": ")}
-    if isinstance(error, TrackerContractError):
-        return {"type": "failed", "status": "invalid", "reason": str(error)}
-    reason = str(error) if isinstance(error, DynslamError) else f"{type(error).__name__}: {text}".rstrip(": ")
-    return {"type": "failed", "status": "crashed", "reason": reason}
+    Returns:
+        The run's exit code; does not return if a signal ended the run, but ends by the same one.
+    """
+    if not adopt_orphans():
+        return main(Connection(connection_fd))
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            code = main(Connection(connection_fd))
+        finally:
+            os._exit(code)
+    os.close(connection_fd)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    end_descendants()
+    if code < 0:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if -code not in (signal.SIGKILL, signal.SIGSTOP):
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    return code
 
 
 if __name__ == "__main__":
-    sys.exit(main(Connection(int(sys.argv[1]))))
+    os._exit(keep(int(sys.argv[1])))  # threads that a tracker left running must not hold it up

@@ -10,15 +10,17 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.sequences.part import part_of
 
-from .child import FRAMES_FILE
+from .child import FRAMES_FILE, LOG_FILE
 from .forkserver import THREAD_VARIABLES
 from .frames import FrameLog
 from .identity import ResolvedRun, resolve
+from .log_file import LogFile
 from .machine import git_revision, this_machine, versions
 from .process import start_child
 from .record import RunRecord, SequenceInfo, Status, TrackerInfo
@@ -49,6 +51,7 @@ def run_one(
     protocol: Protocol | str = DEFAULT_PROTOCOL,
     progress_every: int = PROGRESS_EVERY,
     cancelled: Callable[[], bool] | None = None,
+    at_a_time: int = 1,
 ) -> RunRecord:
     """Make a run in a child process and store it, whatever becomes of it.
 
@@ -62,12 +65,14 @@ def run_one(
         protocol: Protocol of the partial metrics.
         progress_every: Frames between two of them.
         cancelled: Asked many times a second; True ends the run at once, as stopped.
+        at_a_time: Runs that share this machine; the default memory limit is divided among them.
 
     Returns:
         The record.
 
     Raises:
-        DynslamError: The request names something unknown or unfit, or the store cannot be written.
+        DynslamError: The request names something unknown or unfit (nothing is stored then), or the store cannot be
+            written.
     """
     resolved = resolve(run) if isinstance(run, RunSpec) else run
     run_id = resolved.run_id
@@ -84,7 +89,13 @@ def run_one(
             "path": list(sys.path),
         }
         listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
-        verdict = supervise(start_child(), job, resolved.spec.limits, listener, cancelled)
+        log = LogFile(work / LOG_FILE)
+        verdict = supervise(
+            start_child(), job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time
+        )  # fmt: skip
+        log.finish()
+        if verdict.refused:
+            raise RunError(f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}")
         frames = FrameLog.read(work / FRAMES_FILE)
         frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
         (work / FRAMES_FILE).unlink(missing_ok=True)
@@ -125,9 +136,10 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     return RunRecord(
         run_id=resolved.run_id, status=status, reason=reason,
         tracker=TrackerInfo(
-            id=tracker.id, label=tracker.label, version=tracker.version, distribution=identity["distribution"],
-            provenance=tracker.provenance, ranked=tracker.ranked, deterministic=tracker.deterministic,
-            license=tracker.license, citation=tracker.citation, remarks=tracker.remarks,
+            id=tracker.id, label=spec.label or tracker.label, version=tracker.version,
+            distribution=identity["distribution"], provenance=tracker.provenance, ranked=tracker.ranked,
+            deterministic=tracker.deterministic, license=tracker.license, citation=tracker.citation,
+            remarks=tracker.remarks,
         ),
         overrides=spec.settings, settings=flatten(resolved.settings),
         sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
@@ -142,7 +154,7 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         wall_s=wall_s, peak_memory_mb=verdict.peak_memory_mb or None, peak_gpu_memory_mb=final.get("gpu_memory_mb"),
         machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}), versions=versions(),
         git=git_revision(), command=list(sys.argv), identity=identity,
-        notes=[CACHED_TIMES] if spec.cache else [], place=place_of(spec.sequence),
+        notes=[*([CACHED_TIMES] if spec.cache else []), *final.get("notes", [])], place=place_of(spec.sequence),
     )  # fmt: skip
 
 

@@ -2,7 +2,8 @@
 
 It is told what to do over a Unix socket: one byte with two file descriptors, the child's end of its connection and a
 pipe on which the server answers with the child's process id and, later, its wait status, a JSON line each. When the
-socket closes, because the parent ended in whatever way, the server kills its children and goes.
+socket closes, because the parent ended in whatever way, the server kills its children and goes. A run's end is reported
+only after everything that it had started has ended, too.
 
 (Python's own ``forkserver`` re-imports the caller's main script in every child and may not be used in daemonic
 processes; this one does neither.)
@@ -21,10 +22,13 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Collection
 from multiprocessing.connection import Connection
 from typing import NoReturn
 
 from dynslam_bench.core.errors import RunError
+
+from .family import adopt_orphans, children, end_descendants, end_family
 
 PRELOADED = (
     "numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium", "dynslam_bench.envs",
@@ -125,6 +129,8 @@ atexit.register(SERVER.close)
 def serve(fd: int) -> None:
     """The server's loop, until the socket `fd` closes."""
     _preload()
+    adopt_orphans()  # what a run leaves behind becomes a child of this process, and is ended
+    own = frozenset(children(os.getpid()))
     control = socket.socket(fileno=fd)
     wake_read, wake_write = os.pipe()
     for end in (wake_read, wake_write):
@@ -135,51 +141,50 @@ def serve(fd: int) -> None:
     selector = selectors.DefaultSelector()
     selector.register(control, selectors.EVENT_READ)
     selector.register(wake_read, selectors.EVENT_READ)
-    children: dict[int, int] = {}
+    runs: dict[int, int] = {}
     while True:
         for key, _ in selector.select():
             if key.fileobj is control:
                 message, fds, _, _ = socket.recv_fds(control, 1, 2)
                 if not message:
-                    _end(children)
+                    _end(runs)
                     return
                 connection_fd, status_fd = fds
                 pid = os.fork()
                 if pid == 0:
                     selector.close()
-                    for inherited in (fd, wake_read, wake_write, status_fd, *children.values()):
+                    for inherited in (fd, wake_read, wake_write, status_fd, *runs.values()):
                         os.close(inherited)
                     control.detach()
                     _become_child(connection_fd)
                 os.close(connection_fd)
                 _tell(status_fd, {"pid": pid})
-                children[pid] = status_fd
+                runs[pid] = status_fd
             else:
                 with contextlib.suppress(BlockingIOError):
                     os.read(wake_read, 4096)
-        _reap(children)
+        _reap(runs, own)
 
 
-def _reap(children: dict[int, int]) -> None:
-    while children:
-        try:
-            pid, status = os.waitpid(-1, os.WNOHANG)
-        except ChildProcessError:
-            return
-        if pid == 0:
-            return
-        status_fd = children.pop(pid, None)
-        if status_fd is not None:
-            _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
-            os.close(status_fd)
+def _reap(runs: dict[int, int], own: Collection[int]) -> None:
+    """Bury the runs that have ended, end what they left behind, then report them."""
+    ended: list[tuple[int, int]] = []
+    for pid in list(runs):
+        with contextlib.suppress(ChildProcessError):
+            buried, status = os.waitpid(pid, os.WNOHANG)
+            if buried:
+                ended.append((runs.pop(pid), status))
+    if ended:
+        end_descendants({*runs, *own})
+    for status_fd, status in ended:
+        _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
+        os.close(status_fd)
 
 
-def _end(children: dict[int, int]) -> None:
-    for pid in children:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(pid, signal.SIGKILL)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+def _end(runs: dict[int, int]) -> None:
+    for pid in runs:
+        end_family(pid)
+    end_descendants()
 
 
 def _tell(fd: int, message: dict[str, int]) -> None:

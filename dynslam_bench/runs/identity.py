@@ -9,8 +9,8 @@ from typing import Any
 
 import dynslam_bench
 from dynslam_bench.core.errors import RunError, SequenceError
-from dynslam_bench.core.fingerprint import code_digest, named_digests, plugin_digest
-from dynslam_bench.core.plugins import Registry
+from dynslam_bench.core.fingerprint import code_digest, named_digests, path_digest, plugin_digest
+from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.envs.degrade_frames import Degradation
@@ -18,7 +18,8 @@ from dynslam_bench.envs.device import resolve_device
 from dynslam_bench.envs.source import open_frames, preprocessing_of
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.flow.spec import FLOWS
-from dynslam_bench.segmentation.build import resolve_source, weights_digest
+from dynslam_bench.segmentation.availability import segmentation_source
+from dynslam_bench.segmentation.build import weights_digest
 from dynslam_bench.segmentation.registry import SEGMENTERS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.frame import Sequence
@@ -81,7 +82,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
     _check_degradation(spec.degrade)
     device = resolve_device(spec.device)
-    source = _segmentation_source(settings, sequence)
+    source = segmentation_source(settings, sequence)
     known = versions()
     part = part_of(sequence, spec.offset)
     identity = {
@@ -93,6 +94,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "settings": flatten(settings),
         "segmentation": source,
         "weights": weights_of(settings, source),
+        **files_of(tracker, settings),
         "sequence": part.id,
         "content": part.content,
         "camera": part.camera,
@@ -168,11 +170,11 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
     return found
 
 
-def _segmentation_source(settings: Settings, sequence: Sequence) -> str:
-    group = getattr(settings, "segmentation", None)
-    if not isinstance(group, SegmentationSettings):
-        return ""
-    return resolve_source(group, sequence.id, sequence.masks)
+def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, list[str]]:
+    """``files``: digests of what the tracker's spec says decides its results beside its settings; else nothing."""
+    if not tracker.files:
+        return {}
+    return {"files": [path_digest(path) for path in load_object(tracker.files)(settings)]}
 
 
 def _check_degradation(strengths: dict[str, float]) -> None:

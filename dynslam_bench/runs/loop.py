@@ -21,6 +21,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.tum_file import write_tum
 
 from .child import FRAMES_FILE
+from .failures import at
 from .sheet import SheetWriter
 from .spec import RunSpec
 
@@ -59,7 +60,9 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     sheet = SheetWriter(folder / "sheet.png", base) if spec.sheet else None
     with (folder / FRAMES_FILE).open("w") as log:
         writer = _FrameWriter(base, log)
-        env.reset(seed=spec.seed)
+        position = _Position(base)
+        with at(position):
+            env.reset(seed=spec.seed)
         over = False
         reported = 0
         while True:
@@ -78,13 +81,25 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             if stopping():
                 env.close()
                 return {"type": "stopped", "frames": done}
-            _, _, terminated, truncated, _ = env.step(0)
+            with at(position):
+                _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
     if video is not None:
         video.close()
-    outcome = _finish(base, folder, sheet)
-    env.close()
+    with at("after the last frame"):
+        outcome = _finish(base, folder, sheet)
+        env.close()
     return {"type": "done", **outcome}
+
+
+class _Position:
+    """Says which frame is being tracked."""
+
+    def __init__(self, env: SlamEnv) -> None:
+        self._env = env
+
+    def __str__(self) -> str:
+        return f"frame {self._env.episode.next_index} of {len(self._env.sequence)}"
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:
@@ -104,6 +119,7 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
     began = time.perf_counter()
     final = env.final_trajectory()
     outcome: dict[str, Any] = {"finalize_s": None, "keyframes": None, "map_points": None, "gpu_memory_mb": None}
+    notes: list[str] = []
     if final is not None:
         outcome["finalize_s"] = time.perf_counter() - began
         write_tum(folder / "trajectory_final.txt", final)
@@ -116,12 +132,14 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
         if sheet is not None:
             sheet.write(outputs, env.online_trajectory() if final is None else final)
         outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
+    elif sheet is not None:
+        notes.append("no sheet.png: the tracker offers neither keyframes nor a map")
     if env.device.startswith("cuda"):
         import torch
 
         outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
         outcome["gpu"] = torch.cuda.get_device_name(env.device)
-    return outcome
+    return outcome | {"notes": notes}
 
 
 class _FrameWriter:

@@ -8,13 +8,15 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from abc import ABC, abstractmethod
-from multiprocessing.connection import Connection, Pipe
-from pathlib import Path
+from multiprocessing.connection import Connection, Pipe, wait
 
+from .family import end_family, family
 from .forkserver import SERVER, child_environment
 
-_PROC = Path("/proc/self")
+_KEEPER_S = 3.0
+_BURIAL_S = 10.0
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 
@@ -42,9 +44,7 @@ class Child(ABC):
     def kill(self) -> None:
         """End it, with everything that it started."""
         if self.pid and self.poll() is None:
-            for end in (os.killpg, os.kill):
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    end(self.pid, signal.SIGKILL)
+            end_family(self.pid)
 
     def close(self) -> None:
         """Kill it if it still runs, and release what belongs to it."""
@@ -92,15 +92,18 @@ class ForkedChild(Child):
         return self._exit
 
     def close(self) -> None:
-        """Kill it if it still runs, and release the pipes."""
+        """Kill it if it still runs, wait until it and all that it started are buried, and release the pipes."""
         super().close()
+        deadline = time.monotonic() + _BURIAL_S
+        while self.poll() is None and time.monotonic() < deadline:
+            wait([self._status_fd], 0.1)
         if self._status_fd >= 0:
             os.close(self._status_fd)
             self._status_fd = -1
 
 
 class FreshChild(Child):
-    """A child in an interpreter of its own."""
+    """A child in an interpreter of its own; on Linux below a keeper, see `child.keep`."""
 
     def __init__(self) -> None:
         ours, theirs = Pipe()
@@ -121,10 +124,25 @@ class FreshChild(Child):
         """Its exit code, None while it runs."""
         return self._process.poll()
 
+    def kill(self) -> None:
+        """End it, with everything that it started; a keeper ends by itself once it has buried them."""
+        if self.poll() is not None:
+            return
+        below = family(self.pid)[1:]
+        for member in below:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(member, signal.SIGKILL)
+        try:
+            self._process.wait(_KEEPER_S if below else 0.0)
+        except subprocess.TimeoutExpired:
+            end_family(self.pid)
+
     def close(self) -> None:
-        """Kill it if it still runs, and reap it."""
+        """Kill it if it still runs, reap it, and end what is left of its process group."""
         super().close()
         self._process.wait()
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
 
 
 def start_child() -> Child:
@@ -135,34 +153,3 @@ def start_child() -> Child:
     """
     how = os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
     return FreshChild() if how == "fresh" else ForkedChild()
-
-
-def resident_mb(pid: int) -> float:
-    """Resident memory in MB of a process and (on Linux) its descendants; 0 if it is gone."""
-    if _PROC.is_dir():
-        return sum(_linux_rss_mb(member) for member in _group_members(pid))
-    result = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False)
-    return sum(float(line) for line in result.stdout.split()) * 1024 / 1e6
-
-
-def _group_members(pid: int) -> list[int]:
-    """The process and its descendants, by way of the kernel's lists of children."""
-    members, fresh = [pid], [pid]
-    while fresh:
-        parent = fresh.pop()
-        for children in Path(f"/proc/{parent}/task").glob("*/children"):
-            try:
-                found = [int(text) for text in children.read_text().split()]
-            except OSError:
-                continue
-            members += found
-            fresh += found
-    return members
-
-
-def _linux_rss_mb(pid: int) -> float:
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, IndexError, ValueError):
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

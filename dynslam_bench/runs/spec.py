@@ -20,7 +20,8 @@ class Limits(Record):
         time_s: Wall-clock time of the whole run; None for no limit.
         start_s: Time until frame 0 is tracked: loading networks, compiling kernels.
         frame_s: Time for any later frame, and for the final optimisation.
-        memory_mb: Resident memory of the run's process and its children; None for no limit.
+        memory_mb: Memory of the run's process and its children, shared pages counted once; None for the default, a
+            share of the machine's memory (see `memory.memory_limit`), 0 for no limit.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -28,7 +29,7 @@ class Limits(Record):
     time_s: float | None = Field(default=None, gt=0)
     start_s: float = Field(default=600.0, gt=0)
     frame_s: float = Field(default=120.0, gt=0)
-    memory_mb: float | None = Field(default=None, gt=0)
+    memory_mb: float | None = Field(default=None, ge=0)
 
 
 class RunSpec(Record):
@@ -53,6 +54,7 @@ class RunSpec(Record):
         camera: Camera of a folder that does not say its own.
         video: Whether to write ``video.mp4``.
         sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
+        label: Name in tables, in place of the tracker's; no part of the run's identity.
         limits: What it may take.
     """
 
@@ -75,6 +77,7 @@ class RunSpec(Record):
     camera: str | None = None
     video: bool = False
     sheet: bool = False
+    label: str = ""
     limits: Limits = Field(default_factory=Limits)
 
     @field_validator("frames", mode="before")

@@ -129,6 +129,16 @@ class RunStore:
             write_atomic(folder / "groundtruth.txt", format_tum(ground_truth))
         write_atomic(folder / "timestamps.txt", "".join(f"{stamp:.6f}\n" for stamp in timestamps.tolist()))
 
+    def relabel(self, record: RunRecord, label: str) -> RunRecord:
+        """Give a stored run another name in tables; everything else of it stays.
+
+        Raises:
+            DynslamError: It cannot be written.
+        """
+        changed = record.model_copy(update={"tracker": record.tracker.model_copy(update={"label": label})})
+        write_atomic(self.folder(record.run_id) / RUN_FILE, changed.to_json())
+        return changed
+
     def add_metrics(self, metrics: MetricRecord) -> None:
         """Write a run's metrics under a protocol."""
         write_atomic(self._metric_file(metrics.run_id, metrics.protocol_digest), metrics.to_json())

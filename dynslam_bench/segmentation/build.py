@@ -21,13 +21,16 @@ LOWEST_CONFIDENCE = 0.1
 """Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
 
 
-def resolve_source(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:
+def resolve_source(
+    settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None, *, optional: bool = False
+) -> str:  # fmt: skip
     """What `settings.source` means for a sequence; the label stored with results.
 
     Args:
         settings: Whose `source` is resolved.
         sequence_id: Id of the sequence, for ``auto``.
         masks: Its exact masks, if it has them.
+        optional: Whether who asks also works without masks, for the hint.
 
     Returns:
         ``auto`` becomes ``embedded``, ``oracle`` or ``coco``; everything else stays as it is.
@@ -44,14 +47,18 @@ def resolve_source(settings: SegmentationSettings, sequence_id: str = "", masks:
             return "oracle"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    available = ["segmentation.source=none (no masks)", "onnx:PATH", "recorded:DIR", "weights:PATH",
+    available = ["onnx:PATH", "recorded:DIR", "weights:PATH",
                  f"coco (downloads {COCO.megabytes} MB from {COCO.url})"]  # fmt: skip
     if masks is not None:
-        available.insert(1, "oracle (the sequence's exact masks)")
+        available.insert(0, "oracle (the sequence's exact masks)")
+    if optional:
+        available.insert(0, "none (no masks)")
+    else:
+        available.append("or a system that needs no masks, e.g. emfoa-oft-no-masks or orb-slam2")
     what = f"sequence '{sequence_id}'" if sequence_id else "this sequence"
     raise SegmentationError(
         f"segmentation.source=auto finds no network for {what}: the COCO checkpoint is not in the cache",
-        "choose one of: " + ", ".join(available),
+        "choose one of: segmentation.source=" + ", ".join(available),
     )
 
 

@@ -79,6 +79,19 @@ class RecordedSegmenter:
         names = tuple(self._name(value, path) for value in values)
         return Instances(masks, boxes_of(masks), names, np.ones(len(values), np.float32))
 
+    def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
+        """Indices of the frames that have no file.
+
+        Args:
+            timestamps: Stamps in seconds of all frames, in their order.
+        """
+        wanted = timestamps if self.by_stamp else np.arange(len(timestamps), dtype=np.float64)
+        after = np.searchsorted(self._keys, wanted).clip(1, max(len(self._keys) - 1, 1))
+        near = np.stack([self._keys[after - 1], self._keys[np.minimum(after, len(self._keys) - 1)]])
+        distance = np.abs(near - wanted).min(axis=0)
+        found = distance < MAX_DIFFERENCE_S if self.by_stamp else distance == 0
+        return [int(index) for index in np.flatnonzero(~found)]
+
     def _find(self, frame: Frame) -> Path:
         wanted = frame.timestamp if self.by_stamp else float(frame.index)
         nearest = int(np.argmin(np.abs(self._keys - wanted)))

@@ -5,6 +5,7 @@ same checks and returns the outcome of every one.
 """
 
 from .filter import check_filter, filter_report, filter_scene
+from .isolated import isolated_tracker_report
 from .report import Check, ConformanceError, ConformanceReport
 from .scenes import CornerSequence, hard_frames
 from .segmenter import check_segmenter, segmenter_report
@@ -23,6 +24,7 @@ __all__ = [
     "filter_report",
     "filter_scene",
     "hard_frames",
+    "isolated_tracker_report",
     "segmenter_report",
     "sequence_report",
     "tracker_report",

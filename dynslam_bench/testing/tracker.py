@@ -17,7 +17,7 @@ from dynslam_bench.slam.result import TrackResult
 from dynslam_bench.trackers.protocol import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
-from .report import ConformanceError, ConformanceReport, NotApplicable, require
+from .report import ConformanceError, ConformanceReport, NotApplicable, require, still_alive
 from .scenes import CornerSequence, hard_frames
 from .steering import check_steering
 
@@ -131,6 +131,7 @@ def check_result(result: TrackResult, frame: Frame) -> None:
     Raises:
         ConformanceError: Something in it breaks the contract.
     """
+    still_alive()
     at = f"frame {frame.index}"
     require(isinstance(result, TrackResult), f"{at}: track() gave a {type(result).__name__}, not a TrackResult",
             "a bare pose has to be wrapped: TrackResult(T_world_cam, 'ok')")  # fmt: skip

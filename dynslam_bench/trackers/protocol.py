@@ -95,6 +95,8 @@ class TrackerSpec:
         bound: Settings fixed by the way it was named, dotted name to value; ``TRACKERS.get("id:value")`` fills it in.
         check: ``"module:function"``; the function returns an install hint if the tracker cannot run here although all
             of `requires` can be imported, else an empty string.
+        files: ``"module:function"``; called with the settings, the function returns the files whose content decides
+            what the tracker does and that no setting names by itself, for a run's identity; empty if there are none.
     """
 
     id: str
@@ -118,6 +120,7 @@ class TrackerSpec:
     parameter: str = ""
     bound: Mapping[str, Any] = field(default_factory=dict)
     check: str = ""
+    files: str = ""
 
     def missing(self) -> list[str]:
         """Install hints of what is required but not there; empty if the tracker can run."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -95,14 +96,18 @@ LIMITS = Limits(frame_s=3.0)
 @pytest.mark.parametrize(
     ("mode", "status", "reason"),
     [
-        ("raise", "crashed", "ValueError: the toy tracker raised on purpose"),
+        ("raise", "crashed", "frame 4 of 60: ValueError: the toy tracker raised on purpose (envs_toys.py:"),
         ("segfault", "crashed", "SIGSEGV (segmentation fault), after frame 3 of 60"),
         ("exit", "crashed", "the process left with exit code 3, after frame 3 of 60"),
         ("nan", "invalid", "tracker 'toy' at frame 4 returned a pose with 16 values that are not finite"),
         ("scaled", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
         ("mirrored", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
         ("string", "invalid", "tracker 'toy' at frame 4 returned a str"),
-        ("memoryerror", "out-of-memory", "MemoryError: the toy tracker ran out of memory on purpose"),
+        (
+            "memoryerror",
+            "out-of-memory",
+            "frame 4 of 60: MemoryError: the toy tracker ran out of memory on purpose (envs",
+        ),
         ("hang", "timeout", "no sign of life for 3 s, after frame 3 of 60"),
         ("lost", "lost", "tracked on 4 of 60 frames"),
         ("initialising", "lost", "tracked on 4 of 60 frames"),
@@ -316,3 +321,31 @@ def test_scores_under_another_protocol_need_no_run(store: RunStore, toy_folder: 
     assert score(store, record) == first and first.online and first.final
     assert json.loads((store.root / "metrics" / first.protocol_digest / f"{record.run_id}.json").read_text())
     assert np.allclose(store.ground_truth(record.sequence.part).T_world_cam, truth(60), atol=1e-6)
+
+
+ECHO = """#!{python}
+import json, sys
+sys.stderr.write("echo {version}\\n")
+for line in sys.stdin:
+    request = json.loads(line)
+    answer = dict(state="ok", T_world_cam=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+    print("on it", flush=True)
+    print(json.dumps(answer), flush=True)
+"""
+
+
+def test_a_rebuilt_program_is_another_run_and_its_words_are_kept(store: RunStore, toy_folder: str, tmp_path) -> None:
+    program = tmp_path / "slam"
+
+    def made(version: int) -> RunRecord:
+        program.write_text(ECHO.format(python=sys.executable, version=version))
+        program.chmod(0o755)
+        spec = RunSpec(tracker=f"subprocess:{program}", sequence=toy_folder, frames=(0, 3), label="my SLAM")
+        return run_one(spec, store)
+
+    first, second = made(1), made(2)
+    assert first.status == second.status == "ok" and first.run_id != second.run_id
+    assert made(1).run_id == first.run_id
+    assert first.tracker.label == "my SLAM"
+    log = (store.folder(second.run_id) / "log.txt").read_text()
+    assert "[slam] echo 2" in log and "[slam] on it" in log

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dynslam_bench.core.errors import PluginError, SettingsError, TrackerError, TrajectoryError
+from dynslam_bench.core.errors import PluginError, SettingsError, TrajectoryError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -123,7 +123,9 @@ def test_replay_id_carries_the_file(trajectory):
     assert TRACKERS.get("replay").id == "replay"
 
 
-def test_bound_values_stay_text():
+def test_bound_values_stay_text(trajectory, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trajectory[0].rename(tmp_path / "5")
     assert resolve_settings(TRACKERS.get("replay:5")).file == "5"
     assert resolve_settings(TRACKERS.get("subprocess:true")).command == "true"
 
@@ -142,7 +144,7 @@ def test_names_with_a_colon_still_load_specs(tmp_path):
 
 def test_replay_faults(tmp_path, trajectory):
     path, _, _ = trajectory
-    with pytest.raises(TrackerError, match="replay:FILE"):
+    with pytest.raises(SettingsError, match="replay:FILE"):
         build_tracker("replay")
     with pytest.raises(PluginError, match="lacks its file"):
         TRACKERS.get("replay:")

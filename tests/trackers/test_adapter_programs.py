@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import shutil
 import sys
 import textwrap
 import time
@@ -11,11 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.errors import SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TrackerContext, build_tracker
+from dynslam_bench.trackers.adapters.program import files_of_command
 
 CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.002, 0.3), baseline_m=0.08)
 
@@ -314,14 +316,55 @@ def test_faults_at_finalize(program):
 
 
 def test_commands_that_cannot_start(tmp_path):
-    with pytest.raises(TrackerError, match="subprocess:PROGRAM"):
-        build_tracker("subprocess")
-    with pytest.raises(TrackerError, match="cannot split"):
-        build_tracker("subprocess:'unclosed")
-    with pytest.raises(TrackerError, match="no folder"):
-        build_tracker("subprocess:ls", {"folder": str(tmp_path / "none")})
-    with pytest.raises(TrackerError, match="cannot start '/no/such/program'"):
-        reset(build_tracker("subprocess:/no/such/program --fast"))
+    (tmp_path / "text").write_text("no program")
+    for name, settings, words in (
+        ("subprocess", {}, "subprocess:PROGRAM"),
+        ("subprocess:'unclosed", {}, "cannot split"),
+        ("subprocess:ls", {"folder": str(tmp_path / "none")}, "no folder"),
+        ("subprocess:/no/such/program --fast", {}, "cannot start '/no/such/program'"),
+        ("subprocess:no-such-program", {}, "cannot start 'no-such-program'"),
+        ("subprocess:./text", {"folder": str(tmp_path)}, "cannot start './text'"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            build_tracker(name, settings)
+
+
+def test_last_words_are_the_last_ones(program):
+    """Standard output that is flushed at the end must not pass for what standard error said last."""
+    said = (
+        "sys.stdout.write('loading vocabulary\\n'); sys.stderr.write('FATAL: no such camera model\\n'); "
+        "sys.stderr.flush(); sys.stdout.flush(); os._exit(3)"
+    )
+    with pytest.raises(TrackerError, match=r"exit code 3; its last line: 'FATAL: no such camera model'"):
+        reset(program(said))
+    early = (
+        "sys.stderr.write('warning: old driver\\n'); sys.stderr.flush(); next(requests); say({'ok': True}); "
+        "next(requests); time.sleep(0.3); print('lost the map', flush=True); os._exit(1)"
+    )
+    tracker = reset(program(early))
+    with pytest.raises(TrackerError, match=r"its last line: 'lost the map'"):
+        tracker.track(frame(0))
+
+
+def test_what_a_program_writes_goes_to_the_log(program, caplog):
+    with caplog.at_level("INFO", logger="dynslam_bench"):
+        reset(
+            program("""
+        sys.stderr.write("version 1.2\\n"); sys.stderr.flush()
+        for request in requests:
+            print("working"); say({"state": "ok", "T_world_cam": STILL})
+        """)
+        ).track(frame(0))
+    assert {"version 1.2", "working"} <= {message.split("] ", 1)[1] for message in caplog.messages}
+
+
+def test_the_files_of_a_command(tmp_path):
+    script = tmp_path / "slam.py"
+    script.write_text("")
+    python = Path(shutil.which("env")).resolve()
+    assert files_of_command(["env", str(script), "--fast", "", "/no/such\0name"]) == [python, script.resolve()]
+    assert files_of_command(["./slam.py", "slam.py"], tmp_path) == [script.resolve()]
+    assert files_of_command([]) == []
 
 
 def test_close_kills_what_does_not_end(program):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import selectors
+import shutil
 import signal
 import subprocess
 import time
@@ -17,7 +19,8 @@ from typing import Any
 
 from dynslam_bench.core.errors import TrackerError
 
-KEPT_LINES = 40
+LOGGER = logging.getLogger(__name__)
+"""Told, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
 
 
 class Program:
@@ -25,8 +28,8 @@ class Program:
 
     Requests go to its standard input, one JSON object a line; it answers each with one JSON object a line on its
     standard output. Lines that do not begin with ``{`` are log output and skipped, as is all it writes to its standard
-    error; the last lines are kept for error messages. It has a session of its own, so that it is ended together with
-    whatever it started, and it should end by itself at the end of its standard input.
+    error; the last ones are kept for error messages, all of them go to `LOGGER`. It has a session of its own, so that
+    it is ended together with whatever it started, and it should end by itself at the end of its standard input.
 
     Args:
         name: For messages.
@@ -47,7 +50,7 @@ class Program:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        self._log: deque[str] = deque(maxlen=KEPT_LINES)
+        self._said = {"out": _Said(), "err": _Said()}
         self._partial = {"out": b"", "err": b""}
         self._answers: deque[str] = deque()
         try:
@@ -78,10 +81,17 @@ class Program:
 
     @property
     def last_words(self) -> str:
-        """The last line that is not blank of what it wrote as log."""
-        partial = [part.decode(errors="replace") for part in self._partial.values()]
-        lines = [line for line in (*self._log, *partial) if line.strip()]
-        return lines[-1].strip()[:300] if lines else ""
+        """The last line that is not blank of what it wrote as log.
+
+        What it wrote since the last request counts before what it wrote earlier, and standard error before standard
+        output: a program's standard output often arrives late, when it is flushed at the end.
+        """
+        for channel, partial in self._partial.items():
+            if partial.strip():
+                self._said[channel].add(partial.decode(errors="replace"))
+                self._partial[channel] = b""
+        said = sorted(self._said.items(), key=lambda item: (item[1].fresh, item[0] == "err"), reverse=True)
+        return next((words.last for _, words in said if words.last), "")
 
     def ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
         """Send a request and wait for its answer.
@@ -95,6 +105,8 @@ class Program:
             TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
         """
         self._answers.clear()
+        for said in self._said.values():
+            said.fresh = False
         line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
         text = self._exchange(line, timeout_s, doing)
         try:
@@ -120,6 +132,7 @@ class Program:
             while self.alive and time.monotonic() < deadline:
                 if not self._read(0.02):
                     time.sleep(0.005)
+            self._drain()
         self.kill()
 
     def kill(self) -> None:
@@ -167,8 +180,16 @@ class Program:
                 if channel == "out" and text.lstrip().startswith("{"):
                     self._answers.append(text)
                 elif text.strip():
-                    self._log.append(text)
+                    self._said[channel].add(text)
+                    LOGGER.info("[%s] %s", self.name, text)
         return any(key.data == "out" for key in self._selector.get_map().values())
+
+    def _drain(self) -> None:
+        """Take in the rest of its words; a grandchild may hold the pipe open for ever."""
+        for _ in range(64):
+            if not self._selector.get_map() or not self._selector.select(0.0):
+                break
+            self._read(0.0)
 
     def _death(self, doing: str) -> TrackerError:
         try:
@@ -176,14 +197,47 @@ class Program:
         except subprocess.TimeoutExpired:
             self.kill()
             return TrackerError(f"{self.name} {doing}: closed its output without an answer")
-        for _ in range(64):  # the rest of its last words; a grandchild may hold the pipe open for ever
-            if not self._selector.get_map() or not self._selector.select(0.0):
-                break
-            self._read(0.0)
+        self._drain()
         words = self.last_words
         self.kill()
         said = f"; its last line: '{words}'" if words else "; it wrote no message"
         return TrackerError(f"{self.name} {doing}: the program {_describe(code)}{said}")
+
+
+class _Said:
+    """What a program wrote to one channel, beside its answers."""
+
+    def __init__(self) -> None:
+        self.last = ""
+        self.fresh = False
+
+    def add(self, text: str) -> None:
+        self.last, self.fresh = text.strip()[:300], True
+
+
+def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:
+    """The files that a command names: its program, found as starting it would, and the arguments that are files.
+
+    A rebuilt program or an edited script is another tracker: their content belongs to a run's identity. Libraries and
+    modules that these load are not seen.
+
+    Args:
+        command: Program and arguments.
+        folder: Its working folder; None for the current one.
+    """
+    if not command:
+        return []
+    base = Path() if folder is None else folder
+    program = base / Path(command[0]).expanduser() if os.sep in command[0] else shutil.which(command[0])
+    named = [*([] if program is None else [Path(program)]), *(base / word for word in command[1:] if word)]
+    return list(dict.fromkeys(file.resolve() for file in named if _is_file(file)))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a word that cannot be a path
+        return False
 
 
 def _describe(code: int) -> str:

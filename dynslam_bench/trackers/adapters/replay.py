@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.sequences.frame import Frame
@@ -25,13 +24,10 @@ class Replay:
         settings: Which file, and the tolerance.
 
     Raises:
-        TrackerError: No file was named.
         TrajectoryError: The file is missing, damaged, or holds no pose.
     """
 
     def __init__(self, settings: ReplaySettings) -> None:
-        if not settings.file.strip():
-            raise TrackerError("replay needs a trajectory file", "write replay:FILE or --set file=FILE")
         self.settings = settings
         self._trajectory = read_tum(Path(settings.file).expanduser())
 

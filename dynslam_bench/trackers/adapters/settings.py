@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
+from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Settings, names, tunable
 
 
@@ -32,6 +37,14 @@ class ReplaySettings(Settings):
         0.01, gt=0, le=1, description="largest difference in seconds between a frame's stamp and its pose's"
     )
 
+    def verify(self) -> None:
+        """There must be a file, and a trajectory in it."""
+        from dynslam_bench.geometry.tum_file import read_tum
+
+        if not self.file.strip():
+            raise SettingsError("replay needs a trajectory file", "write replay:FILE or --set file=FILE")
+        read_tum(Path(self.file).expanduser())
+
 
 class ProgramSettings(Settings):
     """How long a foreign program may take."""
@@ -52,6 +65,30 @@ class SubprocessSettings(ProgramSettings):
     folder: str = Field("", description="working folder of the program; empty for the current one")
     version: str = Field("", description="free text, part of a run's identity; change it with the program")
     final: bool = Field(False, description="whether the program answers `finalize` with a final trajectory")
+
+    def words(self) -> list[str]:
+        """The command's words.
+
+        Raises:
+            SettingsError: There are none, or its quotes do not match.
+        """
+        try:
+            command = shlex.split(self.command)
+        except ValueError as error:
+            raise SettingsError(f"subprocess: cannot split the command '{self.command}': {error}") from None
+        if not command:
+            hint = "write 'subprocess:PROGRAM ARGUMENTS' or --set command=..."
+            raise SettingsError("subprocess needs a command", hint)
+        return command
+
+    def verify(self) -> None:
+        """The program and its folder must be there."""
+        command, folder = self.words(), Path(self.folder or ".").expanduser()
+        if not folder.is_dir():
+            raise SettingsError(f"subprocess: no folder {folder}")
+        program = command[0] if os.sep not in command[0] else str(folder / Path(command[0]).expanduser())
+        if shutil.which(program) is None:
+            raise SettingsError(f"subprocess: cannot start '{command[0]}': no such program", "check its path and mode")
 
 
 class OrbSlam3Settings(ProgramSettings):

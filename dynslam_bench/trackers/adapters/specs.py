@@ -58,7 +58,11 @@ SUBPROCESS = TrackerSpec(
     deterministic=False,
     provenance="external",
     parameter="command",
-    remarks="Change the setting `version` when the program changes, or stored runs of the old one are reused.",
+    files=f"{_HERE}.subprocess_tracker:files",
+    remarks=(
+        "The program and the files among its arguments are part of a run's identity; change the setting `version` when "
+        "what these load has changed, or stored runs of the old one are reused."
+    ),
 )
 
 ORBSLAM3 = TrackerSpec(
@@ -74,6 +78,7 @@ ORBSLAM3 = TrackerSpec(
         "C. Campos, R. Elvira, J. J. Gomez Rodriguez, J. M. M. Montiel, J. D. Tardos, ORB-SLAM3: An Accurate "
         "Open-Source Library for Visual, Visual-Inertial, and Multimap SLAM, IEEE T-RO 37(6), 2021"
     ),
+    files=f"{_HERE}.vocabulary:files",
     requires={"pyorbslam3": "pip install 'dynslam-bench[orbslam3]' (Linux x86-64)"},
     remarks=(
         "Assumes a static world and marks nothing as lost on dynamic scenes: it follows the people, coverage 100 %. "

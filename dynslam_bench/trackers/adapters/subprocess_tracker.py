@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from dynslam_bench.slam.result import TrackingState, TrackResult
 from dynslam_bench.trackers.protocol import TrackerContext
 
 from .exchange import ImageExchange
-from .program import Program
+from .program import Program, files_of_command
 from .settings import ProgramSettings, SubprocessSettings
 
 PROTOCOL = 1
@@ -183,20 +182,19 @@ class FinalizingProgramTracker(ProgramTracker):
             raise TrackerError(f"{self.name} at finalize: {error}") from error
 
 
+def files(settings: SubprocessSettings) -> list[Path]:
+    """The files whose content decides what ``subprocess:COMMAND`` does: see `files_of_command`."""
+    folder = Path(settings.folder).expanduser() if settings.folder else None
+    return files_of_command(settings.words(), folder)
+
+
 def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTracker:
     """The tracker of ``subprocess:COMMAND``.
 
     Raises:
-        TrackerError: No command was given, its quotes do not match, or its folder does not exist.
+        SettingsError: No command was given, or its quotes do not match.
     """
-    try:
-        command = shlex.split(settings.command)
-    except ValueError as error:
-        raise TrackerError(f"subprocess: cannot split the command '{settings.command}': {error}") from None
-    if not command:
-        raise TrackerError("subprocess needs a command", "write 'subprocess:PROGRAM ARGUMENTS' or --set command=...")
+    command = settings.words()
     folder = Path(settings.folder).expanduser() if settings.folder else None
-    if folder is not None and not folder.is_dir():
-        raise TrackerError(f"subprocess: no folder {folder}")
     kind = FinalizingProgramTracker if settings.final else ProgramTracker
     return kind(Path(command[0]).name, settings, context, command, images=settings.images, folder=folder)

@@ -13,12 +13,23 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.sequences.roots import user_cache
 
+from .settings import OrbSlam3Settings
+
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
 HINT = (
     f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
     f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
 )
 TOKENS = 35  # parent, whether it is a leaf, 32 bytes of the descriptor, weight
+
+
+def files(settings: OrbSlam3Settings) -> list[Path]:
+    """The vocabulary, whose content decides what ORB-SLAM3 finds again.
+
+    Raises:
+        TrackerError: See `find_vocabulary`.
+    """
+    return [find_vocabulary(settings.vocabulary)]
 
 
 def find_vocabulary(setting: str) -> Path:

@@ -1,0 +1,51 @@
+"""How well the positions determine the rotation of an alignment: the same fit on halves of the path.
+
+On an almost straight path the least-squares rotation about the path's direction follows the errors of the positions,
+not the path: orientations are then off by any angle, though every position fits. The path is cut into twelve blocks,
+which keep errors together that belong together; the alignment is repeated on the 22 halves (six blocks each) of a
+two-level design (Plackett and Burman, Biometrika, 1946), in which every block and every pair of blocks takes part
+equally often. The rotations' root-mean-square distance from that of the whole path estimates the standard error of that
+rotation: a delete-half jackknife.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BLOCKS = 12
+RELIABLE_DEG = 10.0
+"""With a larger uncertainty of the alignment's rotation, absolute rotational errors say nothing of the tracker."""
+_GENERATOR = np.array([1, 1, -1, 1, 1, 1, -1, -1, -1, 1, -1])
+_DESIGN = np.array([np.append(np.roll(_GENERATOR, shift), -1) for shift in range(len(_GENERATOR))])
+_HALVES = np.vstack([_DESIGN, -_DESIGN]) > 0
+
+
+def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> float | None:
+    """Standard error in degrees of the rotation that moves `source` onto `target`, in the least-squares sense.
+
+    Args:
+        source: Estimated positions in metres ``[N, 3]``, in the order of time.
+        target: Their true counterparts ``[N, 3]``.
+        rotation: The rotation found from all of them ``[3, 3]``.
+
+    Returns:
+        None for fewer positions than two a block.
+    """
+    if len(source) < 2 * BLOCKS:
+        return None
+    blocks = np.array_split(np.arange(len(source)), BLOCKS)
+    source, target = source - source.mean(axis=0), target - target.mean(axis=0)
+    weights = _HALVES.astype(np.float64)
+    count = weights @ [len(block) for block in blocks]
+    sums = weights @ np.array([source[block].sum(axis=0) for block in blocks])
+    target_sums = weights @ np.array([target[block].sum(axis=0) for block in blocks])
+    products = np.einsum("kb,bij->kij", weights, np.array([target[block].T @ source[block] for block in blocks]))
+    covariances = products - np.einsum("ki,kj->kij", target_sums, sums) / count[:, None, None]
+    u, _, vt = np.linalg.svd(covariances)
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    turned = np.einsum("kii->k", (u @ vt) @ rotation.T)
+    angles = np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
+    return float(np.sqrt((angles**2).mean()))

@@ -1,0 +1,110 @@
+"""`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
+
+import json
+import time
+
+import pytest
+from cli_errors import one_line
+
+from dynslam_bench.cli import output
+from dynslam_bench.cli.output import fitted, progress
+
+
+def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
+    command = ("run", "constant-velocity", walk, "--frames", "0:3", "--stride", "2", "--set", "frames=4")
+    code, out, _ = cli(*command, "--label", "my control")
+    assert code == 0 and "0:3, every 2nd" in out and "frames=4" in out and "from the store" not in out
+    code, out, _ = cli(*command)
+    assert code == 0 and "from the store" in out and "yes" in out.splitlines()[1]
+    (row,) = json.loads(cli(*command, "--json")[1])
+    assert row["from_store"] is True and row["settings"] == "frames=4" and row["part"] == "0:3, every 2nd"
+    listed = cli("runs", "list")[1]
+    assert "0:3, every 2nd" in listed and "frames=4" in listed and "from the store" not in listed
+    assert "my control" in cli("runs", "show")[1]
+    cli(*command, "--label", "another name")
+    assert "another name [constant-velocity" in cli("runs", "show")[1]
+
+
+def test_runs_list_refuses_what_is_not_there(cli, walk):
+    code, out, err = cli("runs", "list", "--results", "nowhere")
+    assert code == 1 and out == "" and "there are no runs in" in one_line(err)
+    assert cli("run", "never-move", walk)[0] == 0
+    code, _, err = cli("runs", "list", "--status", "crashd")
+    assert code == 1 and "unknown status 'crashd' (did you mean 'crashed'?)" in one_line(err)
+
+
+def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk):
+    for arguments in (
+        ("run", "mask-rcnn", walk, "--set", "segmentation.source=onnx:none.onnx"),
+        ("run", "mask-rcnn", walk, "--set", "segmentation.source=oracle"),
+        ("run", "replay:none.txt", walk),
+    ):
+        code, _, err = cli(*arguments)
+        assert code == 1 and one_line(err)
+        assert "there are no runs" in cli("runs", "list")[2]
+
+
+def test_bench_has_limits(cli, walk, tmp_path):
+    (tmp_path / "small.toml").write_text(
+        f'trackers = ["never-move"]\nsequences = ["{walk}"]\nframes = [0, 3]\n[limits]\nmemory_mb = 20\n'
+    )
+    code, out, _ = cli("bench", "small.toml", "--json")
+    (row,) = json.loads(out)
+    assert code == 3 and row["status"] == "out-of-memory" and "the limit is 20 MB" in row["reason"]
+    code, out, _ = cli("bench", "small.toml", "--retry", "failed", "--memory-limit", "0", "--json")
+    assert code == 0 and json.loads(out)[0]["status"] == "ok"
+    code, out, _ = cli("bench", "small.toml", "--retry", "ok", "--time-limit", "0.0001", "--json")
+    assert code == 3 and json.loads(out)[0]["status"] in ("timeout", "out-of-memory")
+
+
+def test_a_sheet_of_a_stored_run_is_made(cli, walk, tmp_path):
+    from pathlib import Path
+
+    (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
+    folder = Path(row["folder"])
+    assert row["status"] == "ok", row
+    assert not (folder / "sheet.png").exists()
+    (row,) = json.loads(cli("run", "orb-slam2", walk, "--sheet", "--json")[1])
+    assert row["from_store"] is False and (folder / "sheet.png").is_file()
+    (row,) = json.loads(cli("run", "orb-slam2", walk, "--sheet", "--json")[1])
+    assert row["from_store"] is True
+    assert cli("run", "never-move", walk, "--sheet")[0] == 0
+    assert "no sheet.png: the tracker offers neither keyframes nor a map" in cli("runs", "show")[1]
+    assert json.loads(cli("run", "never-move", walk, "--sheet", "--json")[1])[0]["from_store"] is True
+
+
+def test_info_tells_a_program_what_it_may_set(cli):
+    described = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])["parameters"]
+    by_name = {each["name"]: each for each in described}
+    threshold = by_name["segmentation.confidence"]
+    assert (threshold["low"], threshold["high"], threshold["scale"], threshold["online"]) == (0.1, 0.9, "linear", True)
+    assert by_name["segmentation.schedule"]["choices"] == ["every", "every_nth", "keyframes"]
+    assert by_name["segmentation.dilation_px"]["unit"] == "px"
+    assert by_name["segmentation.source"] == {
+        "name": "segmentation.source", "default": "auto", "tunable": False, "online": False
+    }  # fmt: skip
+
+
+def test_long_columns_give_way(monkeypatch):
+    rows = [["run", "settings", "reason"], ["12", "a=1, " * 20, "why " * 20]]
+    cut = fitted(rows, [1, 2], 60)
+    assert max(sum(map(len, row)) + 4 for row in cut) <= 110 and cut[1][1].endswith("…") and len(cut[1][1]) == 12
+    assert fitted(rows, [1], 400) == rows
+
+
+def test_progress_where_nobody_watches(capsys, monkeypatch):
+    monkeypatch.setattr(output, "HEARTBEAT_S", 0.05)
+    with progress("3 runs") as advance:
+        advance(1.5, 3, "orb-slam2 on walk, frame 5 of 10")
+        time.sleep(0.4)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) >= 2 and said[0].startswith("3 runs: 1.5 of 3, about ")
+    assert "(orb-slam2 on walk, frame 5 of 10)" in said[0]
+    with progress("nothing"):
+        pass
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("argument", ["abc", "-1"])
+def test_limits_are_numbers(cli, walk, argument):
+    assert cli("run", "never-move", walk, "--memory-limit", argument)[0] == 2

@@ -1,0 +1,121 @@
+"""A tracker that behaves badly in ways that concern the process and not the poses, for the tests of supervision."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.slam.result import TrackResult
+from dynslam_bench.trackers.protocol import TrackerSpec
+
+DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(300)"
+SLEEPER = [sys.executable, "-S", "-c", DEAF]
+
+
+class HostileSettings(Settings):
+    mode: str = "ok"
+    at: int = 2
+    pids: str = ""
+    """File that the processes it starts are written to, one a line."""
+
+
+class Hostile:
+    """Stands still; on frame `at` it does what `mode` says."""
+
+    def __init__(self, settings: HostileSettings) -> None:
+        self.settings = settings
+        if settings.mode.startswith("build-"):
+            self.act(settings.mode.removeprefix("build-"))
+
+    def reset(self, camera, *, rng) -> None:
+        self.seen = 0
+
+    def track(self, frame) -> TrackResult:
+        if frame.index == self.settings.at:
+            self.act(self.settings.mode)
+        return TrackResult(np.eye(4), "ok")
+
+    def note(self, *pids: int) -> None:
+        with Path(self.settings.pids).open("a") as file:
+            file.writelines(f"{pid}\n" for pid in pids)
+
+    def act(self, mode: str) -> None:
+        if mode == "sys.exit":
+            sys.exit(0)
+        if mode == "os._exit":
+            os._exit(0)
+        if mode == "hang":
+            while True:
+                pass
+        if mode == "segfault":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if mode == "deaf":
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            time.sleep(300)
+        if mode == "raise":
+            raise ValueError("too few\npoints")
+        if mode == "children":
+            self.leave_children()
+        if mode == "flood":
+            print("the first line")
+            for _ in range(300):
+                os.write(1, b"the same line over and over\n" * 2000)
+            print("the last line")
+        if mode == "shared":
+            self.share()
+        if mode == "hog-child":
+            self.note(subprocess.Popen([sys.executable, "-S", "-c", HOG]).pid)
+            time.sleep(300)
+        if mode == "thread":
+            import threading
+
+            threading.Thread(target=time.sleep, args=(300,)).start()
+
+    def leave_children(self) -> None:
+        """One in its own process group, one in a session of its own, one whose parent is gone (a daemon)."""
+        self.note(subprocess.Popen(SLEEPER).pid, subprocess.Popen(SLEEPER, start_new_session=True).pid)
+        middle = os.fork()
+        if middle == 0:
+            os.setsid()
+            self.note(subprocess.Popen(SLEEPER, start_new_session=True).pid)
+            os._exit(0)
+        os.waitpid(middle, 0)
+
+    def share(self) -> None:
+        """300 MB, and three forks that share them."""
+        self.hoard = np.ones(300 * 2**17)
+        for _ in range(3):
+            pid = os.fork()
+            if pid == 0:
+                time.sleep(300)
+                os._exit(0)
+            self.note(pid)
+        time.sleep(0.7)
+
+
+HOG = "import time; hoard = [b'x' * 2**24 for _ in range(100)]; time.sleep(300)"
+
+
+class BlackHater(Hostile):
+    """Leaves the process on a black image."""
+
+    def track(self, frame) -> TrackResult:
+        if not frame.rgb.any():
+            os._exit(0)
+        return TrackResult(np.eye(4), "ok")
+
+
+def _spec(name: str) -> TrackerSpec:
+    return TrackerSpec(id=name.lower(), entry_point=f"{__file__}:{name}", label=name, settings=HostileSettings)
+
+
+SPEC = _spec("Hostile")
+BLACK = _spec("BlackHater")
+TARGET = f"{__file__}:SPEC"
