@@ -249,9 +249,7 @@ def _span(p: Parameter) -> str:
     return f"{p.low:g} to {p.high:g}{' (log)' if p.scale == 'log' else ''}"
 
 
-def _leaves(
-    cls: type[Settings], prefix: str = "", defaults: Settings | None = None
-) -> Iterable[tuple[str, FieldInfo]]:
+def _leaves(cls: type[Settings], prefix: str = "", defaults: Settings | None = None) -> Iterable[tuple[str, FieldInfo]]:
     """Leaf fields by dotted name; the defaults are those of `cls`, also where it gives a group other ones."""
     for key, field in cls.model_fields.items():
         nested = _nested(field)

@@ -108,7 +108,10 @@ def test_a_setting_is_in_force_from_the_very_next_frame(scene: SmallScene) -> No
     sure, any_ = (apply_overrides(settings_of(tracker), {"segmentation.confidence": c}) for c in (0.9, 0.1))
     asked = [any_, any_, sure, any_, sure, sure, any_]
     results = play(tracker, scene, len(asked), before=lambda number: tracker.configure(asked[number]))
-    always = {id(each): play(tracker, scene, len(asked), before=lambda _, s=each: tracker.configure(s)) for each in (sure, any_)}
+    always = {
+        id(each): play(tracker, scene, len(asked), before=lambda _, s=each: tracker.configure(s))
+        for each in (sure, any_)
+    }
     counts = [result.stats["semantic_objects"] for result in results]
     assert counts == [always[id(each)][number].stats["semantic_objects"] for number, each in enumerate(asked)]
     assert len({tuple(r.stats["semantic_objects"] for r in each) for each in always.values()}) == 2
