@@ -95,7 +95,9 @@ def test_each_setting_acts_when_steered_where_it_acts_when_built_with(name: str,
         if not difference(fresh, static):
             continue
         changed = apply_overrides(settings, {name: value})
-        steered = play(tracker, scene, before=lambda number: tracker.configure(changed) if number == 0 else None)
+        steered = play(
+            tracker, scene, before=lambda number, changed=changed: tracker.configure(changed) if number == 0 else None
+        )
         assert not difference(static, steered), f"{system}: {name} = {value:g}"
         assert name not in UNSEEN, "it shows: take it off the list"
         return
