@@ -22,7 +22,7 @@ class DiSlamSettings(SemanticSystemSettings):
     segmentation: SegmentationSettings = SegmentationSettings(confidence=0.1)
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous")
-    multiview: MultiViewSettings = MultiViewSettings(grow=False, min_keyframes=5, border_px=0)
+    multiview: MultiViewSettings = MultiViewSettings(grow=False, min_keyframes=5)
     flow: FlowSettings = FlowSettings(method="lucas-kanade")
 
 
