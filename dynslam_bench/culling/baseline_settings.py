@@ -124,8 +124,8 @@ class MultiViewSettings(Settings):
         15, low=0, high=30, limits=(0, 100), unit="px", meaning="radius by which the result is grown"
     )
     border_px: int = tunable(
-        15, low=0, high=30, limits=(0, 100), unit="px",
-        meaning="further radius within which features at the result's border are dropped (the code does so)",
+        0, low=0, high=30, limits=(0, 100), unit="px",
+        meaning="further radius within which features at the result's border are dropped (15 in the code)",
     )  # fmt: skip
 
 

@@ -64,6 +64,7 @@ def test_features_at_the_border_of_the_mask_go() -> None:
     tight = MultiViewFilter(MultiViewSettings(dilation_px=0, border_px=0)).apply(frame, state)
     beside = (y > 120) & (y < 360) & (((x >= 206) & (x < 220)) | ((x > 329) & (x <= 343)))
     assert beside.any() and not kept.keep[beside].any() and tight.keep[beside].all()
+    assert TRACKERS.get("dynaslam-code").settings().multiview.border_px == 15  # the code's, not in the paper
     np.testing.assert_array_equal(kept.mask, tight.mask)  # the mask itself is not wider
 
 

@@ -30,7 +30,7 @@ class DynaSlamSettings(DynaSlamMasksSettings):
 class DynaSlamCodeSettings(DynaSlamSettings):
     """The constants of the authors' code where they differ from the paper."""
 
-    multiview: MultiViewSettings = MultiViewSettings(tau_m=0.6, order="farthest", min_keyframes=5)
+    multiview: MultiViewSettings = MultiViewSettings(tau_m=0.6, order="farthest", min_keyframes=5, border_px=15)
 
 
 class DynaSlamGeometrySettings(SystemSettings):
@@ -63,13 +63,13 @@ def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -
 
 GEOMETRY = (
     "a seed needs a neighbourhood of nearly one depth (variance below 0.001 m^2, missing depth as 0), as in the code",
-    "features within 15 px of the geometric mask go as well, as in the code",
     "the next pixel of a region is the one nearest to its mean to 5 mm",
     "the low-cost tracking matches the last frame alone",
     "parallax is taken between camera centres (the code's translation is in another frame)",
 )
 START = "the geometric test acts from the first keyframe on (the paper is silent, the code waits for five)"
-BORDER = "features within another 15 px of the grown semantic masks, which the code drops, stay"
+NO_BORDER = "features at the border of the geometric mask stay (the code drops those within 15 px, the paper does not)"
+BORDER = "the further 15 px at the border of the semantic masks, whose features the code drops, stay"
 UNION = "the masks of N and G are united, as in the code (the paper keeps G's where both find an object)"
 
 
@@ -95,7 +95,7 @@ def _spec(
             *(() if settings is DynaSlamGeometrySettings else (SHARED_MASKS,)),
             *((BORDER,) if faithful_code else ()),
             *(() if factory == "build_masks_only" else GEOMETRY),
-            *(() if factory == "build_masks_only" or faithful_code else (START,)),
+            *(() if factory == "build_masks_only" or faithful_code else (START, NO_BORDER)),
             *((UNION,) if variant.startswith("N+G") else ()),
         ),
         remarks="background inpainting is left out: it rejects nothing",
