@@ -22,13 +22,8 @@ class DiSlamSettings(SemanticSystemSettings):
     segmentation: SegmentationSettings = SegmentationSettings(confidence=0.1)
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous")
-<<<<<<< HEAD
-    multiview: MultiViewSettings = MultiViewSettings(grow=False, min_keyframes=5, border_px=0)
-    flow: PublishedFlowSettings = PublishedFlowSettings()
-=======
     multiview: MultiViewSettings = MultiViewSettings(grow=False, min_keyframes=5)
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
->>>>>>> geometry
+    flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
 def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
