@@ -2,8 +2,8 @@
 
 Errors are simulated: a hardness for every sequence, a quality for every tracker, and a scatter of several shapes. A
 board counts as right if the true rank of every tracker lies in its group. Of trackers that are exactly equal, any
-separation counts as wrong. The shape "one-sided failures" is outside of what a test on few sequences can hold: the trackers
-fail with different chances, and their order by the mean is mostly decided by failures that were not seen.
+separation counts as wrong. The shape "one-sided failures" is outside of what a test on few sequences can hold: the
+trackers fail with different chances, and their order by the mean is mostly decided by failures that were not seen.
 
 Run: python tests/benchmarks/rank_groups.py [boards]
 """
