@@ -191,7 +191,8 @@ def _sequences(draft: _Draft, board: Board, protocol: Protocol, loaded: Loaded) 
         return
     section = Section("errors", "Errors by sequence", "Errors")
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence, row.duration_s)}
-    parts = sorted(excerpts | {board.sequence(row) for row in board.rows if row.frames})
+    recorded = [row for row in board.rows if not row.sequence.startswith("synthetic/")]
+    parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frames})
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)

@@ -187,7 +187,7 @@ def power_note(standings: Sequence[Standing], sequences: int, fewest_repeats: in
     Args:
         standings: The ranked ones count.
         sequences: Sequences that they are ranked on.
-        fewest_repeats: Repeats that count in the smallest of their cells.
+        fewest_repeats: Repeats that count in the smallest of their cells, 0 if there is none.
     """
     if not sequences:
         return "No sequence has ground truth, so nothing can be compared."
@@ -211,7 +211,7 @@ def power_note(standings: Sequence[Standing], sequences: int, fewest_repeats: in
             f"The smallest p that a signed-rank test can reach is {attainable_p(sequences, len(groups)):.3g}, so none "
             "is shown."
         )
-    if fewest_repeats < 3:
+    if 0 < fewest_repeats < 3:
         parts.append(
             f"Some cells hold only {fewest_repeats} run{'s' if fewest_repeats != 1 else ''} that count: the spread "
             "from run to run is unknown there."

@@ -167,6 +167,7 @@ def test_power_notes():
     assert "smallest p" not in note(3, 7)
     assert "only 1 run that count" in note(2, 7, 1)
     assert "nothing can be compared" in power_note([], 0, 0)
+    assert "that count" not in power_note([], 1, 0)
 
 
 # -- do the rank groups hold the true order?

@@ -231,6 +231,7 @@ def test_parts_get_no_published_rows(tmp_path):
     add_run(store, "orb-slam2", "tum/fr3/walking_xyz", frames=(0, 200), block="part", duration_s=6.7)
     add_run(store, "orb-slam2", "bonn/crowd", block="excerpt", duration_s=6.7)
     add_run(store, "orb-slam2", "tum/fr3/walking_rpy", block="whole", duration_s=30.6)
+    add_run(store, "orb-slam2", "synthetic/walking_xyz", block="rendered", frames=(0, 60))
     paths = build_report(store, tmp_path / "report")
     table = rows_of(paths.csv["per_sequence"])
     published = [r for r in table if "reported" in r["tracker"] or "claimed" in r["tracker"]]
