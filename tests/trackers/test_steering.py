@@ -51,6 +51,11 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "free_space.min_votes": ("emfoa-oft-no-masks", {
         **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
     }),
+    "segmentation.min_area_px": ("mask-rcnn", {"segmentation.classes": "all"}),
+    "multiview.tau_m": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }),
+    "segmentation.max_carry": ("detect-slam", {"backend.keyframes.min_gap": 6}),
 }  # fmt: skip
 """Where a setting shows on the excerpt, if not in the first tracker that has it: the tracker and what else is set."""
 UNSEEN: frozenset[str] = frozenset()
