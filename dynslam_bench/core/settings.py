@@ -25,7 +25,6 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
 from .errors import SettingsError, did_you_mean
 
@@ -215,9 +214,7 @@ def _span(p: Parameter) -> str:
     return f"{p.low:g} to {p.high:g}{' (log)' if p.scale == 'log' else ''}"
 
 
-def _leaves(
-    cls: type[Settings], prefix: str = "", defaults: Settings | None = None
-) -> Iterable[tuple[str, FieldInfo]]:
+def _leaves(cls: type[Settings], prefix: str = "", defaults: Settings | None = None) -> Iterable[tuple[str, FieldInfo]]:
     """Leaf fields by dotted name; the defaults are those of `cls`, also where it gives a group other ones."""
     for key, field in cls.model_fields.items():
         nested = _nested(field)
@@ -236,7 +233,7 @@ def _with_default(field: FieldInfo, default: Any) -> FieldInfo:
 
 def _check_default(cls: type[Settings], p: Parameter) -> None:
     """Numbers only: pydantic holds the defaults of the others to their types."""
-    if p.low is None or p.high is None or p.default is None or p.default is PydanticUndefined:
+    if p.low is None or p.high is None or p.default is None:
         return
     if not p.low <= float(p.default) <= p.high:
         raise TypeError(

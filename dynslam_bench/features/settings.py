@@ -8,7 +8,6 @@ from pydantic import Field, field_validator
 
 from dynslam_bench.core.settings import Settings, tunable
 
-
 _ORB = {"extractor": ["orb"]}
 
 

@@ -88,7 +88,9 @@ def main() -> int:
     queries = [queries[i] for i in np.linspace(0, len(queries) - 1, min(options.queries, len(queries))).astype(int)]
     world = mapped.world
     sys.stdout.write(f"{world.keyframe_count} keyframes, {len(queries)} queries\n")
-    sys.stdout.write("| matched | found | right | cpu ms a frame: median | largest |\n| --- | --- | --- | --- | --- |\n")
+    sys.stdout.write(
+        "| matched | found | right | cpu ms a frame: median | largest |\n| --- | --- | --- | --- | --- |\n"
+    )
     for searched in options.searched:
         found, right, times = 0, 0, []
         for index in [queries[0], *queries]:  # the first compiles
