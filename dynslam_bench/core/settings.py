@@ -27,7 +27,6 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
 from .errors import SettingsError, did_you_mean
 
@@ -268,7 +267,7 @@ def _with_default(field: FieldInfo, default: Any) -> FieldInfo:
 
 def _check_default(cls: type[Settings], p: Parameter) -> None:
     """Numbers only: pydantic holds the defaults of the others to their types."""
-    if p.low is None or p.high is None or p.default is None or p.default is PydanticUndefined:
+    if p.low is None or p.high is None or p.default is None:
         return
     if not p.low <= float(p.default) <= p.high:
         raise TypeError(

@@ -22,6 +22,7 @@ from .mapping import LocalMapper
 from .motion import MotionState, pose_covariance, smooth
 from .observation import Observations, observe
 from .outputs import KeyframeRecord, MapOutputs
+from .places import most_alike
 from .pose import PoseEstimate
 from .relocalisation import Relocalised, locate
 from .result import TrackResult
@@ -286,12 +287,13 @@ class RgbdBackend:
         return best[0].select(best[1].inliers), best[1].T_cam_world
 
     def _from_keyframes(self, seen: Observations, least: int) -> Relocalised | None:
-        """A pose with at least so many inliers by descriptors: from the reference keyframe, else from any."""
+        """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike."""
         s = self.settings
         rng = stream(self.seed, "relocalisation", self._frame)
-        tries = [[self._reference]] if self.state == "ok" else []
-        tries.append(self.world.keyframes.tolist())
-        for keyframes in tries:
+        for alike in (False, True) if self.state == "ok" else (True,):
+            keyframes = [self._reference]
+            if alike:
+                keyframes = most_alike(self.world, self.world.keyframes, seen, s.relocalisation.searched)
             found = locate(self.world, keyframes, seen, s.relocalisation, rng, s.tracking.min_inliers)
             if found is not None and found.estimate.count >= least:
                 return found

@@ -141,6 +141,10 @@ class BundleAdjustmentSettings(Settings):
 class RelocalisationSettings(Settings):
     """Finding the pose again after tracking was lost."""
 
+    searched: int = tunable(
+        10, low=3, high=40, limits=(1, 100000),
+        meaning="keyframes that are matched feature by feature: those that look most alike; bounds the time of a frame",
+    )  # fmt: skip
     candidates: int = tunable(
         5, low=1, high=20, limits=(1, 1000), meaning="keyframes with the most descriptor matches that PnP is tried on"
     )

@@ -51,6 +51,11 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "free_space.min_votes": ("emfoa-oft-no-masks", {
         **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
     }),
+    "segmentation.min_area_px": ("mask-rcnn", {"segmentation.classes": "all"}),
+    "multiview.tau_m": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }),
+    "segmentation.max_carry": ("detect-slam", {"backend.keyframes.min_gap": 6}),
 }  # fmt: skip
 """Where a setting shows on the excerpt, if not in the first tracker that has it: the tracker and what else is set."""
 UNSEEN: frozenset[str] = frozenset()
@@ -66,6 +71,11 @@ def settings_of(tracker) -> Settings:
     return tracker._steering._built
 
 
+def at_first(tracker, settings: Settings):
+    """Steers before the first frame."""
+    return lambda number: tracker.configure(settings) if number == 0 else None
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene) -> None:
     spec = SYSTEMS[name]
@@ -75,7 +85,7 @@ def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene)
     ends |= {"features.fast_threshold": 12, "features.fast_threshold_min": 3}
     extreme = apply_overrides(settings, ends)
     fresh = play(tracker, scene, SHORT)
-    steered = play(tracker, scene, SHORT, before=lambda number: tracker.configure(extreme) if number == 0 else None)
+    steered = play(tracker, scene, SHORT, before=at_first(tracker, extreme))
     again = play(tracker, scene, SHORT)
     static = play(construct(spec, scene, **ends), scene, SHORT)
     assert difference(fresh, static), "the extremes change nothing at all"
@@ -95,9 +105,7 @@ def test_each_setting_acts_when_steered_where_it_acts_when_built_with(name: str,
         if not difference(fresh, static):
             continue
         changed = apply_overrides(settings, {name: value})
-        steered = play(
-            tracker, scene, before=lambda number, changed=changed: tracker.configure(changed) if number == 0 else None
-        )
+        steered = play(tracker, scene, before=at_first(tracker, changed))
         assert not difference(static, steered), f"{system}: {name} = {value:g}"
         assert name not in UNSEEN, "it shows: take it off the list"
         return
@@ -110,10 +118,7 @@ def test_a_setting_is_in_force_from_the_very_next_frame(scene: SmallScene) -> No
     sure, any_ = (apply_overrides(settings_of(tracker), {"segmentation.confidence": c}) for c in (0.9, 0.1))
     asked = [any_, any_, sure, any_, sure, sure, any_]
     results = play(tracker, scene, len(asked), before=lambda number: tracker.configure(asked[number]))
-    always = {
-        id(each): play(tracker, scene, len(asked), before=lambda _, s=each: tracker.configure(s))
-        for each in (sure, any_)
-    }
+    always = {id(each): play(tracker, scene, len(asked), before=at_first(tracker, each)) for each in (sure, any_)}
     counts = [result.stats["semantic_objects"] for result in results]
     assert counts == [always[id(each)][number].stats["semantic_objects"] for number, each in enumerate(asked)]
     assert len({tuple(r.stats["semantic_objects"] for r in each) for each in always.values()}) == 2
