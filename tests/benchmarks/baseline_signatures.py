@@ -6,7 +6,7 @@ rendered twin beside the class that published figures put it in, and which filte
     dynslam-bench bench dynamic --results results
     python tests/benchmarks/baseline_signatures.py results
 
-Measured class (medians over the seeds):
+Measured class (medians over the repeats: seeds and start offsets):
   fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not end;
   survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same twin;
   between   neither.
@@ -47,7 +47,7 @@ FAITHFUL = ("faithful-code", "faithful-paper")
 
 @dataclass
 class Cell:
-    """One system on one twin, over its seeds."""
+    """One system on one twin, over its repeats."""
 
     ates: list[float] = field(default_factory=list)
     coverages: list[float] = field(default_factory=list)
