@@ -6,14 +6,10 @@ rendered twin beside the class that published figures put it in, and which filte
     dynslam-bench bench dynamic --results results
     python tests/benchmarks/baseline_signatures.py results --instances 100:200
 
-<<<<<<< HEAD
 Each instance of a twin is a row of its own. Its repeats (start offsets, sensor-noise seeds, seeds) are one cell: the
 median counts, the range stands beside it.
 
 Measured class (medians over the repeats):
-=======
-Measured class (medians over the repeats: seeds and start offsets):
->>>>>>> identity
   fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not end;
   survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same twin;
   between   neither.
