@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).resolve().parents[1]
-SUITE = 'trackers = [{tracker!r}]\nsequences = [{folder!r}]\nframes = [0, 4]\n[settings]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
+SUITE = (
+    "trackers = [{tracker!r}]\nsequences = [{folder!r}]\nframes = [0, 4]\n"
+    '[settings]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
+)
 STUDY = (
     'tracker = {tracker!r}\ntune = [{folder!r}]\ntrials = 4\nseeds = [0]\npruner = "none"\n'
     '[space.fixed]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
