@@ -127,6 +127,7 @@ class Evaluator:
         *,
         cache: bool,
         on_progress: Callable[[dict[str, Any]], bool] | None = None,
+        cancelled: Callable[[], bool] | None = None,
     ) -> Outcome | None:
         """Run a configuration on one instance, or take the stored run.
 
@@ -135,9 +136,10 @@ class Evaluator:
             instance: Where.
             cache: Whether to use the stage cache.
             on_progress: Told of partial metrics; returning False stops the run.
+            cancelled: Asked many times a second; True ends the run at once.
 
         Returns:
-            The outcome; None if `on_progress` stopped it.
+            The outcome; None if `on_progress` stopped it, or it was cancelled.
 
         Raises:
             InstanceFailedError: The run crashed, timed out, ran out of memory or was invalid; names run and reason.
@@ -147,7 +149,9 @@ class Evaluator:
             offset=instance.offset, threads=self.spec.threads, cache=cache, data_root=self.spec.data_root,
         )  # fmt: skip
         listener = None if on_progress is None else (lambda _, partial: on_progress(partial))
-        (record,) = run_many([spec], results=self.store, on_progress=listener, protocol=self.protocol)
+        (record,) = run_many(
+            [spec], results=self.store, on_progress=listener, protocol=self.protocol, cancelled=cancelled
+        )  # fmt: skip
         if record.status == "stopped":
             return None
         if record.failed:

@@ -8,8 +8,9 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -90,6 +91,7 @@ class Tuner:
         self.folder = study_folder(self.results, spec)
         self.study = self._open(sampler, pruner)
         self._lock = threading.Lock()
+        self._interrupted = threading.Event()
         self._reference: dict[Instance, Outcome] = {}
 
     def run(self, *, jobs: int = 1, on_event: OnEvent | None = None) -> optuna.Study:
@@ -114,13 +116,22 @@ class Tuner:
         deadline = None if self.spec.timeout_s is None else time.monotonic() + self.spec.timeout_s
 
         def work() -> None:
-            while (deadline is None or time.monotonic() < deadline) and self._more():
+            while (deadline is None or time.monotonic() < deadline) and not self._interrupted.is_set() and self._more():
                 self._one(on_event)
 
-        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool:
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool, self._ending_all():
             for future in [pool.submit(work) for _ in range(jobs)]:
                 future.result()
         return self.study
+
+    @contextmanager
+    def _ending_all(self) -> Iterator[None]:
+        """Whatever interrupts the waiting ends the runs of all threads at once."""
+        try:
+            yield
+        except BaseException:
+            self._interrupted.set()
+            raise
 
     def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[Instance, Outcome]:
         """The default settings' outcomes on the tune split, to which every trial is compared."""
@@ -130,13 +141,16 @@ class Tuner:
             number = self.tune_instances.index(instance)
             _tell(on_event, "reference", number, len(self.tune_instances), str(instance))
             try:
-                outcome = self.evaluator.run(self.spec.space.fixed, instance, cache=self.spec.cache)
+                outcome = self.evaluator.run(
+                    self.spec.space.fixed, instance, cache=self.spec.cache, cancelled=self._interrupted.is_set
+                )  # fmt: skip
             except InstanceFailedError as error:
                 raise StudyError(f"the default settings fail: {error}", "a study needs a default that runs") from error
-            assert outcome is not None
+            if outcome is None:
+                raise StudyError("interrupted")
             return outcome
 
-        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-reference") as pool:
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-reference") as pool, self._ending_all():
             self._reference.update(zip(missing, pool.map(one, missing), strict=True))
         return self._reference
 
@@ -164,7 +178,12 @@ class Tuner:
         try:
             for position, instance in enumerate(order):
                 watch = self._watch(trial, found, instance, position)
-                outcome = self.evaluator.run(settings, instance, cache=self.spec.cache, on_progress=watch)
+                outcome = self.evaluator.run(
+                    settings, instance, cache=self.spec.cache, on_progress=watch, cancelled=self._interrupted.is_set
+                )  # fmt: skip
+                if outcome is None and self._interrupted.is_set():
+                    trial.set_user_attr("reason", CRASHED_WORKER)
+                    return TrialState.FAIL, None, "interrupted"
                 if outcome is None:
                     return self._pruned(trial, found, f"pruned on {instance.sequence}")
                 found.outcomes.append(outcome)

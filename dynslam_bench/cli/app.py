@@ -63,6 +63,9 @@ def _root(
     """Benchmark and tune visual SLAM in dynamic scenes."""
 
 
+_INTERRUPTED = "interrupted; what is finished is stored, the same command goes on from there"
+
+
 def start(arguments: list[str] | None = None) -> None:
     """Run the program and exit.
 
@@ -79,8 +82,12 @@ def start(arguments: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader went away, e.g. `| head`
         sys.exit(0)
     except KeyboardInterrupt:
-        _say("interrupted; what is finished is stored, the same command goes on from there")
+        _say(_INTERRUPTED)
         sys.exit(130)
+    except SystemExit as ended:  # typer turns an interrupt within a command into this
+        if ended.code == 130:
+            _say(_INTERRUPTED)
+        raise
 
 
 LISTS = ("--seed", "--offset")

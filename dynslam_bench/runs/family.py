@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 _PROC = Path("/proc")
@@ -127,8 +127,7 @@ def _bury(pid: int) -> bool:
         return True
 
 
-def _signal(send: object, target: int) -> None:
-    assert callable(send)
+def _signal(send: Callable[[int, int], None], target: int) -> None:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         send(target, signal.SIGKILL)
 
@@ -137,6 +136,6 @@ def _prctl(option: int, value: int) -> bool:
     if sys.platform != "linux":
         return False
     try:
-        return ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0) == 0
+        return bool(ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0) == 0)
     except (OSError, AttributeError):
         return False

@@ -1,0 +1,63 @@
+"""Ctrl-C in long commands: they stop at once, say how to go on, and exit with 130."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).resolve().parents[1]
+SUITE = (
+    "trackers = [{tracker!r}]\nsequences = [{folder!r}]\nframes = [0, 4]\n"
+    '[settings]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
+)
+STUDY = (
+    'tracker = {tracker!r}\ntune = [{folder!r}]\ntrials = 4\nseeds = [0]\npruner = "none"\n'
+    '[space.fixed]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
+)
+
+
+@pytest.mark.parametrize(("verb", "text"), [("bench", SUITE), ("tune run", STUDY)])
+def test_ctrl_c_stops_within_two_seconds(walk, tmp_path, verb, text):
+    tracker = tmp_path / "waits.py"
+    tracker.write_text(
+        f"import sys; sys.path.insert(0, {str(HERE / 'runs')!r})\n"
+        "from pathlib import Path\n"
+        "from dynslam_bench.core.settings import tunable\n"
+        "from dynslam_bench.trackers import TrackerSpec\n"
+        "import hostile, os\n"
+        "class WaitsSettings(hostile.HostileSettings):\n"
+        "    patience: float = tunable(0.5, low=0.1, high=1.0, meaning='of no use')\n"
+        "class Waits(hostile.Hostile):\n"
+        "    def act(self, mode):\n"
+        "        self.note(os.getpid())\n"
+        "        super().act(mode)\n"
+        "SPEC = TrackerSpec('waits', f'{__file__}:Waits', 'Waits', settings=WaitsSettings)\n"
+    )
+    pids = tmp_path / "pids"
+    values = {"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}
+    (tmp_path / "what.toml").write_text(text.format(**values).replace("'", '"'))
+    command = [sys.executable, "-m", "dynslam_bench.cli", *verb.split(), "what.toml"]
+    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 300
+        while not (pids.is_file() and pids.read_text().endswith("\n")):
+            assert program.poll() is None, program.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        program.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        _, err = program.communicate(timeout=60)
+        took = time.monotonic() - began
+    finally:
+        program.kill()
+    assert program.returncode == 130 and "the same command goes on from there" in err, err
+    assert took < 2 + 10 * (_load() > 4), f"{took:.1f} s"
+    assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
+
+
+def _load():
+    """Processes that wait for a processor; on a crowded machine two seconds are no measure."""
+    return float(Path("/proc/loadavg").read_text().split()[0])
