@@ -55,7 +55,9 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "multiview.tau_m": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
-    "segmentation.max_carry": ("detect-slam", {"backend.keyframes.min_gap": 6}),
+    "segmentation.max_carry": ("detect-slam", {
+        "backend.keyframes.tracked_share": 0.4, "backend.keyframes.new_close": 1000, "probability.threshold": 0.99,
+    }),
 }  # fmt: skip
 """Where a setting shows on the excerpt, if not in the first tracker that has it: the tracker and what else is set."""
 UNSEEN: frozenset[str] = frozenset()
