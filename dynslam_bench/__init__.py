@@ -1,12 +1,15 @@
 """dynslam-bench: benchmark and tune visual SLAM in dynamic scenes through Gymnasium environments.
 
-The rooms: `core`, `geometry`, `sequences`, `evaluation`, `features`, `segmentation`, `flow`, `culling`, `slam`,
-`trackers`, `envs`, `runs`, `tuning`, `reports`, `cli`. Importing this package loads none of them.
+The rooms: `core`, `geometry`, `contracts`, `sequences`, `evaluation`, `features`, `segmentation`, `flow`, `culling`,
+`slam`, `trackers`, `envs`, `runs`, `suites`, `reports`, `testing`, `tuning`, `cli`. Importing this package loads none
+of them.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+
+from .core import moved
 
 __version__ = "0.1.0"
 
@@ -15,3 +18,4 @@ if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.
     # In a bare checkout `envs/`, `tuning/` and `reports/` lie beside this package instead of inside it.
     __path__.append(str(_checkout))
 del _checkout
+moved.install()

@@ -6,7 +6,8 @@ worker processes write ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequ
 
 from __future__ import annotations
 
-from .contract import TrackerContractError
+from dynslam_bench.contracts.checks import TrackerContractError
+
 from .control import ActionMap
 from .degrade_frames import Degradation, DegradeFrames
 from .device import resolve_device

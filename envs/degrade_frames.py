@@ -12,9 +12,9 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.sequences.frame import Frame
 
 from .record_timings import slam_env_of
 

@@ -10,10 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.slam.result import TrackResult
 
 ObservationKind = Literal["stats", "rgbd"]
 MAX_DEPTH_M = 20.0

@@ -12,22 +12,22 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from dynslam_bench.core.cache import default_folder
+from dynslam_bench.contracts.checks import check_result, check_trajectory
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.sequence import Sequence as FrameSequence
+from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Settings, apply_overrides
+from dynslam_bench.core.stage_cache import default_folder
 from dynslam_bench.core.steering import Steerable
 from dynslam_bench.evaluation.online import OnlineError, OnlineSample
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.sequences.frame import Sequence as FrameSequence
-from dynslam_bench.trackers.protocol import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
-from .contract import check_result, check_trajectory
 from .control import ActionMap
 from .device import resolve_device
 from .episode import Episode, FrameOutcome

@@ -6,11 +6,12 @@ from collections.abc import Sequence as PySequence
 from pathlib import Path
 from typing import cast
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
-from dynslam_bench.sequences.frame import Sequence, SequenceView
 from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.view import SequenceView
 
 Frames = PySequence[int | None] | str | None
 """Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""

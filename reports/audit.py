@@ -18,8 +18,8 @@ from dynslam_bench.evaluation.pairs import select_pairs
 from dynslam_bench.evaluation.protocol import RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
 
-from .reported import Claimed, claimed, published
-from .table import Column, Table, TableCell, to_markdown
+from .model.published import Claimed, claimed, published
+from .tables.table import Column, Table, TableCell, to_markdown
 
 OURS = "EMFOA-OFT-SLAM"
 _HALF_DIGIT = 0.5
@@ -267,7 +267,7 @@ def _time(table: int, system: str, sequence: str, quantity: str, printed: Claime
 
 @cache
 def _stored_never_move() -> dict[tuple[str, str], float]:
-    text = (files("dynslam_bench.reports") / "data" / "never_move.csv").read_text(encoding="utf-8")
+    text = (files("dynslam_bench.reports.model") / "data" / "never_move.csv").read_text(encoding="utf-8")
     return {(line["sequence"], line["metric"]): float(line["value"]) for line in csv.DictReader(text.splitlines())}
 
 

@@ -12,8 +12,8 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.records import write_atomic
-from dynslam_bench.reports.page import Block, Section, render
-from dynslam_bench.reports.table import Column, Table, TableCell, to_csv
+from dynslam_bench.reports.html.page import Block, Section, render
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, to_csv
 
 from .final_runs import Candidate, Ratio, StudySummary
 from .preset import preset_text

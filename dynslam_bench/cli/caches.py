@@ -15,7 +15,7 @@ app = typer.Typer(help="The stage cache: results that do not depend on the setti
 @app.command()
 def info(as_json: AsJson = False) -> None:
     """Show how full the cache is."""
-    from dynslam_bench.core.cache import StageCache
+    from dynslam_bench.core.stage_cache import StageCache
 
     found = StageCache().info()
     total = sum(found.bytes_by_stage.values())
@@ -36,7 +36,7 @@ def info(as_json: AsJson = False) -> None:
 @app.command()
 def clear(yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False) -> None:
     """Delete all entries."""
-    from dynslam_bench.core.cache import StageCache
+    from dynslam_bench.core.stage_cache import StageCache
 
     cache = StageCache()
     if not yes:

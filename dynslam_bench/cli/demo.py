@@ -110,7 +110,7 @@ def tune_a_little(results: Path, *, frames: int, jobs: int, trials: int) -> tupl
 
 def render(sequences: set[str]) -> None:
     """Render sequences ahead of the runs, so that no run waits for another's frames."""
-    from dynslam_bench.sequences.roots import find_data_root
+    from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in sorted(sequences):
@@ -121,10 +121,10 @@ def render(sequences: set[str]) -> None:
 def leaderboard_text(store: RunStore, protocol: str = DEFAULT_PROTOCOL) -> str:
     """The leaderboard and the errors by sequence of a store, as aligned text."""
     from dynslam_bench.evaluation import get_protocol
-    from dynslam_bench.reports.board import make_board
-    from dynslam_bench.reports.rows import load_runs
-    from dynslam_bench.reports.sequence_tables import per_sequence
-    from dynslam_bench.reports.tables import leaderboard
+    from dynslam_bench.reports.model.board import make_board
+    from dynslam_bench.reports.model.rows import load_runs
+    from dynslam_bench.reports.tables.leaderboard import leaderboard
+    from dynslam_bench.reports.tables.sequences import per_sequence
 
     chosen = get_protocol(protocol)
     board = make_board([run.row for run in load_runs([store], chosen).runs])

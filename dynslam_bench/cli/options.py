@@ -84,7 +84,7 @@ def read_settings(file: Path) -> dict[str, Any]:
         SettingsError: The file cannot be read, or is no TOML.
     """
     from dynslam_bench.core.errors import SequenceError, SettingsError
-    from dynslam_bench.sequences._toml import read_toml
+    from dynslam_bench.core.toml import read_toml
 
     try:
         document = read_toml(file.expanduser())

@@ -66,7 +66,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare two results folders on the sequences that both have, with the same settings or with others."""
-    from dynslam_bench.reports import compare as compare_results
+    from dynslam_bench.reports import compare_runs as compare_results
 
     found = compare_results(a, b, protocol=protocol)
     if as_json:
@@ -92,12 +92,12 @@ def audit_paper(
     """Hold the numbers that the paper prints against arithmetic, and against a camera that never moves."""
     from dataclasses import asdict
 
+    from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.records import write_atomic
     from dynslam_bench.geometry.tum_file import read_tum
     from dynslam_bench.reports.audit import audit_paper as audit
-    from dynslam_bench.reports.reported import claimed
+    from dynslam_bench.reports.model.published import claimed
     from dynslam_bench.sequences.catalogue import entry_of
-    from dynslam_bench.sequences.roots import find_data_root
 
     truth = {}
     for name in sorted({each.sequence for each in claimed()}):

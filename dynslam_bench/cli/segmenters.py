@@ -27,9 +27,9 @@ def train(
     """Train a Mask R-CNN with a cross-layer feature pyramid; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
     from dynslam_bench.envs import resolve_device
-    from dynslam_bench.segmentation.train import TrainProgress
-    from dynslam_bench.segmentation.train import train as train_network
-    from dynslam_bench.segmentation.train_settings import TrainSettings
+    from dynslam_bench.segmentation.training.settings import TrainSettings
+    from dynslam_bench.segmentation.training.train import TrainProgress
+    from dynslam_bench.segmentation.training.train import train as train_network
 
     chosen = apply_overrides(TrainSettings(), gather_settings(assignments, settings, {}))
     with progress("training") as advance:
@@ -63,8 +63,8 @@ def evaluate(
     """Measure a segmenter's masks against labels."""
     from dynslam_bench.core.settings import apply_overrides
     from dynslam_bench.envs import resolve_device
-    from dynslam_bench.segmentation.evaluate import evaluate_segmenter
     from dynslam_bench.segmentation.settings import SegmentationSettings
+    from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
     settings = apply_overrides(
         SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})}

@@ -66,7 +66,7 @@ def fetch(
     keep_archive: Annotated[bool, typer.Option("--keep-archive", help="Keep the archive, too.")] = False,
 ) -> None:
     """Download public sequences; a call that was cut short goes on where it stopped."""
-    from dynslam_bench.sequences.download import Progress
+    from dynslam_bench.core.download import Progress
     from dynslam_bench.sequences.fetch import fetch as fetch_one
     from dynslam_bench.sequences.listing import expand
 
@@ -120,7 +120,7 @@ def render(
     threads: Annotated[Optional[int], typer.Option(min=1, help="Frames rendered at a time.")] = None,  # noqa: UP045
 ) -> None:
     """Render sequences now, in place of when they are first read."""
-    from dynslam_bench.sequences.roots import find_data_root
+    from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in names:

@@ -27,7 +27,7 @@ def list_(
 
     from dynslam_bench.core.errors import RunError, did_you_mean
     from dynslam_bench.runs import RunStore
-    from dynslam_bench.runs.record import Status
+    from dynslam_bench.runs.storage.record import Status
 
     if status is not None and status not in get_args(Status):
         raise RunError(f"unknown status '{status}'", did_you_mean(status, get_args(Status)))

@@ -94,7 +94,7 @@ def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
 
 def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
     """What others report of a system: its own spec's numbers, the published ones and those that the paper claims."""
-    from dynslam_bench.reports.reported import CLAIMED, claimed, published
+    from dynslam_bench.reports.model.published import CLAIMED, claimed, published
 
     own = [
         (name, metric, value, "its spec", "") for name, row in spec.reported.items() for metric, value in row.items()

@@ -1,6 +1,6 @@
 """Protocol, association, alignment, APE, RPE, coverage and mask quality."""
 
-from .compare import ComparisonRow, compare_protocols
+from .compare_protocols import ComparisonRow, compare_protocols
 from .evaluate import Evaluation, evaluate, evaluate_files, pose_errors
 from .frames import common_frames, coverage, hold
 from .masks import MaskCounts, compare_masks

@@ -17,11 +17,11 @@ from .alignment import Similarity, align
 from .ape import absolute_errors
 from .association import Association, match
 from .conditioning import RELIABLE_DEG
+from .error_statistics import named, statistics
 from .never_move import never_move
 from .protocol import Alignment, Protocol, get_protocol
 from .rpe import RelativeErrors, evo_relative_errors, tum_relative_errors
 from .segments import segment_errors
-from .statistics import named, statistics
 
 SCHEMA_VERSION = 1
 

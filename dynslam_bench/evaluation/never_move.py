@@ -9,7 +9,7 @@ from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.geometry.association import associate
 from dynslam_bench.geometry.trajectory import Trajectory
 
-from .statistics import statistics
+from .error_statistics import statistics
 
 
 def never_move(ground_truth: Trajectory, stamps: ArrayLike | None = None, max_dt: float = 0.02) -> dict[str, float]:

@@ -8,16 +8,16 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.cache import StageCache
+from dynslam_bench.contracts.features import FeatureExtractor, Keypoints
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.core.steering import Steerable
 
-from .keypoints import FeatureExtractor, Keypoints
 from .registry import FEATURES
 
-_ROOMS = ("core", "features")
+_ROOMS = ("core", "contracts", "features")
 """The rooms whose code decides what an extractor finds."""
 
 

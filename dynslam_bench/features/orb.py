@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.core.errors import SettingsError
 
 from ._centroid import orientations, patch_half_widths
-from .keypoints import Keypoints
 from .settings import FeatureSettings
 
 PATCH_RADIUS = 15

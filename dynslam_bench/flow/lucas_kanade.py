@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import flow_stats, request, usable_points
-from .estimator import FlowResult
+from dynslam_bench.contracts.flow import FlowResult
+
+from .degenerate import flow_stats, request, usable_points
 from .settings import FlowSettings
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)

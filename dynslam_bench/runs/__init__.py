@@ -9,21 +9,31 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .bench import RunEvent, run_many
-    from .execute import run_one
     from .identity import ResolvedRun, resolve
-    from .imports import import_trajectory
-    from .record import FAILED, MetricRecord, RunRecord
-    from .scoring import DEFAULT_PROTOCOL, score
+    from .many import RunEvent, run_many
+    from .one import run_one
     from .spec import Limits, RunSpec
-    from .store import RunStore
+    from .storage.imported import import_trajectory
+    from .storage.record import FAILED, MetricRecord, RunRecord
+    from .storage.scoring import DEFAULT_PROTOCOL, score
+    from .storage.store import RunStore
 
 _HOMES = {
-    "FAILED": "record", "DEFAULT_PROTOCOL": "scoring", "Limits": "spec", "MetricRecord": "record",
-    "ResolvedRun": "identity", "RunEvent": "bench", "RunRecord": "record", "RunSpec": "spec", "RunStore": "store",
-    "import_trajectory": "imports", "resolve": "identity", "run_many": "bench", "run_one": "execute",
-    "score": "scoring",
-}  # fmt: skip
+    "DEFAULT_PROTOCOL": "storage.scoring",
+    "FAILED": "storage.record",
+    "import_trajectory": "storage.imported",
+    "Limits": "spec",
+    "MetricRecord": "storage.record",
+    "resolve": "identity",
+    "ResolvedRun": "identity",
+    "run_many": "many",
+    "run_one": "one",
+    "RunEvent": "many",
+    "RunRecord": "storage.record",
+    "RunSpec": "spec",
+    "RunStore": "storage.store",
+    "score": "storage.scoring",
+}
 
 __all__ = [
     "DEFAULT_PROTOCOL",

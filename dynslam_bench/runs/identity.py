@@ -8,8 +8,11 @@ from importlib.metadata import packages_distributions, version
 from typing import Any
 
 import dynslam_bench
+from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.errors import RunError, SequenceError
 from dynslam_bench.core.fingerprint import code_digest, named_digests, path_digest, plugin_digest
+from dynslam_bench.core.machine import versions
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
@@ -17,20 +20,19 @@ from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
 from dynslam_bench.envs.source import open_frames, preprocessing_of
 from dynslam_bench.features.registry import FEATURES
-from dynslam_bench.flow.spec import FLOWS
+from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.build import weights_digest
+from dynslam_bench.segmentation.build_segmenter import weights_digest
 from dynslam_bench.segmentation.registry import SEGMENTERS
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.frame import Sequence
 from dynslam_bench.sequences.part import part_of
-from dynslam_bench.trackers.protocol import TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-from .machine import versions
 from .spec import RunSpec
 
-_ROOMS = ("core", "geometry", "sequences", "features", "segmentation", "flow", "culling", "slam", "trackers", "envs")
+_ROOMS = (
+    "core", "geometry", "contracts", "sequences", "features", "segmentation", "flow", "culling", "slam", "trackers", "envs",
+)  # fmt: skip
 """The rooms whose source a trajectory may depend on."""
 
 

@@ -20,9 +20,9 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.tum_file import write_tum
 
-from .child import FRAMES_FILE
-from .failures import at
-from .sheet import SheetWriter
+from .process.child import FRAMES_FILE
+from .process.failures import at
+from .sheet_collector import SheetWriter
 from .spec import RunSpec
 
 Send = Callable[[dict[str, Any]], None]
@@ -125,7 +125,7 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
         write_tum(folder / "trajectory_final.txt", final)
     outputs = env.map_outputs()
     if outputs is not None:
-        from dynslam_bench.slam.outputs import write_keyframes_csv, write_ply
+        from dynslam_bench.slam.outputs.map_files import write_keyframes_csv, write_ply
 
         write_keyframes_csv(folder / "keyframes.csv", outputs)
         write_ply(folder / "map.ply", outputs)

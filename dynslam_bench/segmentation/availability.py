@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.sequences.frame import Sequence
 
-from .build import build_oracle, resolve_source
-from .checkpoints import COCO, embedded_weights, fetch_checkpoint
-from .recorded import RecordedSegmenter
+from .build_segmenter import build_oracle, resolve_source
+from .masks.recorded import RecordedSegmenter
+from .networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
 from .registry import SEGMENTERS, SegmenterContext
 from .settings import SegmentationSettings
 
@@ -75,10 +75,10 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
 def _check_network(kind: str, path: Path, settings: SegmentationSettings, stamp: tuple[int, int] | None) -> None:
     """Load it once in a process, as long as size and time of the file stay."""
     if kind == "onnx":
-        from .onnx import OnnxSegmenter
+        from .networks.onnx.segmenter import OnnxSegmenter
 
         OnnxSegmenter(path, settings)
     else:
-        from .loading import load_network
+        from .networks.mask_rcnn.loading import load_network
 
         load_network(path)

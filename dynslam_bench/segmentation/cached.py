@@ -7,19 +7,19 @@ from functools import cache
 
 import numpy as np
 
-from dynslam_bench.core.cache import Arrays, StageCache
+from dynslam_bench.contracts.segmenter import Instances, Segmenter
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest
 from dynslam_bench.core.records import digest
-from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.core.stage_cache import Arrays, StageCache
 
-from .build import LOWEST_CONFIDENCE, ConfiguredSegmenter, DeferredSegmenter, weights_digest
-from .instances import Instances, Segmenter
+from .build_segmenter import LOWEST_CONFIDENCE, ConfiguredSegmenter, DeferredSegmenter, weights_digest
+from .masks.schedule import MaskScheduler
 from .registry import SEGMENTERS
-from .schedule import MaskScheduler
 
 NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
 """Sources whose masks depend on the colour image alone."""
-_ROOMS = ("core", "sequences", "segmentation")
+_ROOMS = ("core", "contracts", "sequences", "segmentation")
 """The rooms whose code decides what a network sees."""
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from dynslam_bench.contracts.sequence import MaskSource
 from dynslam_bench.core.plugins import Registry
-from dynslam_bench.sequences.frame import MaskSource
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SegmenterSpec:
 
 
 def _builtin() -> Iterable[SegmenterSpec]:
-    here = "dynslam_bench.segmentation.build"
+    here = "dynslam_bench.segmentation.build_segmenter"
     mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
     return (
         SegmenterSpec("oracle", f"{here}:build_oracle", "exact masks of rendered sequences"),

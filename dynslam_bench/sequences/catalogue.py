@@ -9,18 +9,19 @@ from typing import Any, Literal, cast
 
 from pydantic import Field
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings, build
+from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera
 
-from ._toml import read_toml
-from .cameras import CAMERAS, MARKER_TO_CAMERA, find_camera
-from .datasets import DATASETS, DatasetSpec
-from .frame import Sequence, SequenceView
-from .roots import find_data_root, is_writable, user_cache
+from .published.cameras import CAMERAS, MARKER_TO_CAMERA, find_camera
+from .published.datasets import DATASETS, DatasetSpec
 from .settings import PreprocessingSettings
 from .synthetic import SYNTHETIC_IDS, open_synthetic
+from .view import SequenceView
 
 Tag = Literal["static", "low-dynamic", "high-dynamic"]
 Split = Literal["tune", "held-out", ""]
@@ -35,7 +36,7 @@ class CatalogueEntry(Settings):
 
     id: str = Field(description="for example tum/fr3/walking_xyz")
     folder: str = Field(description="published folder name, an alias of the id")
-    camera: str = Field(description="name of the camera, see dynslam_bench.sequences.cameras")
+    camera: str = Field(description="name of the camera, see dynslam_bench.sequences.published.cameras")
     url: str = Field(description="archive")
     page: str = Field(default="", description="web page of the data set")
     size_bytes: int | None = Field(default=None, description="exact size of the archive")
@@ -83,7 +84,7 @@ def catalogue() -> dict[str, CatalogueEntry]:
     """All public sequences by id, in the order of the data files."""
     entries: dict[str, CatalogueEntry] = {}
     for name in _FILES:
-        document = read_toml(Path(__file__).parent / name)
+        document = read_toml(Path(__file__).parent / "published" / name)
         common: dict[str, Any] = document["common"]
         for row in document["sequence"]:
             entry = build(CatalogueEntry, {**common, **row})
@@ -215,7 +216,7 @@ def open_folder(
     Raises:
         SequenceError: It cannot be opened, or its camera is not known.
     """
-    from .tum import Description, TumSequence
+    from .readers.tum import Description, TumSequence
 
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)

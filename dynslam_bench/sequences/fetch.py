@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from dynslam_bench.core.download import Report, download, file_sha256
 from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.records import Record, atomic_folder, write_atomic
 
-from .archives import extract
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
-from .diagnostics import Dropped
-from .download import Report, download, file_sha256
-from .roots import find_data_root
+from .published.archives import extract
+from .readers.diagnostics import Dropped
 
 RECEIPT = "fetched.json"
 MANIFEST = "manifest.sha256"

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.folders import find_data_root
 
 from .catalogue import catalogue, entry_of, open_sequence
-from .datasets import DATASETS
-from .roots import find_data_root
+from .published.datasets import DATASETS
 from .synthetic import parse_synthetic_id
 
 

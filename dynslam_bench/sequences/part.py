@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.records import digest
 
-from .frame import Sequence, SequenceView
+from .view import SequenceView
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
 
-from .frame import Frame, FrameMasks, MaskSource, Sequence
 from .settings import PreprocessingSettings
 
 Image = NDArray[np.integer | np.floating]

@@ -8,34 +8,26 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import FrameBundle, KeyframeView
+from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
+from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling.filter import FrameBundle, KeyframeView
-from dynslam_bench.features.keypoints import Keypoints
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
-from .history import History
-from .keyframes import KeyframeRule
-from .map import Map
-from .mapping import LocalMapper
-from .motion import MotionState, pose_covariance, smooth
-from .observation import Observations, observe
-from .outputs import KeyframeRecord, MapOutputs
+from .localisation.motion_model import MotionState, pose_covariance, smooth
+from .localisation.observation import Observations, observe
+from .localisation.pose import PoseEstimate
+from .localisation.relocalisation import Relocalised, locate
+from .localisation.tracking import ENOUGH_FIRST, Matches, Tracked, local_points, match_last_frame, match_map, solve
+from .mapping.history import History
+from .mapping.keyframes import KeyframeRule
+from .mapping.local_mapping import LocalMapper
+from .mapping.map import Map
 from .places import most_alike
-from .pose import PoseEstimate
-from .relocalisation import Relocalised, locate
-from .result import TrackResult
 from .settings import BackendSettings
-from .tracking import (
-    ENOUGH_FIRST,
-    Matches,
-    Tracked,
-    local_points,
-    match_last_frame,
-    match_map,
-    solve,
-)
 
 Array = NDArray[np.float64]
 State = Literal["initialising", "ok", "lost"]

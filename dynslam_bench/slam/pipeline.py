@@ -15,26 +15,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import FeatureExtractor
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
+from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
+from dynslam_bench.contracts.map_outputs import MapOutputs
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.core.steering import Steerable, Steering
-from dynslam_bench.culling.ego_motion import refine_prediction
-from dynslam_bench.culling.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
 from dynslam_bench.culling.guard import restore_starved
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.features.keypoints import FeatureExtractor
-from dynslam_bench.flow.estimator import FlowEstimator, FlowResult
+from dynslam_bench.culling.tools.ego_motion import refine_prediction
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.segmentation.instances import Instances
-from dynslam_bench.sequences.frame import Frame
 
 from .backend import RgbdBackend
-from .checks import check_frame, own_depth
-from .outputs import MapOutputs
-from .result import TrackResult
+from .frame_checks import check_frame, own_depth
 
 KEYFRAMES_SHOWN = 20
 """How many of the latest keyframes filters may look at (DynaSLAM's window)."""

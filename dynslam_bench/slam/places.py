@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .map import Map
-from .observation import Observations
+from .localisation.observation import Observations
+from .mapping.map import Map
 
 VALUES = 1 << 16
 """Values of a piece."""

@@ -23,9 +23,9 @@ class Ailment:
 def diagnose() -> list[Ailment]:
     """All plug-ins of all kinds that failed to load, and trackers that lack a package."""
     from dynslam_bench.features.registry import FEATURES
-    from dynslam_bench.flow.spec import FLOWS
+    from dynslam_bench.flow.registry import FLOWS
     from dynslam_bench.segmentation.registry import SEGMENTERS
-    from dynslam_bench.sequences.datasets import DATASETS
+    from dynslam_bench.sequences.published.datasets import DATASETS
     from dynslam_bench.trackers.registry import TRACKERS
 
     found = [

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.culling.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView
-from dynslam_bench.features.keypoints import Keypoints
-from dynslam_bench.flow.estimator import FlowResult
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.geometry import se3
-from dynslam_bench.segmentation.instances import Instances
 
 from .report import ConformanceReport, require
 from .scenes import CornerSequence

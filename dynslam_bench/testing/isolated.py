@@ -16,12 +16,12 @@ from typing import Any
 
 from dynslam_bench.core import errors
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.runs.child import LOG_FILE
-from dynslam_bench.runs.forkserver import THREAD_VARIABLES
-from dynslam_bench.runs.log_file import LogFile
-from dynslam_bench.runs.process import start_child
+from dynslam_bench.runs.process.child import LOG_FILE
+from dynslam_bench.runs.process.handle import start_child
+from dynslam_bench.runs.process.log_file import LogFile
+from dynslam_bench.runs.process.server import THREAD_VARIABLES
+from dynslam_bench.runs.process.supervise import Verdict, supervise
 from dynslam_bench.runs.spec import Limits
-from dynslam_bench.runs.supervise import Verdict, supervise
 
 from .report import OBSERVER, Check, ConformanceReport
 

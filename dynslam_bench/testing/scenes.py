@@ -7,9 +7,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.frame import Frame, FrameMasks, MaskSource
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 

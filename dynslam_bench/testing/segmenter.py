@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dynslam_bench.segmentation.instances import Instances, Segmenter
-from dynslam_bench.sequences.frame import Frame, Sequence
+from dynslam_bench.contracts.segmenter import Instances, Segmenter
+from dynslam_bench.contracts.sequence import Frame, Sequence
 
 from .report import ConformanceReport, require
 from .scenes import CornerSequence, hard_frames

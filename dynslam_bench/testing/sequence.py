@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.frame import Frame, Sequence
 
 from .report import ConformanceReport, NotApplicable, require
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import Tracker
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import Parameter, Settings, apply_overrides
 from dynslam_bench.core.steering import Steerable, steerable_parameters
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.slam.result import TrackResult
-from dynslam_bench.trackers.protocol import Tracker
 
 from .report import NotApplicable, require
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.settings import Settings, apply_overrides, build
 from dynslam_bench.geometry.se3 import inverse, is_pose
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.frame import Frame, Sequence
-from dynslam_bench.slam.result import TrackResult
-from dynslam_bench.trackers.protocol import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 from .report import ConformanceError, ConformanceReport, NotApplicable, require, still_alive

@@ -10,11 +10,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
-
-from .protocol import Tracker, TrackerContext, TrackerSpec
 
 
 def _builtin() -> Iterable[TrackerSpec]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from dynslam_bench.contracts.tracker import TrackerSpec
+
 from .adapters.specs import adapter_specs
-from .protocol import TrackerSpec
 from .systems import dynaslam, emfoa_oft
 
 _SYSTEMS = (

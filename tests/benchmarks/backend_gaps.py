@@ -22,8 +22,8 @@ sys.path.insert(0, str(ROOT))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
+from dynslam_bench.contracts.sequence import Sequence  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
-from dynslam_bench.sequences.frame import Sequence  # noqa: E402
 from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 
 TWINS = [f"synthetic/sitting_{motion}" for motion in ("xyz", "static", "halfsphere", "rpy")]

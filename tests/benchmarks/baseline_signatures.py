@@ -38,9 +38,9 @@ import numpy as np
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports.reported import published
-from dynslam_bench.reports.rows import LoadedRun, load_runs, open_stores
-from dynslam_bench.runs.scoring import DEFAULT_PROTOCOL
+from dynslam_bench.reports.model.published import published
+from dynslam_bench.reports.model.rows import LoadedRun, load_runs, open_stores
+from dynslam_bench.runs.storage.scoring import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic.settings import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
 

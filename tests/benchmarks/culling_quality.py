@@ -36,11 +36,11 @@ sys.path.insert(0, str(ROOT))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
+from dynslam_bench.contracts.sequence import FrameMasks  # noqa: E402
 from dynslam_bench.evaluation.evaluate import evaluate  # noqa: E402
 from dynslam_bench.evaluation.protocol import get_protocol  # noqa: E402
 from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
-from dynslam_bench.sequences.frame import FrameMasks  # noqa: E402
 from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 from dynslam_bench.trackers.registry import TRACKERS  # noqa: E402
 

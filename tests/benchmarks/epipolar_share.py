@@ -25,7 +25,7 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from dynslam_bench.envs.slam_env import SlamEnv  # noqa: E402
-from dynslam_bench.runs.frames import FrameLog  # noqa: E402
+from dynslam_bench.runs.storage.frames import FrameLog  # noqa: E402
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
 TRACKERS_WITH_F = (

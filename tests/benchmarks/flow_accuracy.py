@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from flow_data import Pair, kitti, real, synthetic
 
-from dynslam_bench.flow.build import build_flow
-from dynslam_bench.flow.dense import DenseDaisyFlow
+from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.dense.labels import DenseDaisyFlow
 from dynslam_bench.flow.dis import DisFlow
 from dynslam_bench.flow.settings import FlowSettings
 

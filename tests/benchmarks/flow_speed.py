@@ -21,9 +21,9 @@ import numpy as np
 from flow_accuracy import SEARCHES
 from flow_data import Pair, corners, synthetic
 
-from dynslam_bench.flow.build import build_flow
-from dynslam_bench.flow.dense import DenseDaisyFlow
-from dynslam_bench.flow.estimator import FlowEstimator
+from dynslam_bench.contracts.flow import FlowEstimator
+from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.dense.labels import DenseDaisyFlow
 from dynslam_bench.flow.settings import FlowSettings
 
 

@@ -12,7 +12,7 @@ import sys
 
 import numpy as np
 
-from dynslam_bench.reports.statistics import rank_groups
+from dynslam_bench.reports.model.statistics import rank_groups
 
 SEQUENCES = (3, 4, 5, 6, 8, 12, 20)
 TRACKERS = (2, 5, 10, 20)

@@ -27,13 +27,13 @@ import numpy as np  # noqa: E402
 from conftest import PointWorld  # noqa: E402
 
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
-from dynslam_bench.features.build import build_extractor  # noqa: E402
+from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
 from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
-from dynslam_bench.slam.observation import observe  # noqa: E402
+from dynslam_bench.slam.localisation.observation import observe  # noqa: E402
+from dynslam_bench.slam.localisation.relocalisation import locate  # noqa: E402
 from dynslam_bench.slam.places import most_alike  # noqa: E402
-from dynslam_bench.slam.relocalisation import locate  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
 DENSE = {

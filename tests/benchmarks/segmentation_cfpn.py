@@ -29,10 +29,10 @@ def main() -> int:
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
     options = parser.parse_args()
 
-    from dynslam_bench.segmentation.evaluate import evaluate_segmenter
     from dynslam_bench.segmentation.settings import SegmentationSettings
-    from dynslam_bench.segmentation.train import train
-    from dynslam_bench.segmentation.train_settings import TrainSettings
+    from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
+    from dynslam_bench.segmentation.training.settings import TrainSettings
+    from dynslam_bench.segmentation.training.train import train
 
     rows = []
     for seed in options.seeds:

@@ -20,16 +20,16 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
 
-from dynslam_bench.segmentation.build import build_segmenter
-from dynslam_bench.segmentation.carry import carry_dense, carry_sparse
-from dynslam_bench.segmentation.checkpoints import embedded_weights
-from dynslam_bench.segmentation.mask_rcnn import MaskRCNNSegmenter
-from dynslam_bench.segmentation.network import MaskRCNN
-from dynslam_bench.segmentation.network_config import NetworkConfig, resnet18_config
-from dynslam_bench.segmentation.postprocess import dynamic_mask
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.segmentation.build_segmenter import build_segmenter
+from dynslam_bench.segmentation.masks.carry import carry_dense, carry_sparse
+from dynslam_bench.segmentation.masks.postprocess import dynamic_mask
+from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
+from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig, resnet18_config
+from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
+from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import MaskRCNNSegmenter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.frame import Frame
 
 WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
 

@@ -65,9 +65,9 @@ def full_size(folder: Path) -> str:
     """Source of a Mask R-CNN of the published size with random weights."""
     import torch
 
-    from dynslam_bench.segmentation.loading import save_network
-    from dynslam_bench.segmentation.network import MaskRCNN
-    from dynslam_bench.segmentation.network_config import NetworkConfig
+    from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig
+    from dynslam_bench.segmentation.networks.mask_rcnn.loading import save_network
+    from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
 
     torch.manual_seed(0)
     save_network(MaskRCNN(NetworkConfig()), folder / "resnet50.pt")

@@ -20,12 +20,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, RenderSettings, open_synthetic
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
 from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
-from dynslam_bench.trackers.protocol import TrackerContext
 
 VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
 CONTROLS = ("moving", "none", "frozen", "masked")

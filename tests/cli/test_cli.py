@@ -204,7 +204,7 @@ def test_envs(cli):
 
 def test_cache(cli, monkeypatch, tmp_path):
     monkeypatch.setenv("DYNSLAM_BENCH_CACHE", str(tmp_path / "stages"))
-    from dynslam_bench.core.cache import StageCache
+    from dynslam_bench.core.stage_cache import StageCache
 
     StageCache().put("masks", "ab" * 16, {"a": np.zeros(10)}, 0.5)
     found = json.loads(cli("cache", "info", "--json")[1])

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.core.cache import StageCache
 from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.stage_cache import StageCache
 
 
 def test_arrays_and_cost_come_back_bit_for_bit(tmp_path: Path) -> None:

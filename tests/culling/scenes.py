@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynslam_bench.culling.filter import FilterState, FrameBundle, KeyframeView
-from dynslam_bench.features.keypoints import Keypoints
-from dynslam_bench.flow.estimator import FlowResult
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeView
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.instances import Instances
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 

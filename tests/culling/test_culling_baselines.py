@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, box_instance, bundle, keyframe, keypoints, scene
 
+from dynslam_bench.contracts.filter import DynamicFilter, FilterState
 from dynslam_bench.culling.baseline_settings import (
     BoxEpipolarSettings,
     BoxSettings,
@@ -19,17 +20,16 @@ from dynslam_bench.culling.baseline_settings import (
     ResidualSettings,
     TemplateSettings,
 )
-from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-from dynslam_bench.culling.boxes import BoxFilter
-from dynslam_bench.culling.class_rule import ClassRuleFilter
-from dynslam_bench.culling.correlation_graph import CorrelationFilter
-from dynslam_bench.culling.depth_ransac import DepthRansacFilter
-from dynslam_bench.culling.filter import DynamicFilter, FilterState
-from dynslam_bench.culling.moving_probability import ProbabilityFilter
-from dynslam_bench.culling.moving_vote import MovingVoteFilter
-from dynslam_bench.culling.multiview_depth import MultiViewFilter
-from dynslam_bench.culling.residual_clusters import ResidualFilter
-from dynslam_bench.culling.template_matching import TemplateFilter
+from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.blocks.boxes import BoxFilter
+from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
+from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
+from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
+from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
+from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
+from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
+from dynslam_bench.culling.blocks.template_matching import TemplateFilter
 from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, box_instance, bundle, keyframe, scene
 
-from dynslam_bench.culling.coherence import coherent
-from dynslam_bench.culling.ego_motion import refine_prediction
-from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
-from dynslam_bench.culling.filter import DynamicFilter, FilterState
-from dynslam_bench.culling.free_space import FreeSpaceFilter
+from dynslam_bench.contracts.filter import DynamicFilter, FilterState
+from dynslam_bench.culling.blocks.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
+from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
+from dynslam_bench.culling.blocks.rigid_motion import MotionFilter
+from dynslam_bench.culling.blocks.semantic import SemanticFilter
 from dynslam_bench.culling.guard import restore_starved
-from dynslam_bench.culling.motion import MotionFilter
-from dynslam_bench.culling.semantic import SemanticFilter
 from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, GuardSettings, MotionSettings
+from dynslam_bench.culling.tools.coherence import coherent
+from dynslam_bench.culling.tools.ego_motion import refine_prediction
 from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

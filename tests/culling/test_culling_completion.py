@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, box_instance, bundle, keypoints, scene
 
+from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import build
 from dynslam_bench.culling.baseline_settings import (
@@ -15,15 +16,14 @@ from dynslam_bench.culling.baseline_settings import (
     DepthBlockSettings,
     ReseedingSettings,
 )
-from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-from dynslam_bench.culling.class_rule import ClassRuleFilter
-from dynslam_bench.culling.correlation_graph import depth_variance, point_covariance
-from dynslam_bench.culling.depth_blocks import DepthBlockFilter, covered_blocks
-from dynslam_bench.culling.ego_motion import depth_sigma
-from dynslam_bench.culling.filter import FilterState, FrameBundle
-from dynslam_bench.culling.light_track import light_track
-from dynslam_bench.culling.moving_probability import expand
-from dynslam_bench.culling.reseeding import ReseedingFilter
+from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
+from dynslam_bench.culling.blocks.correlation_graph import depth_variance, point_covariance
+from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter, covered_blocks
+from dynslam_bench.culling.blocks.moving_probability import expand
+from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
+from dynslam_bench.culling.tools.ego_motion import depth_sigma
+from dynslam_bench.culling.tools.light_track import light_track
 from dynslam_bench.features.orb import OrbExtractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import se3

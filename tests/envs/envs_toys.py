@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame, FrameMasks
+from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.frame import Frame, FrameMasks
-from dynslam_bench.slam.result import TrackResult
-from dynslam_bench.trackers.protocol import TrackerSpec
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 STEP_M = 0.01

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from envs_toys import TARGET, ToySequence, images
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import DynslamError, SettingsError
 from dynslam_bench.envs import (
     Degradation,
@@ -17,7 +18,6 @@ from dynslam_bench.envs import (
     SlamEnv,
 )
 from dynslam_bench.geometry.tum_file import read_tum
-from dynslam_bench.sequences.frame import Frame
 
 
 def play(env) -> list[tuple]:

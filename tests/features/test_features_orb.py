@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.features import FeatureExtractor
 from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
-from dynslam_bench.features.build import build_extractor
-from dynslam_bench.features.keypoints import FeatureExtractor
+from dynslam_bench.features.build_extractor import build_extractor
 from dynslam_bench.features.orb import OrbExtractor, level_quotas, spread
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
@@ -130,7 +130,7 @@ def test_settings_describe_a_search_space():
 def test_a_plugin_extractor_from_a_file(tmp_path, monkeypatch):
     source = (
         "import numpy as np\n"
-        "from dynslam_bench.features.keypoints import Keypoints\n"
+        "from dynslam_bench.contracts.features import Keypoints\n"
         "from dynslam_bench.features.registry import FeatureSpec\n"
         "class Corner:\n"
         "    def __init__(self, settings): self.n = settings.options.get('n', 1)\n"

@@ -8,9 +8,10 @@ import pytest
 import torch
 from scipy import ndimage
 
-from dynslam_bench.flow import layout, matching
-from dynslam_bench.flow.daisy import describe
-from dynslam_bench.flow.maps import gaussian_weights, orientation_maps
+from dynslam_bench.flow.daisy import cost as matching
+from dynslam_bench.flow.daisy import layout
+from dynslam_bench.flow.daisy.descriptor import describe
+from dynslam_bench.flow.daisy.maps import gaussian_weights, orientation_maps
 from dynslam_bench.flow.settings import FlowSettings
 
 

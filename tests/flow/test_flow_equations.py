@@ -9,14 +9,14 @@ import optuna
 import pytest
 import torch
 
-from dynslam_bench.flow.matching import tables_for
-from dynslam_bench.flow.optimiser import emfoa_minimise
+from dynslam_bench.flow.daisy.cost import tables_for
+from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
+from dynslam_bench.flow.daisy.torch_sparse import TorchSparseFlow
 from dynslam_bench.flow.searches import rules
 from dynslam_bench.flow.searches.common import advance, scrambled
 from dynslam_bench.flow.searches.moth_flame import fly
+from dynslam_bench.flow.searches.optimiser import emfoa_minimise
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.sparse import SparseDaisyFlow
-from dynslam_bench.flow.torch_sparse import TorchSparseFlow
 from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.flow.dense import DenseDaisyFlow, consistent
-from dynslam_bench.flow.guided_filter import guided_filter
+from dynslam_bench.flow.dense.guided_filter import guided_filter
+from dynslam_bench.flow.dense.labels import DenseDaisyFlow, consistent
+from dynslam_bench.flow.dense.superpixels import superpixels
+from dynslam_bench.flow.dense.winner import winner_takes_all
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.superpixels import superpixels
-from dynslam_bench.flow.winner import winner_takes_all
 
 
 def direct_guided_filter(guide, values, radius, epsilon):

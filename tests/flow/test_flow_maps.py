@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from dynslam_bench.flow import layout
-from dynslam_bench.flow.buffers import BufferPool
-from dynslam_bench.flow.build import build_flow
-from dynslam_bench.flow.daisy import _binomial
-from dynslam_bench.flow.maps import framed, half_image, orientation_maps
+from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.daisy import layout
+from dynslam_bench.flow.daisy.descriptor import _binomial
+from dynslam_bench.flow.daisy.maps import framed, half_image, orientation_maps
+from dynslam_bench.flow.kernels.buffers import BufferPool
 
 
 def noise(shape, seed=0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import differential_evolution
 
-from dynslam_bench.flow.optimiser import emfoa_minimise
+from dynslam_bench.flow.searches.optimiser import emfoa_minimise
 from dynslam_bench.flow.searches.rules import EMFOA, EMFOA_LITERAL, MFO, flame_counts
 
 SHIFT = np.array([1.3, -0.7, 2.1, -1.9])

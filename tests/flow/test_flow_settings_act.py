@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.core.settings import Parameter, parameters
-from dynslam_bench.flow.build import build_flow
-from dynslam_bench.flow.estimator import FlowEstimator
+from dynslam_bench.flow.build_flow import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 
 FLAVOURS = {

@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
-from dynslam_bench.flow.build import build_flow
-from dynslam_bench.flow.estimator import FlowEstimator
-from dynslam_bench.flow.matching import tables_for
+from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.daisy.cost import tables_for
+from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
+from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.flow.searches.common import new_state
 from dynslam_bench.flow.searches.propagation import common_motions
 from dynslam_bench.flow.searches.schedule import make_plan
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.sparse import SparseDaisyFlow
-from dynslam_bench.flow.spec import FLOWS
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SEARCHES = [
@@ -377,7 +377,7 @@ def test_settings_describe_the_search_space():
 def test_plugins(tmp_path):
     path = tmp_path / "my_flow.py"
     path.write_text(
-        "from dynslam_bench.flow.spec import FlowSpec\n"
+        "from dynslam_bench.flow.registry import FlowSpec\n"
         "from dynslam_bench.flow.lucas_kanade import LucasKanadeFlow\n"
         f"SPEC = FlowSpec('mine', {str(path)!r} + ':make')\n"
         f"BROKEN = FlowSpec('broken', {str(path)!r} + ':boom')\n"

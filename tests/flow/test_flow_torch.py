@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.flow import matching
-from dynslam_bench.flow.build import build_flow
-from dynslam_bench.flow.daisy import quantised_maps
-from dynslam_bench.flow.maps import orientation_maps
+from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.daisy import cost as matching
+from dynslam_bench.flow.daisy.descriptor import quantised_maps
+from dynslam_bench.flow.daisy.maps import orientation_maps
+from dynslam_bench.flow.daisy.torch_sparse import TorchSparseFlow
 from dynslam_bench.flow.searches.schedule import STRATEGIES
+from dynslam_bench.flow.searches.torch_search import label_costs, rotated_descriptors, torch_tables
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.torch_search import label_costs, rotated_descriptors, torch_tables
-from dynslam_bench.flow.torch_sparse import TorchSparseFlow
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 

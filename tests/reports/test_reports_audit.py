@@ -6,7 +6,7 @@ import pytest
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports import audit as audit_module
 from dynslam_bench.reports.audit import CHECKS, OURS, audit_paper
-from dynslam_bench.reports.reported import Claimed, claimed, published, reported_for
+from dynslam_bench.reports.model.published import Claimed, claimed, published, reported_for
 
 
 @pytest.fixture(scope="module")

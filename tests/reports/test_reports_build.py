@@ -12,15 +12,16 @@ from reports_fake_store import add_run, fill, truth_of
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import ReportData, build_report, compare
-from dynslam_bench.reports.board import make_board
-from dynslam_bench.reports.columns import shortened
-from dynslam_bench.reports.rows import RunRow, check_one_protocol, load_runs
-from dynslam_bench.reports.sequence_figures import broken
-from dynslam_bench.reports.sequence_tables import per_sequence
-from dynslam_bench.reports.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown
-from dynslam_bench.reports.tables import leaderboard
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.reports import ReportData, build_report
+from dynslam_bench.reports import compare_runs as compare
+from dynslam_bench.reports.figures.sequence import broken
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.columns import shortened
+from dynslam_bench.reports.model.rows import RunRow, check_one_protocol, load_runs
+from dynslam_bench.reports.tables.leaderboard import leaderboard
+from dynslam_bench.reports.tables.sequences import per_sequence
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown
+from dynslam_bench.runs.storage.store import RunStore
 
 
 @pytest.fixture(scope="module")

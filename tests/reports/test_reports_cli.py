@@ -6,7 +6,7 @@ import pytest
 from reports_fake_store import add_run
 
 from dynslam_bench.cli.app import start
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.runs.storage.store import RunStore
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dynslam_bench.reports.statistics import (
+from dynslam_bench.reports.model.statistics import (
     attainable_p,
     holm,
     paired_p_value,

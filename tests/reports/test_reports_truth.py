@@ -7,16 +7,17 @@ import pytest
 from reports_fake_store import add_run
 
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import build_report, compare, load_frame
-from dynslam_bench.reports.board import make_board
-from dynslam_bench.reports.columns import name_columns
-from dynslam_bench.reports.formats import mm, percent
-from dynslam_bench.reports.missing import missing_commands, missing_note
-from dynslam_bench.reports.reported import is_excerpt
-from dynslam_bench.reports.rows import RunRow, load_runs
-from dynslam_bench.reports.sequence_tables import per_sequence, relative_errors
-from dynslam_bench.reports.tables import leaderboard
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.reports import build_report, load_frame
+from dynslam_bench.reports import compare_runs as compare
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.columns import name_columns
+from dynslam_bench.reports.model.missing import missing_commands, missing_note
+from dynslam_bench.reports.model.published import is_excerpt
+from dynslam_bench.reports.model.rows import RunRow, load_runs
+from dynslam_bench.reports.tables.formats import mm, percent
+from dynslam_bench.reports.tables.leaderboard import leaderboard
+from dynslam_bench.reports.tables.sequences import per_sequence, relative_errors
+from dynslam_bench.runs.storage.store import RunStore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 

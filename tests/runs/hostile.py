@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.slam.result import TrackResult
-from dynslam_bench.trackers.protocol import TrackerSpec
 
 DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(300)"
 SLEEPER = [sys.executable, "-S", "-c", DEAF]

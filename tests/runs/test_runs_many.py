@@ -16,7 +16,7 @@ from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import write_tum
 from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
-from dynslam_bench.runs.packing import pack, unpack
+from dynslam_bench.runs.storage.packing import pack, unpack
 
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:

@@ -18,7 +18,7 @@ from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, resolve, run_one, score
-from dynslam_bench.runs.frames import FrameLog
+from dynslam_bench.runs.storage.frames import FrameLog
 
 
 def leftovers(store: RunStore) -> list[str]:

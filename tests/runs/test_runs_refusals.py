@@ -11,8 +11,8 @@ import pytest
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
-from dynslam_bench.segmentation import checkpoints
-from dynslam_bench.segmentation.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.networks import checkpoints
 from dynslam_bench.tuning import StudySpec, Tuner
 
 

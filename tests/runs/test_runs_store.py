@@ -63,7 +63,7 @@ def test_an_edited_plug_in_that_a_setting_names_is_another_run(
 ) -> None:
     specs = {
         "features.extractor": "from dynslam_bench.features.registry import FeatureSpec as Spec",
-        "flow.plugin": "from dynslam_bench.flow.spec import FlowSpec as Spec",
+        "flow.plugin": "from dynslam_bench.flow.registry import FlowSpec as Spec",
         "segmentation.source": "from dynslam_bench.segmentation.registry import SegmenterSpec as Spec",
     }
     for name, text in specs.items():

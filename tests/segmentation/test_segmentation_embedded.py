@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dynslam_bench.segmentation.build import build_segmenter, resolve_source, weights_digest
-from dynslam_bench.segmentation.checkpoints import embedded_weights
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.frame import Frame
 
 AUTO = SegmentationSettings()
 

@@ -4,17 +4,17 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation import carry
-from dynslam_bench.segmentation.compensation import MissedDetections
-from dynslam_bench.segmentation.images import boxes_of
-from dynslam_bench.segmentation.instances import Instances
-from dynslam_bench.segmentation.labelled import LabelledImage
-from dynslam_bench.segmentation.mask_metrics import MaskTally, average_precision, mask_iou
-from dynslam_bench.segmentation.postprocess import dilate, dynamic_mask, fill_holes, repair, select
-from dynslam_bench.segmentation.schedule import MaskScheduler
+from dynslam_bench.segmentation.masks import carry
+from dynslam_bench.segmentation.masks.compensation import MissedDetections
+from dynslam_bench.segmentation.masks.postprocess import dilate, dynamic_mask, fill_holes, repair, select
+from dynslam_bench.segmentation.masks.schedule import MaskScheduler
+from dynslam_bench.segmentation.networks.images import boxes_of
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.frame import Frame
+from dynslam_bench.segmentation.training.labelled import LabelledImage
+from dynslam_bench.segmentation.training.mask_metrics import MaskTally, average_precision, mask_iou
 
 H, W = 120, 160
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation import box_ops
-from dynslam_bench.segmentation.build import build_segmenter
-from dynslam_bench.segmentation.loading import load_network, save_network
-from dynslam_bench.segmentation.mask_rcnn import MaskRCNNSegmenter, paste
-from dynslam_bench.segmentation.network import MaskRCNN
-from dynslam_bench.segmentation.network_config import NetworkConfig, embedded_config, resnet18_config
-from dynslam_bench.segmentation.roi_align import levels_of, roi_align
+from dynslam_bench.segmentation.build_segmenter import build_segmenter
+from dynslam_bench.segmentation.networks.mask_rcnn import box_ops
+from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig, embedded_config, resnet18_config
+from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network, save_network
+from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
+from dynslam_bench.segmentation.networks.mask_rcnn.roi_align import levels_of, roi_align
+from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import MaskRCNNSegmenter, paste
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.frame import Frame
 
 SMALL = NetworkConfig(
     blocks=(1, 1, 1, 1), bottleneck=False, stem=8, channels=16, classes=("person", "chair"), box_hidden=16,

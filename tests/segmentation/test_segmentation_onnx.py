@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.build import build_segmenter
-from dynslam_bench.segmentation.onnx import OnnxSegmenter, fit, opencv_threads
-from dynslam_bench.segmentation.onnx_header import TensorInfo, read_header
-from dynslam_bench.segmentation.onnx_heads import Layout, Placement, decode, detect_layout
+from dynslam_bench.segmentation.build_segmenter import build_segmenter
+from dynslam_bench.segmentation.networks.onnx.header import TensorInfo, read_header
+from dynslam_bench.segmentation.networks.onnx.heads import Layout, Placement, decode, detect_layout
+from dynslam_bench.segmentation.networks.onnx.segmenter import OnnxSegmenter, fit, opencv_threads
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.frame import Frame
 
 sys.path.insert(0, str(Path(__file__).parent))
 import onnx_writer

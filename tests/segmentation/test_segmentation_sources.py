@@ -9,19 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame, FrameMasks
 from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, build, parameters
-from dynslam_bench.segmentation import build as building
-from dynslam_bench.segmentation import checkpoints
-from dynslam_bench.segmentation.build import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation import build_segmenter as building
+from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
 from dynslam_bench.segmentation.classes import COCO_IDS, COCO_NAMES, VOC_NAMES, expand_classes
-from dynslam_bench.segmentation.images import as_rgb
-from dynslam_bench.segmentation.instances import Instances
-from dynslam_bench.segmentation.oracle import OracleSegmenter
-from dynslam_bench.segmentation.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.masks.oracle import OracleSegmenter
+from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.networks import checkpoints
+from dynslam_bench.segmentation.networks.images import as_rgb
 from dynslam_bench.segmentation.registry import SEGMENTERS, SegmenterSpec
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.frame import Frame, FrameMasks
 
 
 def frame(index=0, stamp=0.0, shape=(24, 32)):
@@ -46,7 +46,7 @@ class Masks:
 def test_settings_need_neither_torch_nor_opencv():
     code = (
         "import sys; import dynslam_bench.segmentation.settings, dynslam_bench.segmentation.registry, "
-        "dynslam_bench.segmentation.train_settings, dynslam_bench.segmentation.checkpoints; "
+        "dynslam_bench.segmentation.training.settings, dynslam_bench.segmentation.networks.checkpoints; "
         "print([m for m in ('torch', 'cv2') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

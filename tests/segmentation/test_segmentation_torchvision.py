@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dynslam_bench.segmentation.loading import load_network
-from dynslam_bench.segmentation.mask_rcnn import paste
+from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network
+from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import paste
 
 
 @pytest.fixture(scope="module")

@@ -9,17 +9,17 @@ import pytest
 import torch
 
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.evaluate import SegmenterScore, evaluate_segmenter
-from dynslam_bench.segmentation.labelled import LabelledImage, open_labelled
-from dynslam_bench.segmentation.labelled_files import CocoImages, YoloImages, decode_runs
-from dynslam_bench.segmentation.labelled_sequences import RenderedFrames
-from dynslam_bench.segmentation.loading import load_network
-from dynslam_bench.segmentation.matching import IGNORED, NEGATIVE, match, sample
-from dynslam_bench.segmentation.prepared import PreparedImages, prepare, shrink, vary
-from dynslam_bench.segmentation.roi_heads import crop_masks
+from dynslam_bench.segmentation.networks.mask_rcnn.assignment import IGNORED, NEGATIVE, match, sample
+from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network
+from dynslam_bench.segmentation.networks.mask_rcnn.roi_heads import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.train import network_config, train
-from dynslam_bench.segmentation.train_settings import TrainSettings
+from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
+from dynslam_bench.segmentation.training.labelled import LabelledImage, open_labelled
+from dynslam_bench.segmentation.training.labelled_files import CocoImages, YoloImages, decode_runs
+from dynslam_bench.segmentation.training.labelled_sequences import RenderedFrames
+from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
+from dynslam_bench.segmentation.training.settings import TrainSettings
+from dynslam_bench.segmentation.training.train import network_config, train
 
 COCO128 = Path(__file__).resolve().parents[3] / "shared" / "data" / "coco128-seg"
 

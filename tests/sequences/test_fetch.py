@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from sequence_folders import make_folder
 
+from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.sequences import fetch as fetching
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.sequences.archives import extract
-from dynslam_bench.sequences.download import download
 from dynslam_bench.sequences.fetch import Receipt, fetch, status, verify
+from dynslam_bench.sequences.published.archives import extract
 
 NAME, FOLDER = "tum/fr3/sitting_static", "rgbd_dataset_freiburg3_sitting_static"
 

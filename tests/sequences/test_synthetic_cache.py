@@ -14,13 +14,14 @@ import pytest
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.synthetic import compiled, open_synthetic, render_synthetic
-from dynslam_bench.sequences.synthetic.people import draw_person
-from dynslam_bench.sequences.synthetic.plan import plan_room
-from dynslam_bench.sequences.synthetic.scene import Scene
-from dynslam_bench.sequences.synthetic.script import write_script
+from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
+from dynslam_bench.sequences.synthetic.frame_cache import encode_png, is_intact_png
+from dynslam_bench.sequences.synthetic.kernels import compiled
+from dynslam_bench.sequences.synthetic.people.bodies import draw_person
+from dynslam_bench.sequences.synthetic.people.script import write_script
+from dynslam_bench.sequences.synthetic.scenes.plan import plan_room
+from dynslam_bench.sequences.synthetic.scenes.scene import Scene
 from dynslam_bench.sequences.synthetic.settings import RenderSettings, SyntheticId
-from dynslam_bench.sequences.synthetic.store import encode_png, is_intact_png
 
 HASHER = """
 import hashlib, sys

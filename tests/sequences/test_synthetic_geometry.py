@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
-from dynslam_bench.sequences.frame import Sequence
 from dynslam_bench.sequences.synthetic import CAMERA, SYNTHETIC_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
 

@@ -251,7 +251,7 @@ def test_grey_and_alpha_images_become_rgb(tmp_path):
     [("bonn/crowd", 200, "bonn"), ("tum/fr1/xyz", 95, "tum-fr1"), ("tum/fr1/rpy", 40, "tum-fr1")],
 )
 def test_real_excerpts(name, frames, camera):
-    from dynslam_bench.sequences.cameras import CAMERAS
+    from dynslam_bench.sequences.published.cameras import CAMERAS
 
     sequence = open_sequence(name, data_root=SHARED / "data")
     assert len(sequence) == frames == sequence.dropped.pairs

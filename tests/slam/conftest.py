@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.culling.filter import FrameBundle
-from dynslam_bench.features.keypoints import Keypoints
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 

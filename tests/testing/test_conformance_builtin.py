@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import dynslam_bench.culling
+from dynslam_bench.contracts.filter import DynamicFilter
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.culling.filter import DynamicFilter
-from dynslam_bench.segmentation.build import build_segmenter
+from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.testing import (

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.filter import FilterResult
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.culling.filter import FilterResult
 from dynslam_bench.geometry.se3 import inverse
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.segmentation.instances import Instances
 from dynslam_bench.sequences import Frame
-from dynslam_bench.slam.result import TrackResult
 from dynslam_bench.testing import (
     ConformanceError,
     CornerSequence,

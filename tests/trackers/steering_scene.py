@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame, FrameMasks
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.segmentation.instances import Instances
-from dynslam_bench.segmentation.oracle import instances_of
+from dynslam_bench.segmentation.masks.oracle import instances_of
 from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.frame import Frame, FrameMasks
-from dynslam_bench.slam.result import TrackResult
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 

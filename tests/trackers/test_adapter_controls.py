@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import PluginError, SettingsError, TrajectoryError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import write_tum
-from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.testing import CornerSequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.registry import resolve_settings

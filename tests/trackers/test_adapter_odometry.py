@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.adapters import opencv_odometry

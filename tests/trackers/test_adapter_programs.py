@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters.program import files_of_command

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 import dynslam_bench
-from dynslam_bench.flow import aggregation, dense
-from dynslam_bench.flow.dense_points import DensePointFlow
-from dynslam_bench.flow.sparse import SparseDaisyFlow
+from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
+from dynslam_bench.flow.dense import aggregation
+from dynslam_bench.flow.dense import labels as dense
+from dynslam_bench.flow.dense.at_points import DensePointFlow
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Parameter, Settings, parameters, settings_table
-from dynslam_bench.segmentation.instances import Instances
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
-from dynslam_bench.slam.result import TrackResult
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.specs import all_specs
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.culling.filter import FilterState, FrameBundle
-from dynslam_bench.features.keypoints import Keypoints
-from dynslam_bench.flow.estimator import FlowResult
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import FilterState, FrameBundle
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.instances import Instances
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.specs import all_specs

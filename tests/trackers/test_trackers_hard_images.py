@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.sequences.frame import Frame
 from dynslam_bench.sequences.synthetic import open_synthetic
 from dynslam_bench.trackers import TrackerContext, build_tracker
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._jit import inlined, kernel
-from ..matching import label_cost
+from ..daisy.cost import label_cost
+from ..kernels.jit import inlined, kernel
 from .common import advance, insert, scrambled, stream, uniform, widen
 
 CANDIDATES, FOUNDING, OPPOSITES, FLIGHT = 0, 1, 2, 3

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._jit import kernel
-from ..matching import label_cost
+from ..daisy.cost import label_cost
+from ..kernels.jit import kernel
 from .common import advance, insert, scrambled, stream, uniform, widen
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._jit import inlined, kernel
+from ..kernels.jit import inlined, kernel
 from .common import advance, scrambled
 
 VOTERS = 256

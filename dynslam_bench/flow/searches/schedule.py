@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..matching import CostTables, Reference, Side
+from ..daisy.cost import CostTables, Reference, Side
+from ..kernels.workers import run_stripes
 from ..settings import FlowSettings, SearchName
-from ..workers import run_stripes
 from . import rules as rule_book
 from .common import SearchState
 from .moth_flame import moth_flame_phase

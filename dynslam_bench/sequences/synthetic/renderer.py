@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from . import kernels, sensors
-from .parts import QUAD, ROUND_CONE
-from .scene import Scene, Snapshot
+from .kernels import raycast as kernels
+from .kernels import sensors
+from .scenes.parts import QUAD, ROUND_CONE
+from .scenes.scene import Scene, Snapshot
 from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
 
 _BAND = 48

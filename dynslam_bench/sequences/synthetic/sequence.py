@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame, FrameMasks
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.frame import Frame, FrameMasks
 
+from .frame_cache import FrameStore
 from .renderer import Rendered, Renderer, default_threads
-from .scene import CLASS_NAMES, Scene
+from .scenes.scene import CLASS_NAMES, Scene
 from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
-from .store import FrameStore
 
 START_S = 1000.0
 """Stamp of the first frame in seconds."""

@@ -11,9 +11,9 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.frame import Frame
 
 SHARED_MEMORY = Path("/dev/shm")
 

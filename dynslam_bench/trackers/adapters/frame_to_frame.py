@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.slam.result import TrackResult
 
 LEAST_DEPTH_PIXELS = 1000
 PATIENCE = 5

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.slam.result import TrackResult
 
 
 class NeverMove:

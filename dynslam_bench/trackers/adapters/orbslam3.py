@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import dynslam_bench
+from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.trackers.protocol import TrackerContext
 
 from .settings import OrbSlam3Settings
 from .subprocess_tracker import FinalizingProgramTracker

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.tum_file import read_tum
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.slam.result import TrackResult
 
 from .settings import ReplaySettings
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dynslam_bench.trackers.protocol import TrackerSpec
+from dynslam_bench.contracts.tracker import TrackerSpec
 
 from .settings import (
     ConstantVelocitySettings,

@@ -9,14 +9,14 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
+from dynslam_bench.contracts.result import TrackingState, TrackResult
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import DynslamError, TrackerError
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.frame import Frame
-from dynslam_bench.slam.result import TrackingState, TrackResult
-from dynslam_bench.trackers.protocol import TrackerContext
 
 from .exchange import ImageExchange
 from .program import Program, files_of_command

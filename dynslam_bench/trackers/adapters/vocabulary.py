@@ -10,8 +10,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.folders import user_cache
 from dynslam_bench.core.records import write_atomic
-from dynslam_bench.sequences.roots import user_cache
 
 from .settings import OrbSlam3Settings
 

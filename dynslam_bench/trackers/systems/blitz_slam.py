@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, DepthBlockSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
@@ -26,8 +26,8 @@ class BlitzSlamSettings(SemanticSystemSettings):
 
 def build(settings: BlitzSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B9 and B1, then B3 inside the boxes with F from outside them."""
-    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.depth_blocks import DepthBlockFilter
+    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter
 
     filters = [
         DepthBlockFilter(settings.depth_blocks, settings.segmentation),

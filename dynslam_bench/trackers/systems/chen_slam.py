@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
@@ -23,8 +23,8 @@ class ChenSlamSettings(SemanticSystemSettings):
 
 def build(settings: ChenSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B1, then B3 on the rest."""
-    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.semantic import SemanticFilter
+    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.blocks.semantic import SemanticFilter
 
     filters = [
         SemanticFilter(settings.segmentation),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.settings import GuardSettings
@@ -18,7 +19,6 @@ from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings
 
-from ..protocol import TrackerContext
 from .published import masks_in_words
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
@@ -29,7 +29,7 @@ CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convo
 """The paper's improved mask branch, as far as it is there."""
 
 if TYPE_CHECKING:
-    from dynslam_bench.culling.filter import DynamicFilter
+    from dynslam_bench.contracts.filter import DynamicFilter
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
@@ -88,11 +88,11 @@ def compose(
         SegmentationError: The semantic source is not available.
         SettingsError: The settings hold an online setting that has an effect and that no part takes.
     """
-    from dynslam_bench.core.cache import StageCache
-    from dynslam_bench.features.build import build_extractor
+    from dynslam_bench.core.stage_cache import StageCache
+    from dynslam_bench.features.build_extractor import build_extractor
     from dynslam_bench.features.cached import CachedExtractor
     from dynslam_bench.segmentation.cached import cache_segmenter
-    from dynslam_bench.segmentation.schedule import build_mask_stage
+    from dynslam_bench.segmentation.masks.schedule import build_mask_stage
     from dynslam_bench.slam.backend import RgbdBackend
     from dynslam_bench.slam.pipeline import CachedStage, SlamPipeline
 
@@ -120,7 +120,7 @@ def compose(
             cached["segmentation"] = segmenter
     estimator = None
     if flow is not None:
-        from dynslam_bench.flow.build import build_flow
+        from dynslam_bench.flow.build_flow import build_flow
 
         estimator = build_flow(flow, device=context.device, threads=context.threads)
     return SlamPipeline(

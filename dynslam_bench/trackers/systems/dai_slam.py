@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import CorrelationSettings
 from dynslam_bench.flow.settings import FlowSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SystemSettings, compose
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class DaiSlamSettings(SystemSettings):
 
 def build(settings: DaiSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B7 in the front end."""
-    from dynslam_bench.culling.correlation_graph import CorrelationFilter
+    from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
 
     return compose(settings, context, [CorrelationFilter(settings.correlation)], settings.flow)
 

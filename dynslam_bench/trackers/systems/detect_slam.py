@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import ProbabilitySettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, links_in_words, masks_in_words
 
@@ -25,7 +25,7 @@ class DetectSlamSettings(SemanticSystemSettings):
 
 def build(settings: DetectSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 on keyframes feeds B8."""
-    from dynslam_bench.culling.moving_probability import ProbabilityFilter
+    from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
 
     block = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")
     return compose(settings, context, [block], settings.flow)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import ResidualSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import masks_in_words
 
@@ -23,7 +23,7 @@ class DgsSlamSettings(SemanticSystemSettings):
 
 def build(settings: DgsSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B14."""
-    from dynslam_bench.culling.residual_clusters import ResidualFilter
+    from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
 
     return compose(settings, context, [ResidualFilter(settings.residual, settings.segmentation)])
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, MultiViewSettings
 from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
@@ -28,8 +28,8 @@ class DiSlamSettings(SemanticSystemSettings):
 
 def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 stricter inside boxes, then B4."""
-    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.multiview_depth import MultiViewFilter
+    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
 
     filters = [
         BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import MovingVoteSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import masks_in_words
 
@@ -24,7 +24,7 @@ class DsSlamSettings(SemanticSystemSettings):
 
 def build(settings: DsSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 on corners of its own, B11 as one global vote, B1 on people."""
-    from dynslam_bench.culling.moving_vote import MovingVoteFilter
+    from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
 
     return compose(settings, context, [MovingVoteFilter(settings.moving_vote, settings.segmentation)])
 

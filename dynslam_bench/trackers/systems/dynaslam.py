@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import MultiViewSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SHARED_MASKS, SemanticSystemSettings, SystemSettings, compose
 
 if TYPE_CHECKING:
-    from dynslam_bench.culling.filter import DynamicFilter
+    from dynslam_bench.contracts.filter import DynamicFilter
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
@@ -45,8 +45,8 @@ def build(settings: DynaSlamSettings | DynaSlamGeometrySettings, context: Tracke
     The code takes the union of both masks. The paper keeps the geometric mask where both find an object; the union
     stands for both here.
     """
-    from dynslam_bench.culling.multiview_depth import MultiViewFilter
-    from dynslam_bench.culling.semantic import SemanticFilter
+    from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
+    from dynslam_bench.culling.blocks.semantic import SemanticFilter
 
     filters: list[DynamicFilter] = [MultiViewFilter(settings.multiview)]
     if isinstance(settings, SemanticSystemSettings):
@@ -56,7 +56,7 @@ def build(settings: DynaSlamSettings | DynaSlamGeometrySettings, context: Tracke
 
 def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -> SlamPipeline:
     """N: B1 alone."""
-    from dynslam_bench.culling.semantic import SemanticFilter
+    from dynslam_bench.culling.blocks.semantic import SemanticFilter
 
     return compose(settings, context, [SemanticFilter(settings.segmentation)])
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import TemplateSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import masks_in_words
 
@@ -22,7 +22,7 @@ class DynaTmSlamSettings(SemanticSystemSettings):
 
 def build(settings: DynaTmSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 with B13."""
-    from dynslam_bench.culling.template_matching import TemplateFilter
+    from dynslam_bench.culling.blocks.template_matching import TemplateFilter
 
     return compose(settings, context, [TemplateFilter(settings.template, settings.segmentation)])
 

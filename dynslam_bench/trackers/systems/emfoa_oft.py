@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, MotionSettings
 from dynslam_bench.flow.settings import FlowSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import CFPN, SHARED_MASKS, ObjectSettings, SemanticSystemSettings, SystemSettings, compose
 
 if TYPE_CHECKING:
-    from dynslam_bench.culling.filter import DynamicFilter
+    from dynslam_bench.contracts.filter import DynamicFilter
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
@@ -95,7 +95,7 @@ class PaperSparseSettings(PaperSettings):
 
 def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
     """Mask culling, flow and epipolar culling, depth consistency: those of them that the settings have a group for."""
-    from dynslam_bench.culling.semantic import SemanticFilter
+    from dynslam_bench.culling.blocks.semantic import SemanticFilter
 
     filters: list[DynamicFilter] = []
     if isinstance(settings, SemanticSystemSettings):
@@ -109,9 +109,9 @@ def build_object_mode(settings: MaskedEpipolarTestSettings, context: TrackerCont
 
 
 def _with_geometry(settings: SystemSettings, context: TrackerContext, filters: list[DynamicFilter]) -> SlamPipeline:
-    from dynslam_bench.culling.epipolar import EpipolarFilter
-    from dynslam_bench.culling.free_space import FreeSpaceFilter
-    from dynslam_bench.culling.motion import MotionFilter
+    from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
+    from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
+    from dynslam_bench.culling.blocks.rigid_motion import MotionFilter
 
     if not isinstance(settings, EpipolarTestSettings):
         return compose(settings, context, filters)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..protocol import TrackerContext, TrackerSpec
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
+
 from .composition import CFPN, SHARED_MASKS, SemanticSystemSettings, compose
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 def build(settings: SemanticSystemSettings, context: TrackerContext) -> SlamPipeline:
     """Semantic culling, then the shared back end."""
-    from dynslam_bench.culling.semantic import SemanticFilter
+    from dynslam_bench.culling.blocks.semantic import SemanticFilter
 
     return compose(settings, context, [SemanticFilter(settings.segmentation)])
 

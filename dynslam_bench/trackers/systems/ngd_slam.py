@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import BoxDepthSettings, ReseedingSettings
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import masks_in_words
 
@@ -27,8 +27,8 @@ class NgdSlamSettings(SemanticSystemSettings):
 
 def build(settings: NgdSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 cut out by depth; B10 between detections; B12 fills up what is left."""
-    from dynslam_bench.culling.box_depth import BoxDepthFilter
-    from dynslam_bench.culling.reseeding import ReseedingFilter
+    from dynslam_bench.culling.blocks.box_depth import BoxDepthFilter
+    from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
 
     filters = [
         BoxDepthFilter(settings.box_depth, settings.segmentation),

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..protocol import TrackerContext, TrackerSpec
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
+
 from .composition import SystemSettings, compose
 
 if TYPE_CHECKING:

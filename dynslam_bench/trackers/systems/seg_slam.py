@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import ClassRuleSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
@@ -23,7 +23,7 @@ class SegSlamSettings(SemanticSystemSettings):
 
 def build(settings: SegSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B1 and B15."""
-    from dynslam_bench.culling.class_rule import ClassRuleFilter
+    from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
 
     return compose(settings, context, [ClassRuleFilter(settings.class_rule, settings.segmentation)], settings.flow)
 

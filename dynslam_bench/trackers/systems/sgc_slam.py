@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
@@ -23,7 +23,7 @@ class SgcSlamSettings(SemanticSystemSettings):
 
 def build(settings: SgcSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 with F from outside the boxes."""
-    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
 
     return compose(settings, context, [BoxEpipolarFilter(settings.box_epipolar, settings.segmentation)], settings.flow)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.baseline_settings import DepthRansacSettings
 
-from ..protocol import TrackerContext, TrackerSpec
 from .composition import SemanticSystemSettings, compose
 from .published import masks_in_words
 
@@ -22,7 +22,7 @@ class YoloSlamSettings(SemanticSystemSettings):
 
 def build(settings: YoloSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 with B6: the largest set of like depth in a box is the person."""
-    from dynslam_bench.culling.depth_ransac import DepthRansacFilter
+    from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
 
     return compose(settings, context, [DepthRansacFilter(settings.depth_ransac, settings.segmentation)])
 

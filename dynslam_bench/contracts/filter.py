@@ -1,0 +1,169 @@
+"""The contract of all dynamic feature filters, and the guard that they share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from .features import Keypoints
+from .flow import FlowResult
+from .segmenter import Instances
+
+Provenance = Literal["faithful-code", "faithful-paper", "inspired", "assumed"]
+Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
+
+
+@dataclass(eq=False)
+class FrameBundle:
+    """Everything known about one frame before it is tracked.
+
+    Attributes:
+        index: Index in the sequence.
+        timestamp: Seconds.
+        rgb: uint8 ``[H, W, 3]``.
+        gray: uint8 ``[H, W]``.
+        depth: float32 ``[H, W]`` metres, 0 missing.
+        keypoints: The frame's features, raw (distorted) pixels.
+        xy: float64 ``[N, 2]``, undistorted pixels of the keypoints.
+        z: float32 ``[N]``, depth at the keypoints, metres, 0 missing.
+        instances: What the segmenter found; None if no segmenter ran.
+    """
+
+    index: int
+    timestamp: float
+    rgb: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    keypoints: Keypoints
+    xy: NDArray[np.float64]
+    z: NDArray[np.float32]
+    instances: Instances | None = None
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeView:
+    """What a filter may see of a keyframe.
+
+    Attributes:
+        T_world_cam: Camera-to-world pose ``[4, 4]``.
+        keypoints: Its features (raw pixels).
+        xy: float64 ``[N, 2]`` undistorted pixels.
+        z: float32 ``[N]`` depth at the keypoints in metres, 0 missing.
+        depth: float32 ``[H, W]`` metres, or None where the keyframe no longer keeps its image.
+        timestamp: Seconds.
+    """
+
+    T_world_cam: NDArray[np.float64]
+    keypoints: Keypoints
+    xy: NDArray[np.float64]
+    z: NDArray[np.float32]
+    depth: NDArray[np.float32] | None
+    timestamp: float = 0.0
+
+
+@dataclass(eq=False)
+class FilterState:
+    """What is known beside the frame itself, shared by all filters of a pipeline.
+
+    Attributes:
+        camera: Intrinsics (with the raw images' distortion).
+        keep: bool ``[N]``, keypoints that earlier filters kept.
+        previous: The previous frame, None on the first.
+        previous_keep: bool, which keypoints of the previous frame were kept.
+        T_world_prev: Pose of the previous frame, None if it was not tracked.
+        T_world_pred: Pose predicted for this frame by the motion model, None without one.
+        motion_covariance: Covariance ``[6, 6]`` of the predicted motion since the previous frame: position in the world
+            (m), rotation in the camera's frame (rad); None where the motion model knows nothing.
+        flow: Flow of this frame's keypoints *to the previous image* (raw pixels); None until the flow stage ran.
+        keyframes: The latest keyframes, newest first.
+        map_point: int64 ``[M]`` ids and float64 ``[M, 3]`` positions of local map points, or None.
+        seed: Seed of everything random a filter does on this frame.
+    """
+
+    camera: Camera
+    keep: NDArray[np.bool_]
+    previous: FrameBundle | None = None
+    previous_keep: NDArray[np.bool_] | None = None
+    T_world_prev: NDArray[np.float64] | None = None
+    T_world_pred: NDArray[np.float64] | None = None
+    motion_covariance: NDArray[np.float64] | None = None
+    flow: FlowResult | None = None
+    keyframes: tuple[KeyframeView, ...] = ()
+    map_points: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FilterResult:
+    """A filter's verdict.
+
+    Attributes:
+        keep: bool ``[N]``; False = dynamic. A filter only judges; what earlier filters dropped stays dropped.
+        weight: float32 ``[N]`` in [0, 1], confidence that the point is static, used by the pose optimiser.
+        stats: Counts and reasons, e.g. ``{"dropped": 41.0, "degenerate": 0.0}``; the same keys on every frame. A filter
+            that tests against a fundamental matrix says with ``f_asked`` (1 where there was something to test) and
+            ``f_judged`` (1 where the matrix was used) on how many frames it did.
+        mask: bool ``[H, W]`` of pixels that the filter holds for dynamic, where it has an opinion on pixels.
+    """
+
+    keep: NDArray[np.bool_]
+    weight: NDArray[np.float32]
+    stats: Mapping[str, float] = field(default_factory=dict)
+    mask: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        keep: NDArray[np.bool_] | np.bool_,
+        stats: Mapping[str, float] | None = None,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> FilterResult:
+        """A verdict with weights 1 (kept) and 0 (dropped); `stats` gains ``dropped``."""
+        verdict = np.asarray(keep, dtype=bool)
+        counts = {"dropped": float(np.count_nonzero(~verdict)), **(stats or {})}
+        return cls(verdict, verdict.astype(np.float32), counts, mask)
+
+
+@runtime_checkable
+class DynamicFilter(Protocol):
+    """Judges which keypoints lie on moving things.
+
+    Attributes:
+        name: Short name, the prefix of its stats.
+        needs: What must be there for it to work; `FilterState` fields that are None make it keep all.
+        provenance: How closely it follows its source.
+    """
+
+    name: str
+    needs: frozenset[Need]
+    provenance: Provenance
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Groups of a system's settings that it takes: its own, and ``segmentation`` where it looks at objects."""
+        own = getattr(self, "group", self.name)
+        return (own, "segmentation") if hasattr(self, "segmentation") else (own,)
+
+    def configure(self, settings: Settings) -> None:
+        """Put settings of one of its groups into force from the next frame on."""
+        objects = isinstance(settings, SegmentationSettings) and hasattr(self, "segmentation")
+        setattr(self, "segmentation" if objects else "settings", settings)
+
+    def reset(self, camera: Camera) -> None:
+        """Forget everything: a new sequence begins."""
+        ...
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Judge the frame's keypoints; never raises on degenerate input, says so in `stats` instead."""
+        ...

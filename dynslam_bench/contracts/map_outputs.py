@@ -1,0 +1,48 @@
+"""What a tracker's map looks like from outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeRecord:
+    """One keyframe.
+
+    Attributes:
+        id: Number in order of creation.
+        frame: Index of its frame.
+        timestamp: Seconds.
+        T_world_cam: Camera-to-world pose ``[4, 4]``.
+        features: Features it holds.
+        observations: Map points it observes.
+    """
+
+    id: int
+    frame: int
+    timestamp: float
+    T_world_cam: NDArray[np.float64]
+    features: int
+    observations: int
+
+
+@dataclass(frozen=True, eq=False)
+class MapOutputs:
+    """Keyframes, oldest first, and map points.
+
+    Attributes:
+        keyframes: All keyframes.
+        ids: int64 ``[M]`` ids of the points.
+        positions: float64 ``[M, 3]`` world coordinates, metres.
+        colours: uint8 ``[M, 3]`` red, green, blue.
+        observations: int64 ``[M]``, keyframes that observe each point.
+    """
+
+    keyframes: tuple[KeyframeRecord, ...]
+    ids: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    observations: NDArray[np.int64]

@@ -1,0 +1,104 @@
+"""What a sequence hands out: frames, ground truth, and masks where there are any."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One synchronised colour and depth image.
+
+    Attributes:
+        index: Position in the sequence (after association), from 0.
+        timestamp: Seconds, the colour image's stamp.
+        rgb: uint8 ``[H, W, 3]``, red first.
+        depth: float32 ``[H, W]``, z-depth in metres, 0 where it is missing.
+    """
+
+    index: int
+    timestamp: float
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMasks:
+    """Exact (or recorded) object masks of one frame.
+
+    Attributes:
+        instances: uint8 or int32 ``[H, W]``: 0 is background, k > 0 is instance k.
+        class_names: Class name of each instance id that can occur, e.g. ``{1: "person", 3: "chair"}`` (COCO names).
+        moving: Ids of the instances that move in this frame (relative to the previous one).
+    """
+
+    instances: NDArray[np.integer]
+    class_names: dict[int, str]
+    moving: frozenset[int]
+
+
+@runtime_checkable
+class MaskSource(Protocol):
+    """Gives the masks of a frame by its index."""
+
+    def __getitem__(self, index: int) -> FrameMasks: ...
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """A recorded or rendered RGB-D sequence; frames are decoded (or rendered) when they are asked for."""
+
+    @property
+    def id(self) -> str:
+        """For example ``tum/fr3/walking_xyz`` or ``synthetic/walking_xyz@0?frames=600``."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the images that `__getitem__` returns."""
+        ...
+
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        """Stamps of all frames in seconds, strictly increasing."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Camera-to-world poses at their own stamps, possibly with holes; None if there are none."""
+        ...
+
+    @property
+    def masks(self) -> MaskSource | None:
+        """Exact masks, where the sequence has them."""
+        ...
+
+    @property
+    def fps(self) -> float:
+        """Nominal frame rate in Hz."""
+        ...
+
+    @property
+    def license(self) -> str:
+        """Licence of the data."""
+        ...
+
+    @property
+    def citation(self) -> str:
+        """What to cite."""
+        ...
+
+    def digest(self) -> str:
+        """Short digest of the content (files' names and sizes, or the renderer's version and parameters)."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Frame: ...

@@ -1,0 +1,50 @@
+"""Documented modules that have moved: their old import paths work for one version, with a deprecation."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.abc
+import importlib.machinery
+import sys
+import types
+import warnings
+from collections.abc import Sequence
+
+MOVED: dict[str, tuple[str, ...]] = {
+    "dynslam_bench.culling.filter": ("dynslam_bench.contracts.filter",),
+    "dynslam_bench.features.keypoints": ("dynslam_bench.contracts.features",),
+    "dynslam_bench.flow.estimator": ("dynslam_bench.contracts.flow",),
+    "dynslam_bench.flow.spec": ("dynslam_bench.flow.registry",),
+    "dynslam_bench.segmentation.instances": ("dynslam_bench.contracts.segmenter",),
+    "dynslam_bench.sequences.datasets": ("dynslam_bench.sequences.published.datasets",),
+    "dynslam_bench.sequences.frame": ("dynslam_bench.contracts.sequence", "dynslam_bench.sequences.view"),
+    "dynslam_bench.slam.result": ("dynslam_bench.contracts.result",),
+    "dynslam_bench.trackers.protocol": ("dynslam_bench.contracts.tracker",),
+}
+"""Old module: the modules in which its names are now, looked up in this order."""
+
+
+class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Makes an old module of the new ones' names, when somebody still imports it."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: types.ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Answers for the moved modules only; asked after the real modules were looked for."""
+        return importlib.machinery.ModuleSpec(fullname, self) if fullname in MOVED else None
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        """Fill the old module."""
+        homes = MOVED[module.__name__]
+        warnings.warn(
+            f"'{module.__name__}' has moved to '{homes[0]}' and will be gone in 0.3", DeprecationWarning, stacklevel=2
+        )
+        for home in reversed(homes):
+            found = importlib.import_module(home)
+            module.__dict__.update({name: value for name, value in vars(found).items() if not name.startswith("__")})
+
+
+def install() -> None:
+    """Let the old paths be imported; the second call changes nothing."""
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.append(_Finder())

@@ -1,0 +1,1 @@
+"""The rejection rules of the published systems, one file a rule."""

@@ -1,0 +1,81 @@
+"""B3 with boxes: F from the points outside all boxes, different limits inside and outside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from ..baseline_settings import BoxEpipolarSettings
+from ..settings import EpipolarSettings
+from ..tools.links import judged_by_flow
+from .boxes import dynamic_boxes, in_boxes
+from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
+
+MIN_OUTSIDE = 20
+"""SG-SLAM takes all matches where fewer than this lie outside the boxes."""
+
+
+class BoxEpipolarFilter(DynamicFilter):
+    """Drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
+
+    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is
+    meaningless. Features whose flow failed go by the setting ``unmatched``. Stats: ``dropped``, ``matches``, ``boxes``,
+    ``lost`` (features whose flow failed), ``failed`` (1 where F could not be estimated).
+    """
+
+    name = "box_epipolar"
+    needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
+    provenance: Provenance = "faithful-paper"
+
+    def __init__(self, settings: BoxEpipolarSettings, segmentation: SegmentationSettings) -> None:
+        self.settings = settings
+        self.segmentation = segmentation
+
+    def reset(self, camera: Camera) -> None:
+        """Nothing to forget."""
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Test the flow of this frame's keypoints to the previous image."""
+        keep = np.ones(len(frame), dtype=bool)
+        flow = state.flow
+        boxes = dynamic_boxes(frame, self.segmentation)
+        stats = dict.fromkeys(("matches", "lost", "failed", "f_asked", "f_judged"), 0.0) | {"boxes": float(len(boxes))}
+        if flow is None or state.previous is None:
+            return FilterResult.of(keep, stats)
+        stats["f_asked"] = 1.0
+        lost = state.keep & ~flow.valid
+        stats["lost"] = float(np.count_nonzero(lost))
+        if self.settings.unmatched == "drop":
+            keep &= ~lost
+        judged = judged_by_flow(flow, state.keep, self.settings.unmatched)
+        inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
+        before = state.camera.undistort_points(flow.xy)
+        fit = judged & ~self._left_out(inside, state)
+        if np.count_nonzero(fit) < MIN_OUTSIDE:
+            fit = judged
+        stats["matches"] = float(np.count_nonzero(fit))
+        options = EpipolarSettings(inlier_px=self.settings.inlier_px, confidence=self.settings.confidence)
+        matrix = None
+        if stats["matches"] >= MIN_MATCHES:
+            matrix = fundamental_matrix(before[fit], frame.xy[fit], options)
+        if matrix is None:
+            return FilterResult.of(keep, {**stats, "failed": 1.0})
+        stats["f_judged"] = 1.0
+        distance = epipolar_distance(matrix, before[judged], frame.xy[judged])
+        outside_px = self.settings.outside_px if self.settings.test_outside else np.inf
+        limit = np.where(inside[judged], self.settings.inside_px, outside_px)
+        keep[judged] = distance <= limit
+        return FilterResult.of(keep, stats)
+
+    def _left_out(self, inside: NDArray[np.bool_], state: FilterState) -> NDArray[np.bool_]:
+        """Matches that F is not fitted to, bool ``[N]``."""
+        if self.settings.fit == "kept":
+            return np.zeros(len(inside), dtype=bool)
+        if self.settings.fit == "outside" or state.previous is None or state.flow is None:
+            return inside
+        boxes = dynamic_boxes(state.previous, self.segmentation)
+        return np.asarray(in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), boxes).any(axis=0))

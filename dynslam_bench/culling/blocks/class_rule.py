@@ -1,0 +1,83 @@
+"""B15: three rules in one: class, depth, epipolar line (SEG-SLAM)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.masks.postprocess import dynamic_mask, select
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+from ..baseline_settings import ClassRuleSettings
+from ..settings import EpipolarSettings
+from ..tools.links import judged_by_flow
+from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
+from .semantic import inside
+
+
+class ClassRuleFilter(DynamicFilter):
+    """Drops all points on people; on movable things those off their line, or at the depth of a thing that moves.
+
+    A feature on a movable thing whose flow failed goes by the setting ``unmatched``.
+    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``, ``lost`` (features whose flow failed).
+    """
+
+    name = "class_rule"
+    needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
+    provenance: Provenance = "inspired"
+
+    def __init__(self, settings: ClassRuleSettings, segmentation: SegmentationSettings) -> None:
+        self.settings = settings
+        self.segmentation = segmentation
+
+    def reset(self, camera: Camera) -> None:
+        """Nothing to forget."""
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Judge by class first, then movable things by geometry."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = dict.fromkeys(("on_people", "on_movable", "moving_objects", "lost"), 0.0)
+        stats |= {"f_asked": float(state.flow is not None and state.previous is not None), "f_judged": 0.0}
+        if frame.instances is None or not len(frame.instances):
+            return FilterResult.of(keep, stats)
+        people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
+        keep &= ~inside(people, frame.keypoints.xy)
+        stats["on_people"] = float(np.count_nonzero(~keep))
+        movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
+        lost = np.zeros(len(frame), dtype=bool)
+        if state.flow is not None and state.previous is not None:
+            lost = state.keep & ~state.flow.valid
+        stats["lost"] = float(np.count_nonzero(lost))
+        off_line, tested = self._off_line(frame, state, keep & ~inside(movable.union(), frame.keypoints.xy))
+        stats["f_judged"] = float(tested.any())
+        for mask in movable.masks:
+            on = inside(mask, frame.keypoints.xy) & keep
+            stats["on_movable"] += float(np.count_nonzero(on))
+            voters = on & tested
+            drop = on & (off_line | lost) if self.settings.unmatched == "drop" else on & off_line
+            if voters.any() and off_line[voters].mean() >= self.settings.vote_share:
+                stats["moving_objects"] += 1.0
+                depth = frame.depth[mask]
+                depth = depth[np.isfinite(depth) & (depth > 0)]
+                if len(depth):
+                    drop |= on & (np.abs(frame.z - np.median(depth)) < self.settings.depth_m)
+            keep &= ~drop
+        return FilterResult.of(keep, stats, people)
+
+    def _off_line(self, frame: FrameBundle, state: FilterState, static: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which points fail the epipolar test with F of the static-labelled ones, and which were tested at all."""
+        none = np.zeros(len(frame), dtype=bool)
+        if state.flow is None or state.previous is None:
+            return none, none
+        judged = judged_by_flow(state.flow, state.keep, self.settings.unmatched)
+        fit = judged & static
+        before = state.camera.undistort_points(state.flow.xy)
+        matrix = (
+            fundamental_matrix(before[fit], frame.xy[fit], EpipolarSettings()) if fit.sum() >= MIN_MATCHES else None
+        )
+        if matrix is None:
+            return none, none
+        failing = none.copy()
+        failing[judged] = epipolar_distance(matrix, before[judged], frame.xy[judged]) > self.settings.threshold_px
+        return failing, judged

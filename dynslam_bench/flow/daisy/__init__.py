@@ -1,0 +1,1 @@
+"""DAISY Filter Flow at sparse points: maps, descriptor, matching cost, refinement."""

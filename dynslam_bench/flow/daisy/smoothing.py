@@ -1,0 +1,208 @@
+"""The orientation maps' kernels: derivatives, the cascade of blurs, and normalised bytes, row by row.
+
+A Gaussian is replaced by the binomial of equal variance, made of rounded means: ``[1 4 6 4 1] / 16`` has variance 1 and
+``[1 2 1] / 4`` one half, times the square of the taps' distance (which may exceed one where the rows are smooth enough
+already). Rows move through short rings of lines that stay in the cache; neighbouring stripes compute the few lines that
+they share twice.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..kernels.jit import inlined, kernel
+from ..kernels.words import average, average_of_pairs, derivatives, load_words, store_normalised, store_words
+
+RING = 16
+"""Lines kept of each level; a power of two above twice the farthest tap."""
+SPILL = 64
+"""Numbers that vector code may touch beyond a line's end."""
+
+
+@inlined
+def smooth_line(ring, pitch, row, rows, columns, taps, distance, line, out, out_at):  # type: ignore[no-untyped-def]
+    """One row of a separable binomial blur, edges repeated.
+
+    Args:
+        ring: uint16, flat ``[RING, pitch]``, source rows; row y lies at ``y % RING``.
+        pitch: Numbers a line.
+        row: Row wanted.
+        rows: Rows of the source image.
+        columns: Its columns.
+        taps: 3 or 5.
+        distance: Between taps, pixels.
+        line: uint16, scratch.
+        out: uint16, flat, receives the row ...
+        out_at: ... from here on.
+    """
+    length, pad = 8 * columns, 16 * distance
+    last = rows - 1
+    here = (row & (RING - 1)) * pitch
+    a, b = (max(row - distance, 0) & (RING - 1)) * pitch, (min(row + distance, last) & (RING - 1)) * pitch
+    if taps == 3:
+        for i in range(0, length, 32):
+            middle = load_words(ring, here + i)
+            store_words(line, pad + i, average(middle, average(load_words(ring, a + i), load_words(ring, b + i))))
+    else:
+        c = (max(row - 2 * distance, 0) & (RING - 1)) * pitch
+        d = (min(row + 2 * distance, last) & (RING - 1)) * pitch
+        for i in range(0, length, 32):
+            middle, near = load_words(ring, here + i), average(load_words(ring, a + i), load_words(ring, b + i))
+            far = average(load_words(ring, c + i), load_words(ring, d + i))
+            store_words(line, pad + i, average(near, average(middle, average(middle, far))))
+    for t in range(0, pad, 8):
+        for k in range(8):
+            line[t + k] = line[pad + k]
+            line[pad + length + t + k] = line[pad + length - 8 + k]
+    near, far = 8 * distance, 16 * distance
+    if taps == 3:
+        for i in range(pad, pad + length, 32):
+            middle = load_words(line, i)
+            beside = average(load_words(line, i - near), load_words(line, i + near))
+            store_words(out, out_at + i - pad, average(middle, beside))
+    else:
+        for i in range(pad, pad + length, 32):
+            middle = load_words(line, i)
+            beside = average(load_words(line, i - near), load_words(line, i + near))
+            beyond = average(load_words(line, i - far), load_words(line, i + far))
+            store_words(out, out_at + i - pad, average(beside, average(middle, average(middle, beyond))))
+
+
+@inlined
+def normalise_line(line, at, columns, floor, cells, first):  # type: ignore[no-untyped-def]
+    """Partially normalised bytes of one row; what the last four histograms spill into the margin is cleared."""
+    length = 8 * columns
+    for i in range(0, length, 32):
+        store_normalised(cells, first + i, load_words(line, at + i), floor)
+    for i in range(length, 32 * ((length + 31) // 32)):
+        cells[first + i] = 0
+
+
+@inlined
+def sum_line(gray, row, sums, at, columns):  # type: ignore[no-untyped-def]
+    """Sums over 2 x 2 pixels of one half-resolution row, with one repeated number on either side."""
+    height, width = gray.shape
+    upper, lower = gray[min(2 * row, height - 1)], gray[min(2 * row + 1, height - 1)]
+    for x in range(min(columns, width // 2)):
+        sums[at + x] = np.uint16(
+            (np.uint16(upper[2 * x]) + np.uint16(upper[2 * x + 1]))
+            + (np.uint16(lower[2 * x]) + np.uint16(lower[2 * x + 1]))
+        )
+    if width == 1:
+        sums[at] = np.uint16(2 * (np.uint16(upper[0]) + np.uint16(lower[0])))
+    sums[at - 1], sums[at + columns] = sums[at], sums[at + columns - 1]
+
+
+@kernel
+def fine_levels(start, stop, gray, half, border, blurs, geometry, margin, floor, cells, coarse):  # type: ignore[no-untyped-def]
+    """The half-resolution levels, and their last one once more at quarter resolution.
+
+    Args:
+        start: First pair of half-resolution rows.
+        stop: One past the last pair.
+        gray: uint8 ``[H, W]``.
+        half: uint8 ``[h + 2 border, w + 2 border]``, receives the rounded mean over 2 x 2 pixels.
+        border: Pixels around `half`'s image; left as they are.
+        blurs: int64 ``[L, 2]``, taps and distance of each level.
+        geometry: `maps.MapGeometry`.
+        margin: Empty histograms around the maps.
+        floor: Added to norms.
+        cells: uint8, flat, all levels' histograms.
+        coarse: uint16 ``[quarter rows, >= 8 quarter columns]``, receives the means of 2 x 2 histograms.
+    """
+    rows, columns = half.shape[0] - 2 * border, half.shape[1] - 2 * border
+    levels = len(blurs)
+    length = 32 * ((8 * columns + 31) // 32)
+    pitch = length + SPILL
+    rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
+    line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
+    sum_pitch = columns + 2 + SPILL
+    sums = np.zeros(4 * sum_pitch, dtype=np.uint16)
+    top, bottom = 2 * start, min(2 * stop, rows)
+    reach = np.zeros(levels + 1, dtype=np.int64)  # rows that later levels need beyond the stripe
+    for level in range(levels - 1, -1, -1):
+        reach[level] = reach[level + 1] + (blurs[level, 0] // 2) * blurs[level, 1]
+    first = max(top - reach[0], 0)
+    summed = max(first - 1, 0)
+    for row in range(first, bottom + reach[0]):
+        if row < min(bottom + reach[0], rows):
+            while summed <= min(row + 1, rows - 1):
+                at = (summed & 3) * sum_pitch + 1
+                sum_line(gray, summed, sums, at, columns)
+                if top <= summed < bottom:
+                    target = half[border + summed]
+                    for x in range(columns):
+                        target[border + x] = np.uint8((sums[at + x] + np.uint16(2)) >> np.uint16(2))
+                summed += 1
+            here = (row & 3) * sum_pitch + 1
+            above, below = (max(row - 1, 0) & 3) * sum_pitch + 1, (min(row + 1, rows - 1) & 3) * sum_pitch + 1
+            at = (row & (RING - 1)) * pitch
+            for x in range(0, columns, 4):
+                store_words(rings[0], at + 8 * x, derivatives(sums, here + x, above + x, below + x))
+        delay = 0
+        for level in range(levels):
+            taps, distance = blurs[level, 0], blurs[level, 1]
+            delay += (taps // 2) * distance
+            y = row - delay
+            if not (max(top - reach[level + 1], 0) <= y < min(bottom + reach[level + 1], rows)):
+                continue
+            at = (y & (RING - 1)) * pitch
+            smooth_line(rings[level], pitch, y, rows, columns, taps, distance, line, rings[level + 1], at)
+            if top <= y < bottom:
+                cell = geometry.base[level] + (margin + y) * geometry.stride[level] + margin
+                normalise_line(rings[level + 1], at, columns, floor, cells, 8 * cell)
+            if level == levels - 1 and (y & 1 or rows == 1) and y // 2 < len(coarse):
+                upper, lower = rings[levels], at
+                before = ((y & ~1) & (RING - 1)) * pitch
+                for k in range(8):  # a single column is its own neighbour
+                    for each in (at, before):
+                        upper[each + 8 * columns + k] = upper[each + 8 * columns - 8 + k]
+                target = coarse[y // 2]
+                for i in range(0, len(target) - 31, 32):
+                    left = average(load_words(upper, before + 2 * i), load_words(upper, lower + 2 * i))
+                    right = average(load_words(upper, before + 2 * i + 32), load_words(upper, lower + 2 * i + 32))
+                    store_words(target, i, average_of_pairs(left, right))
+
+
+@kernel
+def coarse_levels(start, stop, coarse, columns, blurs, first_level, geometry, margin, floor, cells):  # type: ignore[no-untyped-def]
+    """The quarter-resolution levels of rows start..stop.
+
+    Args:
+        start: First row.
+        stop: One past the last.
+        coarse: uint16 ``[rows, >= 8 columns]`` of `fine_levels`.
+        columns: Pixels a row.
+        blurs: int64 ``[L, 2]``, taps and distance of each level.
+        first_level: Number of the first of these levels.
+        geometry: `maps.MapGeometry`.
+        margin: Empty histograms around the maps.
+        floor: Added to norms.
+        cells: uint8, flat, all levels' histograms.
+    """
+    rows, levels = len(coarse), len(blurs)
+    length = 32 * ((8 * columns + 31) // 32)
+    pitch = length + SPILL
+    rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
+    line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
+    reach = np.zeros(levels + 1, dtype=np.int64)
+    for level in range(levels - 1, -1, -1):
+        reach[level] = reach[level + 1] + (blurs[level, 0] // 2) * blurs[level, 1]
+    for row in range(max(start - reach[0], 0), stop + reach[0]):
+        if row < rows:
+            source, at = coarse[row], (row & (RING - 1)) * pitch
+            for i in range(0, length, 32):
+                store_words(rings[0], at + i, load_words(source, i))
+        delay = 0
+        for level in range(levels):
+            taps, distance = blurs[level, 0], blurs[level, 1]
+            delay += (taps // 2) * distance
+            y = row - delay
+            if not (max(start - reach[level + 1], 0) <= y < min(stop + reach[level + 1], rows)):
+                continue
+            at = (y & (RING - 1)) * pitch
+            smooth_line(rings[level], pitch, y, rows, columns, taps, distance, line, rings[level + 1], at)
+            if start <= y < stop:
+                number = first_level + level
+                cell = geometry.base[number] + (margin + y) * geometry.stride[number] + margin
+                normalise_line(rings[level + 1], at, columns, floor, cells, 8 * cell)

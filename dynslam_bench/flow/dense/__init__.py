@@ -1,0 +1,1 @@
+"""Dense DAISY Filter Flow: superpixel labels, guided filter, winner takes all."""

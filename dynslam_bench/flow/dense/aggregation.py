@@ -1,0 +1,112 @@
+"""Aggregation and choice of labels: raw cost (Eq. 1), guided filter (Eq. 2), winner takes all (Eq. 3), compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..daisy.cost import appearance, describe_once, descriptor_distance, quantised
+from ..kernels.jit import kernel
+from .guided_filter import filter_patch
+
+
+@kernel
+def aggregate_and_choose(  # type: ignore[no-untyped-def]
+    start, stop, members, starts, centres, candidates, reference, target, tables, guide, radius, epsilon, best, winner,
+    evaluations,
+):  # fmt: skip
+    """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
+
+    Args:
+        start: First region.
+        stop: One past the last.
+        members: `Superpixels.members`.
+        starts: `Superpixels.starts`.
+        centres: float32 ``[K, 2]``, full-image pixels.
+        candidates: float32 ``[K, C, 4]``, labels around the centres; NaN means none.
+        reference: `matching.Side`.
+        target: `matching.Side`.
+        tables: `matching.CostTables` without support.
+        guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
+        radius: Of the guided filter, half-resolution pixels.
+        epsilon: Of the guided filter.
+        best: float32 ``[h, w]``, lowest aggregated cost, changed in place.
+        winner: float32 ``[h, w, 4]``, its label around the region's centre.
+        evaluations: int64 ``[K]``, raw costs computed.
+    """
+    rows, columns = guide.shape
+    height, width = target.gray.shape
+    descriptors = np.empty(0, dtype=np.uint8)
+    size = 0
+    described = np.zeros(13, dtype=np.bool_)
+    raw = np.empty(0, dtype=np.float32)
+    patch_guide, filtered, work = np.empty(0, dtype=np.float32), np.empty(0, np.float32), np.empty((6, 0), np.float32)
+    for r in range(start, stop):
+        if starts[r] == starts[r + 1]:
+            continue
+        top, bottom, left, right = rows, -1, columns, -1
+        for k in range(starts[r], starts[r + 1]):
+            y, x = members[k] // columns, members[k] % columns
+            top, bottom, left, right = min(top, y), max(bottom, y), min(left, x), max(right, x)
+        top, left = max(top - 2 * radius, 0), max(left - 2 * radius, 0)
+        bottom, right = min(bottom + 2 * radius, rows - 1), min(right + 2 * radius, columns - 1)
+        high, wide = bottom - top + 1, right - left + 1
+        n = high * wide
+        if n > size:
+            size = n
+            descriptors = np.empty(13 * n * 136, dtype=np.uint8)
+            raw, patch_guide, filtered = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+            work = np.empty((6, n), np.float32)
+        described[:] = False
+        for y in range(high):
+            for x in range(wide):
+                patch_guide[y * wide + x] = guide[top + y, left + x]
+        for c in range(candidates.shape[1]):
+            u, v, s, theta = candidates[r, c, 0], candidates[r, c, 1], candidates[r, c, 2], candidates[r, c, 3]
+            if not np.isfinite(u + v + s + theta):
+                continue
+            si, ti = quantised(s, theta)
+            scale = np.float32(np.exp2(s))
+            a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
+            for y in range(high):
+                for x in range(wide):
+                    k = y * wide + x
+                    px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
+                    mine = (ti * size + k) * 136
+                    if not described[ti]:
+                        describe_once(px, py, ti, reference, tables, descriptors, mine)
+                    dx, dy = px - centres[r, 0], py - centres[r, 1]
+                    tx, ty = centres[r, 0] + u + a * dx - b * dy, centres[r, 1] + v + b * dx + a * dy
+                    cost = np.int64(tables.ceiling)
+                    if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
+                        cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, descriptors, target, tables))
+                        if tables.appearance:
+                            gray, gradient = appearance(target.gray, tx, ty)
+                            own_gray, own_gradient = appearance(reference.gray, px, py)
+                            cost += tables.intensity[abs(gray - own_gray)]
+                            cost += tables.gradient[min(abs(gradient - own_gradient), 255)]
+                    raw[k] = np.float32(cost)
+            described[ti] = True
+            evaluations[r] += n
+            filter_patch(patch_guide[:n], raw[:n], high, wide, radius, epsilon, work, filtered[:n])
+            for k in range(starts[r], starts[r + 1]):
+                y, x = members[k] // columns, members[k] % columns
+                cost = filtered[(y - top) * wide + x - left]
+                if cost < best[y, x]:
+                    best[y, x] = cost
+                    winner[y, x, 0], winner[y, x, 1], winner[y, x, 2], winner[y, x, 3] = u, v, s, theta
+
+
+@kernel
+def spread_labels(start, stop, winner, regions, centres, flow):  # type: ignore[no-untyped-def]
+    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
+    for y in range(start, stop):
+        row = min(y // 2, winner.shape[0] - 1)
+        for x in range(flow.shape[1]):
+            column = min(x // 2, winner.shape[1] - 1)
+            u, v, s, theta = winner[row, column]
+            r = regions[row, column]
+            scale = np.float32(np.exp2(s))
+            a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
+            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
+            flow[y, x, 0] = u + a * dx - b * dy - dx
+            flow[y, x, 1] = v + b * dx + a * dy - dy

@@ -1,0 +1,95 @@
+"""The guided filter (He, Sun, Tang 2010) that aggregates matching costs: Eq. 2."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels.jit import inlined, kernel
+
+
+def guided_filter(
+    guide: NDArray[np.floating], values: NDArray[np.floating], radius: int, epsilon: float
+) -> NDArray[np.float32]:
+    """Edge-preserving average of `values` that follows the edges of `guide`.
+
+    Within each ``(2 radius + 1)**2`` window (clipped at the image's edge) the output is a linear function of the guide;
+    overlapping windows are averaged.
+
+    Args:
+        guide: ``[H, W]``, grey levels in [0, 1].
+        values: ``[H, W]``, what is filtered (matching costs).
+        radius: Of the window, pixels.
+        epsilon: Regularisation, squared grey levels.
+
+    Returns:
+        float32 ``[H, W]``.
+
+    Raises:
+        ValueError: The images differ in size, or radius or epsilon is negative.
+    """
+    if guide.ndim != 2 or guide.shape != values.shape:
+        raise ValueError(f"guide and values must be images of one size, got {guide.shape} and {values.shape}")
+    if radius < 0 or not epsilon >= 0:
+        raise ValueError(f"radius and epsilon must not be negative, got {radius} and {epsilon}")
+    out = np.empty(guide.shape, dtype=np.float32)
+    height, width = guide.shape
+    work = np.empty((6, height * width), dtype=np.float32)
+    filter_patch(
+        np.ascontiguousarray(guide, dtype=np.float32).reshape(-1),
+        np.ascontiguousarray(values, dtype=np.float32).reshape(-1),
+        height, width, radius, np.float32(epsilon), work, out.reshape(-1),
+    )  # fmt: skip
+    return out
+
+
+@kernel
+def filter_patch(guide, values, height, width, radius, epsilon, work, out):  # type: ignore[no-untyped-def]
+    """`guided_filter` on flat float32 arrays of ``height * width``; `work` is float32 ``[6, height * width]``."""
+    n = height * width
+    mean_guide, mean_value = work[0, :n], work[1, :n]
+    product, square, line = work[2, :n], work[3, :n], work[4, :n]
+    box_mean(guide, height, width, radius, line, mean_guide)
+    box_mean(values, height, width, radius, line, mean_value)
+    for k in range(n):
+        out[k] = guide[k] * values[k]
+    box_mean(out, height, width, radius, line, product)
+    for k in range(n):
+        out[k] = guide[k] * guide[k]
+    box_mean(out, height, width, radius, line, square)
+    slope, offset = product, square
+    for k in range(n):
+        spread = max(square[k] - mean_guide[k] * mean_guide[k], np.float32(0)) + epsilon
+        a = (product[k] - mean_guide[k] * mean_value[k]) / spread if spread > 0 else np.float32(0)
+        slope[k] = a
+        offset[k] = mean_value[k] - a * mean_guide[k]
+    box_mean(slope, height, width, radius, line, mean_guide)
+    box_mean(offset, height, width, radius, line, mean_value)
+    for k in range(n):
+        out[k] = mean_guide[k] * guide[k] + mean_value[k]
+
+
+@inlined
+def box_mean(values, height, width, radius, line, out):  # type: ignore[no-untyped-def]
+    """Mean over the window clipped at the edges; columns first (vectorised), then running sums along rows."""
+    for y in range(height):
+        low, high = max(y - radius, 0), min(y + radius, height - 1)
+        row = line[y * width : (y + 1) * width]
+        first = values[low * width : (low + 1) * width]
+        for x in range(width):
+            row[x] = first[x]
+        for other in range(low + 1, high + 1):
+            more = values[other * width : (other + 1) * width]
+            for x in range(width):
+                row[x] += more[x]
+        count = np.float32(high - low + 1)
+        total = np.float32(0)
+        for x in range(min(radius, width)):
+            total += row[x]
+        for x in range(width):
+            if x + radius < width:
+                total += row[x + radius]
+            if x - radius - 1 >= 0:
+                total -= row[x - radius - 1]
+            columns = np.float32(min(x + radius, width - 1) - max(x - radius, 0) + 1)
+            out[y * width + x] = total / (count * columns)

@@ -1,0 +1,1 @@
+"""How the flow's kernels are compiled, and the values they compute with."""

@@ -1,0 +1,205 @@
+"""Many runs: resumable, parallel, here or on any executor."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Collection, Iterable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+
+from .identity import ResolvedRun, resolve
+from .one import OnProgress, run_one
+from .spec import RunSpec
+from .storage.packing import run_packed, unpack
+from .storage.record import FAILED, RunRecord
+from .storage.scoring import DEFAULT_PROTOCOL, score
+from .storage.store import RunStore
+
+
+@dataclass(frozen=True)
+class RunEvent:
+    """Something happened to a run.
+
+    Attributes:
+        kind: ``reused`` (it was stored already), ``started``, ``progress`` or ``finished``.
+        run_id: The run.
+        spec: What was asked for.
+        total: How many runs there are.
+        record: The outcome, with ``reused`` and ``finished``.
+        partial: The partial metrics, with ``progress``.
+    """
+
+    kind: Literal["reused", "started", "progress", "finished"]
+    run_id: str
+    spec: RunSpec
+    total: int
+    record: RunRecord | None = None
+    partial: dict[str, Any] | None = None
+
+
+def run_many(
+    specs: Iterable[RunSpec],
+    *,
+    results: str | Path | RunStore = "results",
+    jobs: int = 1,
+    executor: Executor | None = None,
+    retry: Collection[str] = (),
+    on_event: Callable[[RunEvent], None] | None = None,
+    on_progress: OnProgress | None = None,
+    protocol: Protocol | str = DEFAULT_PROTOCOL,
+    cancelled: Callable[[], bool] | None = None,
+) -> list[RunRecord]:
+    """Make the runs that are not stored yet, and score all of them.
+
+    Everything is looked up before the first run begins. A stored run is made again if a video or a sheet is asked for
+    that it lacks; one that is given another label gets that. Each run is a child process; a failure is a record like
+    any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from there.
+
+    Args:
+        specs: What to run; runs that are the same are made once.
+        results: The results folder, or a store.
+        jobs: Runs at a time on this machine.
+        executor: Where to make them instead: anything with the interface of `concurrent.futures.Executor`, for example
+            Dask's ``client.get_executor()``. Workers return records as bytes; they need the sequences, not the results
+            folder. Partial metrics stay on the worker, so `on_progress` is not called.
+        retry: Statuses to run again although they are stored; ``failed`` stands for all of `FAILED`.
+        on_event: Told of everything that happens, from several threads but never two at a time.
+        on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
+        protocol: Protocol to score under.
+        cancelled: Asked many times a second; True ends the runs on this machine at once, as stopped.
+
+    Returns:
+        The records in the order of `specs`.
+
+    Raises:
+        DynslamError: A spec names something unknown or unfit, or the results folder cannot be written; nothing ran.
+    """
+    store = results if isinstance(results, RunStore) else RunStore(results)
+    protocol = get_protocol(protocol)
+    again = _statuses(retry)
+    if jobs < 1:
+        raise RunError(f"jobs is {jobs}", "give a number >= 1")
+    resolved = [resolve(spec) for spec in specs]
+    store.prepare()
+    bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs, cancelled)
+    todo: dict[str, ResolvedRun] = {}
+    done: dict[str, RunRecord] = {}
+    for run in resolved:
+        if run.run_id in todo or run.run_id in done:
+            continue
+        stored = store.get(run.run_id)
+        if stored is not None and stored.status not in again and not _lacks_pictures(store, run, stored):
+            done[run.run_id] = bench.reuse(run, stored)
+        else:
+            todo[run.run_id] = run
+    done |= bench.run_remotely(todo, executor) if executor is not None else bench.run_here(todo, jobs)
+    return [done[run.run_id] for run in resolved]
+
+
+class _Bench:
+    def __init__(
+        self,
+        store: RunStore,
+        protocol: Protocol,
+        total: int,
+        on_event: Callable[[RunEvent], None] | None,
+        on_progress: OnProgress | None,
+        jobs: int,
+        cancelled: Callable[[], bool] | None,
+    ) -> None:
+        self.jobs = jobs
+        self.cancelled_outside = cancelled or (lambda: False)
+        self.store, self.protocol, self.total = store, protocol, total
+        self.on_event, self.on_progress = on_event, on_progress
+        self.lock = threading.Lock()
+        self.cancelled = threading.Event()
+
+    def reuse(self, run: ResolvedRun, record: RunRecord) -> RunRecord:
+        if run.spec.label not in ("", record.tracker.label):
+            record = self.store.relabel(record, run.spec.label)
+        score(self.store, record, self.protocol)
+        self.tell("reused", run, record=record)
+        return record
+
+    def run_here(self, todo: dict[str, ResolvedRun], jobs: int) -> dict[str, RunRecord]:
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-run") as pool:
+            futures = {pool.submit(self._one, run): run_id for run_id, run in todo.items()}
+            return self._collect(futures, lambda record, _: record)
+
+    def run_remotely(self, todo: dict[str, ResolvedRun], executor: Executor) -> dict[str, RunRecord]:
+        options = json.dumps({"protocol": self.protocol.model_dump(mode="json")})
+        futures: dict[Future[bytes], str] = {}
+        for run_id, run in todo.items():
+            self.tell("started", run)
+            futures[executor.submit(run_packed, run.spec.model_dump_json(), options)] = run_id
+
+        def take(data: bytes, run_id: str) -> RunRecord:
+            record = unpack(data, self.store)
+            score(self.store, record, self.protocol)
+            self.tell("finished", todo[run_id], record=record)
+            return record
+
+        return self._collect(futures, take)
+
+    def _collect(self, futures: dict[Future[Any], str], take: Callable[[Any, str], RunRecord]) -> dict[str, RunRecord]:
+        try:
+            return {futures[future]: take(future.result(), futures[future]) for future in as_completed(futures)}
+        except BaseException:
+            self.cancelled.set()
+            for future in futures:
+                future.cancel()
+            raise
+
+    def _one(self, run: ResolvedRun) -> RunRecord:
+        self.tell("started", run)
+
+        def progress(run_id: str, partial: dict[str, Any]) -> bool:
+            self.tell("progress", run, partial=partial)
+            return self.on_progress is None or self.on_progress(run_id, partial)
+
+        record = run_one(
+            run, self.store, on_progress=progress, protocol=self.protocol, cancelled=self._is_cancelled,
+            at_a_time=self.jobs,
+        )  # fmt: skip
+        if record.status != "stopped":
+            score(self.store, record, self.protocol)
+        self.tell("finished", run, record=record)
+        return record
+
+    def _is_cancelled(self) -> bool:
+        return self.cancelled.is_set() or self.cancelled_outside()
+
+    def tell(
+        self,
+        kind: Literal["reused", "started", "progress", "finished"],
+        run: ResolvedRun,
+        *,
+        record: RunRecord | None = None,
+        partial: dict[str, Any] | None = None,
+    ) -> None:
+        if self.on_event is not None:
+            with self.lock:
+                self.on_event(RunEvent(kind, run.run_id, run.spec, self.total, record, partial))
+
+
+def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
+    """Whether a stored run has to be made again for a video or a sheet that is asked for now."""
+    folder = store.folder(stored.run_id)
+    wanted = [name for name, asked in (("video.mp4", run.spec.video), ("sheet.png", run.spec.sheet)) if asked]
+    excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
+    return not stored.failed and any(not (folder / name).is_file() for name in set(wanted) - excused)
+
+
+def _statuses(retry: Collection[str]) -> set[str]:
+    wanted = {retry} if isinstance(retry, str) else set(retry)
+    known = {"ok", "lost", *FAILED}
+    unknown = sorted(wanted - known - {"failed"})
+    if unknown:
+        raise RunError(f"unknown status '{unknown[0]}' to retry", "known: failed, " + ", ".join(sorted(known)))
+    return (wanted - {"failed"}) | (set(FAILED) if "failed" in wanted else set())

@@ -1,0 +1,171 @@
+"""Making one run and storing it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.machine import git_revision, this_machine, versions
+from dynslam_bench.core.records import digest
+from dynslam_bench.core.settings import flatten
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.sequences.part import part_of
+
+from .identity import ResolvedRun, resolve
+from .process.child import FRAMES_FILE, LOG_FILE
+from .process.handle import start_child
+from .process.log_file import LogFile
+from .process.server import THREAD_VARIABLES
+from .process.supervise import Verdict, supervise
+from .spec import RunSpec, place_of
+from .storage.frames import FrameLog
+from .storage.record import RunRecord, SequenceInfo, Status, TrackerInfo
+from .storage.scoring import DEFAULT_PROTOCOL
+from .storage.store import RunStore
+
+PROGRESS_EVERY = 50
+CACHED_TIMES = "times of features and masks are those of the stage cache's entries, not of this run"
+LOST_COVERAGE = 0.5
+LOST_AT_END = 10
+"""A run whose coverage is below the first, or that is lost on so many frames at its end, has status ``lost``."""
+
+OnProgress = Callable[[str, dict[str, Any]], bool]
+"""Called as ``on_progress(run_id, partial)`` every `PROGRESS_EVERY` frames; returning False stops the run.
+
+`partial` holds ``frames_done``, ``frames``, ``metrics`` (of the frames so far under the protocol), ``frame_time_s`` and
+``pose_error_trans_m``.
+"""
+
+
+def run_one(
+    run: RunSpec | ResolvedRun,
+    store: RunStore,
+    *,
+    on_progress: OnProgress | None = None,
+    protocol: Protocol | str = DEFAULT_PROTOCOL,
+    progress_every: int = PROGRESS_EVERY,
+    cancelled: Callable[[], bool] | None = None,
+    at_a_time: int = 1,
+) -> RunRecord:
+    """Make a run in a child process and store it, whatever becomes of it.
+
+    A tracker that raises, hangs, breaks its contract, takes too much or dies gives a record with that status and the
+    reason; only a request that cannot begin at all is an error. A run that `on_progress` stopped is not stored.
+
+    Args:
+        run: What to run.
+        store: Where to keep it; an earlier run of the same id is replaced.
+        on_progress: Told of the partial metrics; may stop the run.
+        protocol: Protocol of the partial metrics.
+        progress_every: Frames between two of them.
+        cancelled: Asked many times a second; True ends the run at once, as stopped.
+        at_a_time: Runs that share this machine; the default memory limit is divided among them.
+
+    Returns:
+        The record.
+
+    Raises:
+        DynslamError: The request names something unknown or unfit (nothing is stored then), or the store cannot be
+            written.
+    """
+    resolved = resolve(run) if isinstance(run, RunSpec) else run
+    run_id = resolved.run_id
+    started = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+    clock = time.perf_counter()
+    with store.work_folder(run_id) as work:
+        job = {
+            "spec": resolved.spec.model_dump(mode="json"),
+            "folder": str(work),
+            "protocol": get_protocol(protocol).model_dump(mode="json"),
+            "progress_every": progress_every,
+            "environment": {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES},
+            "working_folder": str(Path.cwd()),
+            "path": list(sys.path),
+        }
+        listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
+        log = LogFile(work / LOG_FILE)
+        verdict = supervise(
+            start_child(), job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time
+        )  # fmt: skip
+        log.finish()
+        if verdict.refused:
+            raise RunError(f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}")
+        frames = FrameLog.read(work / FRAMES_FILE)
+        frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
+        (work / FRAMES_FILE).unlink(missing_ok=True)
+        record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
+        if record.status != "stopped":
+            store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)
+            store.publish(work, record)
+    return record
+
+
+def sequence_info(resolved_sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
+    """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
+    sequence, seen = resolved_sequence, part_of(resolved_sequence, offset)
+    stamps = sequence.timestamps
+    return SequenceInfo(
+        id=sequence.id, content=content, part=part, block=seen.block, noise=seen.noise, frames=len(sequence),
+        duration_s=float(stamps[-1] - stamps[0]), fps=sequence.fps, ground_truth=sequence.ground_truth is not None,
+        license=sequence.license, citation=sequence.citation, tags=sorted(getattr(sequence, "tags", ())),
+        split=getattr(sequence, "split", ""),
+    )  # fmt: skip
+
+
+def part_digest(identity: dict[str, Any]) -> str:
+    """Names what of the sequence a run saw: content and frames."""
+    return digest({key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16)
+
+
+def _partial(message: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in message.items() if key != "type"}
+
+
+def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: str, wall_s: float) -> RunRecord:
+    spec, tracker, identity = resolved.spec, resolved.tracker, resolved.identity
+    final = verdict.final
+    tracked, total = frames.count("ok"), len(resolved.sequence)
+    dropped = frames.count("dropped")
+    status, reason = _judge(verdict, frames, total)
+    return RunRecord(
+        run_id=resolved.run_id, status=status, reason=reason,
+        tracker=TrackerInfo(
+            id=tracker.id, label=spec.label or tracker.label, version=tracker.version,
+            distribution=identity["distribution"], provenance=tracker.provenance, ranked=tracker.ranked,
+            deterministic=tracker.deterministic, license=tracker.license, citation=tracker.citation,
+            remarks=tracker.remarks,
+        ),
+        overrides=spec.settings, settings=flatten(resolved.settings),
+        sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
+        frames=spec.frames, offset=spec.offset, stride=spec.stride, seed=spec.seed, device=resolved.device,
+        threads=spec.threads,
+        realtime=spec.realtime, drop_share=spec.drop_share, degrade=identity["degrade"],
+        segmentation=resolved.segmentation, n_frames=total, n_processed=len(frames.rows) - dropped, n_tracked=tracked,
+        n_lost=frames.count("lost"), n_initialising=frames.count("initialising"), n_dropped=dropped,
+        coverage=tracked / total, keyframes=final.get("keyframes"), map_points=final.get("map_points"),
+        epipolar_skipped=frames.epipolar_skipped(),
+        mask_iou=frames.mask_iou(), timings=frames.timings(), finalize_s=final.get("finalize_s"), started=started,
+        wall_s=wall_s, peak_memory_mb=verdict.peak_memory_mb or None, peak_gpu_memory_mb=final.get("gpu_memory_mb"),
+        machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}), versions=versions(),
+        git=git_revision(), command=list(sys.argv), identity=identity,
+        notes=[*([CACHED_TIMES] if spec.cache else []), *final.get("notes", [])], place=place_of(spec.sequence),
+    )  # fmt: skip
+
+
+def _judge(verdict: Verdict, frames: FrameLog, total: int) -> tuple[Status, str]:
+    """A run that came to its end may still have lost its way."""
+    if verdict.status != "ok":
+        return verdict.status, verdict.reason
+    due = total - frames.count("dropped")
+    tracked, streak = frames.count("ok"), frames.lost_streak()
+    if tracked < LOST_COVERAGE * due:
+        return "lost", f"tracked on {tracked} of {due} frames"
+    if streak >= LOST_AT_END:
+        return "lost", f"lost from frame {total - streak} to the end, tracked on {tracked} of {due} frames"
+    return "ok", ""

@@ -1,0 +1,1 @@
+"""What is kept of runs: records, frames, the store, scores."""

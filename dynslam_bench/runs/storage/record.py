@@ -1,0 +1,252 @@
+"""What is kept of a run: `run.json`, and the metrics that lie apart from it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from dynslam_bench.core.machine import GitRevision, Machine
+from dynslam_bench.core.records import Record
+from dynslam_bench.evaluation.evaluate import Evaluation
+
+RUN_SCHEMA = 1
+METRIC_SCHEMA = 1
+
+Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
+FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
+"""Statuses of runs that did not come to their end."""
+
+
+class TrackerInfo(Record):
+    """The tracker, as its spec described it; see `TrackerSpec`."""
+
+    id: str
+    label: str
+    version: str = ""
+    distribution: str = ""
+    provenance: str = "external"
+    ranked: bool = True
+    deterministic: bool = True
+    license: str = ""
+    citation: str = ""
+    remarks: str = ""
+
+
+class SequenceInfo(Record):
+    """The sequence.
+
+    Attributes:
+        id: Its id.
+        content: Digest of its content.
+        part: Digest of content and frames: names the folder with the stamps and the ground truth.
+        block: Digest of what is filmed, camera, frames and stride, without the start offset and the noise seed: one
+            column of a table. Empty in records of older versions, whose `part` stands for it.
+        noise: Seed of the sensors' noise; None for the sequence's own.
+        frames: Frames of the run's part.
+        duration_s: Time between its first and last frame.
+        fps: Nominal frame rate.
+        ground_truth: Whether it has any.
+        license: Licence of the data.
+        citation: What to cite.
+        tags: For example ``high-dynamic``.
+        split: ``tune``, ``held-out`` or empty.
+    """
+
+    id: str
+    content: str = ""
+    part: str
+    block: str = ""
+    noise: int | None = None
+    frames: int
+    duration_s: float
+    fps: float
+    ground_truth: bool
+    license: str = ""
+    citation: str = ""
+    tags: list[str] = Field(default_factory=list)
+    split: str = ""
+
+
+class StageTime(Record):
+    """Wall-clock seconds a frame of one stage, over the tracked frames; frames on which it did not run count as 0."""
+
+    median_s: float
+    p95_s: float
+    mean_s: float
+
+
+class RunRecord(Record):
+    """The outcome of a run.
+
+    Attributes:
+        schema_version: Of this record; older ones stay loadable.
+        kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
+        run_id: Digest of `identity`.
+        status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`); ``crashed``,
+            ``timeout``, ``out-of-memory``; ``invalid``: the tracker broke its contract; ``stopped``: ended early
+            on request.
+        reason: One line, empty for ``ok``.
+        tracker: The tracker.
+        overrides: The settings that were asked for, dotted name to value.
+        settings: All settings, dotted name to value.
+        sequence: The sequence.
+        frames: Part of it; None for all.
+        offset: So many leading frames of that part were left out.
+        stride: Every so many frames.
+        seed: Seed.
+        device: Where it computed.
+        threads: Threads it was given.
+        realtime: Whether frames were dropped while the tracker was busy.
+        drop_share: Share of the frames dropped at random.
+        degrade: Degradation of the images.
+        segmentation: Where the masks came from: ``oracle``, ``embedded``, ...; empty without a semantic stage.
+        n_frames: Input frames.
+        n_processed: Frames that the tracker saw.
+        n_tracked: Frames with state ``ok``.
+        n_lost: Frames with state ``lost``.
+        n_initialising: Frames with state ``initialising``.
+        n_dropped: Frames that never reached the tracker.
+        coverage: ``n_tracked / n_frames``.
+        keyframes: Keyframes at the end, None if the tracker does not say.
+        map_points: Map points at the end, None if the tracker does not say.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
+        mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
+            where either is missing.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
+        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded.
+        finalize_s: Time of the final optimisation.
+        started: UTC, ISO 8601.
+        wall_s: Wall-clock time of the whole run.
+        peak_memory_mb: Largest resident memory.
+        peak_gpu_memory_mb: Largest GPU memory, None without one.
+        machine: The computer.
+        versions: Of Python and the packages that matter.
+        git: Revision of the checkout.
+        command: The command line of the parent process.
+        identity: What `run_id` stands for.
+        provenance: For imported trajectories: where it came from.
+        place: Folder of the sequence where it was named by its path; empty for an id.
+        stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
+        notes: Anything a reader should know, one line each.
+    """
+
+    schema_version: int = RUN_SCHEMA
+    kind: Literal["run", "imported"] = "run"
+    run_id: str
+    status: Status
+    reason: str = ""
+    tracker: TrackerInfo
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    settings: dict[str, Any] = Field(default_factory=dict)
+    sequence: SequenceInfo
+    frames: tuple[int, int | None] | None = None
+    offset: int = 0
+    stride: int = 1
+    seed: int = 0
+    device: str = ""
+    threads: int = 1
+    realtime: bool = False
+    drop_share: float = 0.0
+    degrade: dict[str, float] = Field(default_factory=dict)
+    segmentation: str = ""
+    n_frames: int
+    n_processed: int = 0
+    n_tracked: int = 0
+    n_lost: int = 0
+    n_initialising: int = 0
+    n_dropped: int = 0
+    coverage: float = 0.0
+    keyframes: int | None = None
+    map_points: int | None = None
+    epipolar_skipped: float | None = None
+    mask_iou: float | None = None
+    epipolar_skipped: float | None = None
+    timings: dict[str, StageTime] = Field(default_factory=dict)
+    finalize_s: float | None = None
+    started: str = ""
+    wall_s: float = 0.0
+    peak_memory_mb: float | None = None
+    peak_gpu_memory_mb: float | None = None
+    machine: Machine | None = None
+    versions: dict[str, str] = Field(default_factory=dict)
+    git: GitRevision | None = None
+    command: list[str] = Field(default_factory=list)
+    identity: dict[str, Any] = Field(default_factory=dict)
+    provenance: str = ""
+    place: str = ""
+    stamps_match: bool = True
+    notes: list[str] = Field(default_factory=list)
+
+    def normalised(self) -> RunRecord:
+        """The record as it reads after it was written: tuples inside settings are lists then."""
+        return RunRecord.model_validate_json(self.to_json())
+
+    @property
+    def failed(self) -> bool:
+        """Whether it did not come to its end."""
+        return self.status in FAILED
+
+    @property
+    def repeat(self) -> str:
+        """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
+        words = [f"seed {self.seed}"]
+        words += [f"offset {self.offset}"] * bool(self.offset)
+        words += [] if self.sequence.noise is None else [f"noise {self.sequence.noise}"]
+        return ", ".join(words)
+
+    @property
+    def frame_time_s(self) -> float | None:
+        """Median time a frame, segmentation included, decoding excluded."""
+        total = self.timings.get("total")
+        return None if total is None else total.median_s
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Sensor's frame interval over the mean frame time: above 1 the tracker keeps up."""
+        total = self.timings.get("total")
+        return None if total is None or total.mean_s <= 0 else 1.0 / (self.sequence.fps * total.mean_s)
+
+    def describe(self) -> str:
+        """One line: tracker, sequence, seed, status, coverage, frame time."""
+        parts = [f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"]
+        parts.append(f"coverage {100 * self.coverage:.1f} %")
+        if self.frame_time_s is not None:
+            parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
+        return ", ".join(parts) + (f" ({self.reason})" if self.reason else "")
+
+
+class MetricRecord(Record):
+    """The errors of one run under one protocol.
+
+    Attributes:
+        schema_version: Of this record.
+        run_id: The run.
+        protocol_id: Id of the protocol.
+        protocol_digest: Its digest; numbers of different digests are not comparable.
+        trajectory: Which of the two the protocol asks for.
+        online: Evaluation of the online trajectory; None if it cannot be evaluated.
+        final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
+        reasons: Why an evaluation is missing, by ``online`` and ``final``.
+    """
+
+    schema_version: int = METRIC_SCHEMA
+    run_id: str
+    protocol_id: str
+    protocol_digest: str
+    trajectory: Literal["online", "final"] = "online"
+    online: Evaluation | None = None
+    final: Evaluation | None = None
+    reasons: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def primary(self) -> Evaluation | None:
+        """The evaluation of the trajectory that the protocol asks for."""
+        return self.online if self.trajectory == "online" else self.final
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """The primary evaluation's metrics; empty if there is none."""
+        return {} if self.primary is None else self.primary.metrics

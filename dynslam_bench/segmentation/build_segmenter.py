@@ -1,0 +1,262 @@
+"""Choose and construct the segmenter that the settings ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from dynslam_bench.contracts.segmenter import Instances, Segmenter
+from dynslam_bench.contracts.sequence import Frame, MaskSource
+from dynslam_bench.core.errors import DynslamError, SegmentationError
+from dynslam_bench.core.fingerprint import path_digest
+from dynslam_bench.core.plugins import load_object
+
+from .masks.postprocess import select
+from .networks.checkpoints import COCO, cached_checkpoint, embedded_weights, fetch_checkpoint
+from .registry import SEGMENTERS, SegmenterContext
+from .settings import SegmentationSettings
+
+SYNTHETIC = "synthetic/"
+LOWEST_CONFIDENCE = 0.1
+"""Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
+
+
+def resolve_source(
+    settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None, *, optional: bool = False
+) -> str:  # fmt: skip
+    """What `settings.source` means for a sequence; the label stored with results.
+
+    Args:
+        settings: Whose `source` is resolved.
+        sequence_id: Id of the sequence, for ``auto``.
+        masks: Its exact masks, if it has them.
+        optional: Whether who asks also works without masks, for the hint.
+
+    Returns:
+        ``auto`` becomes ``embedded``, ``oracle`` or ``coco``; everything else stays as it is.
+
+    Raises:
+        SegmentationError: ``auto`` finds nothing that could segment this sequence; says what is available.
+    """
+    if settings.source != "auto":
+        return settings.source
+    if sequence_id.startswith(SYNTHETIC):
+        if embedded_weights() is not None:
+            return "embedded"
+        if masks is not None:
+            return "oracle"
+    if cached_checkpoint(COCO) is not None:
+        return "coco"
+    available = ["onnx:PATH", "recorded:DIR", "weights:PATH",
+                 f"coco (downloads {COCO.megabytes} MB from {COCO.url})"]  # fmt: skip
+    if masks is not None:
+        available.insert(0, "oracle (the sequence's exact masks)")
+    if optional:
+        available.insert(0, "none (no masks)")
+    else:
+        available.append("or a system that needs no masks, e.g. emfoa-oft-no-masks or orb-slam2")
+    what = f"sequence '{sequence_id}'" if sequence_id else "this sequence"
+    raise SegmentationError(
+        f"segmentation.source=auto finds no network for {what}: the COCO checkpoint is not in the cache",
+        "choose one of: segmentation.source=" + ", ".join(available),
+    )
+
+
+def build_segmenter(
+    settings: SegmentationSettings,
+    *,
+    sequence_id: str = "",
+    masks: MaskSource | None = None,
+    device: str = "cpu",
+    threads: int = 1,
+    deferred: bool = False,
+    also: frozenset[str] = frozenset(),
+) -> ConfiguredSegmenter | None:
+    """The segmenter that the settings ask for; None for source ``none``.
+
+    Args:
+        settings: Source, classes and thresholds.
+        sequence_id: Id of the sequence, for ``auto`` and messages.
+        masks: Exact masks of the sequence, for ``oracle``.
+        device: ``cpu`` or ``cuda:N``, for networks that run in torch.
+        threads: Threads a network may use.
+        also: Names of further classes whose objects are wanted, though nobody holds them for dynamic by themselves.
+        deferred: Load a network whose file is there only once a frame needs it; with the stage cache none may.
+
+    Raises:
+        SegmentationError: The source is not available here, or its file does not fit.
+        PluginError: ``plugin:ID`` names no segmenter.
+    """
+    source = resolve_source(settings, sequence_id, masks)
+    if source == "none":
+        return None
+    prefix, _, argument = source.partition(":")
+    name, argument = (argument, "") if prefix == "plugin" else (prefix, argument)
+    spec = SEGMENTERS.get(name)
+    context = SegmenterContext(
+        sequence_id, masks, device, threads, argument, min(LOWEST_CONFIDENCE, settings.confidence)
+    )
+
+    def load() -> Segmenter:
+        try:
+            built = load_object(spec.entry_point)(settings, context)
+        except DynslamError:
+            raise
+        except Exception as error:  # a foreign factory may raise anything; our own raise DynslamError
+            raise SegmentationError(
+                f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}"
+            ) from error
+        if not isinstance(built, Segmenter):
+            raise SegmentationError(f"'{spec.entry_point}' gave a {type(built).__name__} without segment()")
+        return built
+
+    waits = deferred and prefix in ("embedded", "coco", "onnx", "weights") and weights_digest(settings, sequence_id)
+    return ConfiguredSegmenter(DeferredSegmenter(load) if waits else load(), settings, source, also)
+
+
+class DeferredSegmenter:
+    """A segmenter that is loaded when the first frame asks for it.
+
+    Args:
+        load: Loads it.
+    """
+
+    def __init__(self, load: Callable[[], Segmenter]) -> None:
+        self._load = load
+        self._segmenter: Segmenter | None = None
+
+    def loaded(self) -> Segmenter:
+        """The segmenter itself, loaded now if it was not before.
+
+        Raises:
+            SegmentationError: The network's file does not fit.
+        """
+        if self._segmenter is None:
+            self._segmenter = self._load()
+        return self._segmenter
+
+    def segment(self, frame: Frame) -> Instances:
+        """The objects in the frame."""
+        return self.loaded().segment(frame)
+
+
+class ConfiguredSegmenter:
+    """A segmenter whose objects are selected by the settings in force.
+
+    Args:
+        inner: Finds objects.
+        settings: Selects among them; the attribute `settings` may be replaced while a run lasts.
+        source: Label stored with results.
+        also: Names of further classes that are let through.
+    """
+
+    def __init__(
+        self, inner: Segmenter, settings: SegmentationSettings, source: str, also: frozenset[str] = frozenset()
+    ) -> None:
+        self.inner = inner
+        self.settings = settings
+        self.source = source
+        self.also = also
+
+    def segment(self, frame: Frame) -> Instances:
+        """The objects of the frame that count: see `select`.
+
+        Raises:
+            SegmentationError: The segmenter gave masks of another size than the frame.
+        """
+        found = self.inner.segment(frame)
+        if found.masks.shape[1:] != frame.rgb.shape[:2] or len(found.masks) != len(found):
+            raise SegmentationError(
+                f"{self.source} gave {len(found)} objects with masks of shape {found.masks.shape}, the frame is "
+                f"{frame.rgb.shape[1]}x{frame.rgb.shape[0]}", "masks must be [K, H, W] at the frame's size"
+            )  # fmt: skip
+        return select(found, self.settings, self.also)
+
+
+def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:
+    """Digest of the file that decides what the segmenter sees; part of a run's identity.
+
+    Returns:
+        The first 12 hexadecimal digits of the SHA-256 of the network's file, or of the names and contents of recorded
+        masks; empty for sources without a file.
+
+    Raises:
+        SegmentationError: The file cannot be read.
+    """
+    source = resolve_source(settings, sequence_id, masks)
+    prefix, _, argument = source.partition(":")
+    path: Path | None = Path(argument).expanduser()
+    if prefix == "embedded":
+        path = embedded_weights()
+    elif prefix == "coco":
+        path = cached_checkpoint(COCO)
+        if path is None:
+            return COCO.sha256_prefix
+    elif prefix not in ("onnx", "weights", "recorded"):
+        return ""
+    if path is None or not path.exists():
+        return ""
+    try:
+        return path_digest(path)[:12]
+    except OSError as error:
+        raise SegmentationError(f"cannot read {error.filename}: {error.strerror}") from error
+
+
+def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """Exact masks of the sequence.
+
+    Raises:
+        SegmentationError: The sequence has no exact masks.
+    """
+    from .masks.oracle import OracleSegmenter
+
+    if context.masks is None:
+        raise SegmentationError(
+            f"segmentation.source=oracle: sequence '{context.sequence_id}' has no exact masks",
+            "only synthetic/* has them; use coco, onnx:PATH or recorded:DIR",
+        )
+    return OracleSegmenter(context.masks)
+
+
+def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """Masks from a folder."""
+    from .masks.recorded import RecordedSegmenter
+
+    return RecordedSegmenter(Path(context.argument))
+
+
+def build_onnx(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """A network from an ONNX file."""
+    from .networks.onnx.segmenter import OnnxSegmenter
+
+    return OnnxSegmenter(Path(context.argument), settings, threads=context.threads, floor=context.floor)
+
+
+def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """The small network in this package.
+
+    Raises:
+        SegmentationError: This installation lacks its weights.
+    """
+    path = embedded_weights()
+    if path is None:
+        raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
+    return _mask_rcnn(path, settings.model_copy(update={"network_side": 0}), context)
+
+
+def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """Torchvision's COCO checkpoint, downloaded on first use."""
+    return _mask_rcnn(fetch_checkpoint(COCO), settings, context)
+
+
+def build_weights(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """A Mask R-CNN checkpoint of the user's."""
+    return _mask_rcnn(Path(context.argument), settings, context)
+
+
+def _mask_rcnn(path: Path, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    from .networks.mask_rcnn.segmenter import MaskRCNNSegmenter
+
+    return MaskRCNNSegmenter.from_file(
+        path, settings, device=context.device, threads=context.threads, floor=context.floor
+    )

@@ -1,0 +1,1 @@
+"""Segmentation networks: Mask R-CNN, ONNX files, and where their weights lie."""

@@ -1,0 +1,202 @@
+"""Labelled images from files: COCO annotation files and YOLO polygon labels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.records import digest
+
+from ..classes import COCO_NAMES
+from .labelled import LabelledImage
+
+FINER = 4
+"""Polygons are filled at this many times the image's resolution."""
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
+
+
+@dataclass(frozen=True)
+class _Entry:
+    image: Path
+    shapes: tuple[tuple[str, Any], ...]
+
+
+class CocoImages:
+    """Images of a COCO annotation file (``images``, ``annotations``, ``categories``); crowds are left out.
+
+    Polygons and uncompressed and compressed run lengths are understood.
+
+    Args:
+        annotations: The JSON file.
+        images: Folder of the images; None means the folder of the file.
+
+    Raises:
+        SegmentationError: The file is missing or not in COCO's format.
+    """
+
+    def __init__(self, annotations: Path, images: Path | None = None) -> None:
+        self.path = annotations.expanduser()
+        folder = images.expanduser() if images is not None else self.path.parent
+        try:
+            content = json.loads(self.path.read_text())
+            names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
+            shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
+            for entry in content["annotations"]:
+                if not entry.get("iscrowd"):
+                    shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
+            self._entries = [_Entry(folder / entry["file_name"], tuple(shapes[int(entry["id"])]))
+                             for entry in content["images"]]  # fmt: skip
+        except OSError as error:
+            raise SegmentationError(f"cannot read {self.path}: {error.strerror}") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise SegmentationError(f"{self.path} is not in COCO's annotation format: {type(error).__name__} {error}",
+                                    "it needs images, annotations and categories") from error  # fmt: skip
+        if not self._entries:
+            raise SegmentationError(f"{self.path} lists no images")
+
+    @property
+    def name(self) -> str:
+        """The annotation file."""
+        return f"coco:{self.path.name}"
+
+    @property
+    def version(self) -> str:
+        """Digest of the files' names and sizes."""
+        return _files_digest([self.path, *(entry.image for entry in self._entries)])
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        entry = self._entries[index]
+        rgb = _read(entry.image)
+        masks = [_coco_mask(shape, rgb.shape[:2], entry.image) for _, shape in entry.shapes]
+        return _labelled(rgb, masks, [name for name, _ in entry.shapes])
+
+
+class YoloImages:
+    """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
+
+    A label's line is ``class x1 y1 x2 y2 ...`` with COCO's class numbers from 0 and coordinates in [0, 1]. An image
+    without a label file has no objects.
+
+    Args:
+        folder: Holds ``images`` and ``labels``.
+
+    Raises:
+        SegmentationError: The folder or its images are missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.expanduser()
+        root = self.folder / "images"
+        self._images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
+        if not self._images:
+            raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
+
+    @property
+    def name(self) -> str:
+        """The folder."""
+        return f"yolo:{self.folder.name}"
+
+    @property
+    def version(self) -> str:
+        """Digest of the files' names and sizes."""
+        return _files_digest([*self._images, *sorted((self.folder / "labels").rglob("*.txt"))])
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        path = self._images[index]
+        rgb = _read(path)
+        label = self.folder / "labels" / path.relative_to(self.folder / "images").with_suffix(".txt")
+        masks, names = [], []
+        for number, line in enumerate(label.read_text().splitlines() if label.is_file() else [], 1):
+            if not line.strip():
+                continue
+            try:
+                kind, *points = line.split()
+                name = COCO_NAMES[int(kind)]
+                polygon = np.array(points, np.float64).reshape(-1, 2) * [rgb.shape[1], rgb.shape[0]]
+            except (ValueError, IndexError) as error:
+                raise SegmentationError(f"{label} line {number} is no polygon label: {error}",
+                                        "expected class x1 y1 x2 y2 ...") from error  # fmt: skip
+            masks.append(_fill([polygon], rgb.shape[:2]))
+            names.append(name)
+        return _labelled(rgb, masks, names)
+
+
+def _files_digest(paths: list[Path]) -> str:
+    return digest([(str(path), path.stat().st_size) for path in paths if path.is_file()])
+
+
+def _read(path: Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise SegmentationError(f"cannot read the image {path}", "it is missing or damaged")
+    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+
+
+def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]) -> LabelledImage:
+    stack = np.stack(masks) if masks else np.zeros((0, *rgb.shape[:2]), bool)
+    visible = np.asarray(stack.any(axis=(1, 2)))
+    kept = tuple(name for name, seen in zip(names, visible.tolist(), strict=True) if seen)
+    return LabelledImage(rgb, stack[visible], kept)
+
+
+def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels at least half covered by the union of polygons (x, y in pixels, the image's corner is 0, 0)."""
+    mask = np.zeros(shape, bool)
+    for polygon in polygons:
+        low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int) if len(polygon) >= 3 else np.zeros(2, int)
+        high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int) if len(polygon) >= 3 else low
+        if (high <= low).any():
+            continue
+        size = (high - low) * FINER  # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
+        fine = np.zeros((size[1], size[0]), np.uint8)
+        cv2.fillPoly(fine, [np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)], 255, shift=4)
+        whole = cv2.resize(fine, (high - low).tolist(), interpolation=cv2.INTER_AREA)
+        mask[low[1] : high[1], low[0] : high[0]] |= whole >= 128
+    return mask
+
+
+def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
+    if isinstance(segmentation, list):
+        return _fill([np.array(points, np.float64).reshape(-1, 2) for points in segmentation], shape)
+    if isinstance(segmentation, dict) and "counts" in segmentation and "size" in segmentation:
+        counts = segmentation["counts"]
+        runs = decode_runs(counts) if isinstance(counts, str) else [int(count) for count in counts]
+        height, width = (int(value) for value in segmentation["size"])
+        flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+        if (height, width) == tuple(shape) and flat.size == height * width:
+            return np.ascontiguousarray(flat.reshape(width, height).T)
+        raise SegmentationError(f"{where}: a mask of {width}x{height} with {flat.size} pixels, the image is "
+                                f"{shape[1]}x{shape[0]}")  # fmt: skip
+    raise SegmentationError(f"{where}: a segmentation is neither polygons nor run lengths")
+
+
+def decode_runs(text: str) -> list[int]:
+    """COCO's compressed run lengths: base-32 digits, least first, differences to the run two before."""
+    runs: list[int] = []
+    position = 0
+    while position < len(text):
+        value = shift = 0
+        while True:
+            digit = ord(text[position]) - 48
+            position += 1
+            value |= (digit & 0x1F) << shift
+            shift += 5
+            if not digit & 0x20:
+                if digit & 0x10:
+                    value |= -1 << shift
+                break
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+    return runs

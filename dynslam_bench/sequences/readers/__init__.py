@@ -1,0 +1,1 @@
+"""Readers of recorded sequences, one layout a file."""

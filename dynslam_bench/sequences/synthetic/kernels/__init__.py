@@ -1,0 +1,1 @@
+"""The renderer's compiled kernels and its two sensors."""

@@ -1,0 +1,1 @@
+"""Rendered people: their bodies and what they do."""

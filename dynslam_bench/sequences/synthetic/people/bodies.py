@@ -1,0 +1,305 @@
+"""People of articulated volumes: a skeleton by forward kinematics, clothed with round cones and ellipsoids."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.seeding import stream
+
+from ..scenes.parts import ROUND_CONE, Parts, along, turn
+from ..scenes.plan import pick, pick_one
+
+Array = NDArray[np.float64]
+_X = np.array([1.0, 0.0, 0.0])
+_Y = np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Person:
+    """What does not change about a person: size, build, colours and clothes."""
+
+    instance: int
+    height: float
+    build: float
+    skin: Array
+    hair: Array
+    trousers: Array
+    shoes: Array
+    shirt: str
+    shirt_tint: Array
+    long_hair: bool
+    long_sleeves: bool
+    cap: bool
+
+
+@dataclass(frozen=True)
+class Posture:
+    """What a person does at one time.
+
+    Attributes:
+        x: Place on the floor, metres.
+        y: Place on the floor, metres.
+        facing: Direction of the body in degrees; 0 looks along +y, counter-clockwise.
+        stride: Phase of the gait in radians.
+        gait: 0 stands, 1 walks at full stride.
+        sit: 0 stands, 1 sits.
+        gesture: 0 arms at rest, 1 lively.
+        clock: Seconds, drives gestures, breathing and sway.
+    """
+
+    x: float
+    y: float
+    facing: float
+    stride: float
+    gait: float
+    sit: float
+    gesture: float
+    clock: float
+
+
+def draw_person(instance: int, index: int) -> Person:
+    """The `index`-th person (0 or 1) of an instance; the first always wears plaid, the other any pattern."""
+    rng = stream(instance, "synthetic", "person", index)
+    skins = np.array(
+        [
+            [1.0, 0.84, 0.74],
+            [0.93, 0.74, 0.6],
+            [0.8, 0.6, 0.46],
+            [0.6, 0.42, 0.31],
+            [0.98, 0.8, 0.68],
+            [0.45, 0.31, 0.23],
+        ]
+    )
+    hairs = np.array(
+        [
+            [0.1, 0.08, 0.07],
+            [0.3, 0.19, 0.11],
+            [0.52, 0.36, 0.2],
+            [0.16, 0.11, 0.08],
+            [0.62, 0.5, 0.3],
+            [0.45, 0.43, 0.42],
+        ]
+    )
+    shirt = (
+        ("plaid:0", "plaid:1")[index]
+        if index == 0
+        else ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")[pick_one(rng, instance, list(range(6)))]
+    )
+    return Person(
+        instance=index + 1,
+        height=pick(rng, instance, 1.62, 1.88),
+        build=pick(rng, instance, 0.92, 1.12),
+        skin=skins[pick_one(rng, instance, list(range(6)))],
+        hair=hairs[pick_one(rng, instance, list(range(6)))] * (0.8 + 0.4 * rng.random()),
+        trousers=np.array([[0.25, 0.32, 0.5], [0.2, 0.21, 0.25], [0.55, 0.48, 0.37], [0.32, 0.34, 0.3]])[
+            pick_one(rng, instance, list(range(4)))
+        ]
+        * (0.85 + 0.3 * rng.random()),
+        shoes=0.12 + 0.3 * rng.random() * np.ones(3),
+        shirt=shirt,
+        shirt_tint=np.clip(1.0 - 0.1 * rng.random(3), 0, 1),
+        long_hair=bool(rng.random() < 0.4),
+        long_sleeves=bool(rng.random() < 0.6),
+        cap=bool(rng.random() < 0.15),
+    )
+
+
+def _pitch(angle: float) -> Array:
+    """About the person's right-hand axis; positive swings a hanging limb forward."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def _roll(angle: float) -> Array:
+    """About the person's forward axis; positive swings a hanging limb to the left (-x)."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def _yaw(angle: float) -> Array:
+    return turn(math.degrees(angle))
+
+
+def add_person(parts: Parts, who: Person, how: Posture) -> None:
+    """Add the person's primitives, always as many and in the same order."""
+    k, b = who.height / 1.75, who.build
+    thigh, shin, foot = 0.43 * k, 0.41 * k, 0.085 * k
+    spine, upper, fore = 0.46 * k, 0.29 * k, 0.26 * k
+    phase, gait, sit, lively, t = how.stride, how.gait, how.sit, how.gesture, how.clock
+    seed = 1.7 * who.instance
+
+    def wave(f: float, p: float) -> float:
+        return math.sin(2 * math.pi * f * t + p + seed)
+
+    # Legs: hip and knee angles of the gait, blended with sitting; the pelvis rests on the lower foot or on the seat.
+    hips, knees = [], []
+    for side in (-1, 1):
+        swing = phase + (0.0 if side < 0 else math.pi)
+        hip = gait * (0.08 + 0.46 * math.sin(swing))
+        knee = gait * (0.12 + 0.85 * max(0.0, math.cos(swing)) ** 2) + 0.03
+        hips.append(hip * (1 - sit) + sit * (1.45 + 0.03 * side))
+        knees.append(knee * (1 - sit) + sit * (1.35 + 0.12 * side))
+    drop = max(thigh * math.cos(h) + shin * math.cos(h - n) for h, n in zip(hips, knees, strict=True))
+    standing = drop + foot
+    seat = 0.485 + 0.085 * b
+    pelvis_z = standing * (1 - sit) + sit * seat
+    body = turn(how.facing)
+    sway = (1 - gait) * (1 - 0.85 * sit)
+    supple = 1 - 0.8 * sit  # who sits leans back: arms and head go on, the trunk hardly moves
+    root = np.array([how.x, how.y, pelvis_z]) + body @ np.array(
+        [0.012 * sway * wave(0.31, 0.0), 0.012 * sway * wave(0.23, 2.0), 0.0]
+    )
+    twist = gait * 0.1 * math.sin(phase) + supple * lively * 0.12 * wave(0.27, 0.4)
+    lean = 0.05 * gait + sit * 0.06 + supple * (0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2))
+    trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * supple * wave(0.17, 0.7))
+    hipline = body @ _yaw(-twist)
+    jeans: dict[str, Any] = {"instance": who.instance, "texture": "denim", "repeat": (2.0, 3.0), "tint": who.trousers}
+    shirt: dict[str, Any] = {"instance": who.instance, "texture": who.shirt, "tint": who.shirt_tint}
+    bare: dict[str, Any] = {"instance": who.instance, "texture": "plain", "tint": who.skin}
+
+    def limb(a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> None:
+        """A round cone from a to c; its section is `flat` times as wide across `side`'s normal."""
+        rotation, length = along(a, c, side)
+        parts.add(ROUND_CONE, rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
+
+    def ball(centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any) -> None:
+        parts.add(ROUND_CONE, rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
+
+    # Trunk: pelvis, belly, chest, shoulders; wider than deep.
+    right = trunk @ _X
+    limb(
+        root + hipline @ np.array([-0.055 * k, 0, 0.01]),
+        root + hipline @ np.array([0.055 * k, 0, 0.01]),
+        0.115 * k * b,
+        0.115 * k * b,
+        hipline @ np.array([0.0, 0.0, 1.0]),
+        0.95,
+        **jeans,
+    )
+    waist = root + trunk @ np.array([0.0, 0.0, 0.08 * k])
+    chest = root + trunk @ np.array([0.0, 0.005, 0.36 * k])
+    neck = root + trunk @ np.array([0.0, -0.005, spine + 0.05 * k])
+    limb(waist, chest, 0.148 * k * b, 0.168 * k * b, right, 0.68, repeat=(5.0, 6.0), **shirt)
+    limb(
+        chest - right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
+        chest + right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
+        0.088 * k * b,
+        0.088 * k * b,
+        trunk @ _Y,
+        1.0,
+        repeat=(3.0, 6.0),
+        **shirt,
+    )
+    # Neck and head, which looks about.
+    skull = neck + trunk @ np.array([0.0, 0.015 * k, 0.15 * k])
+    head = (
+        trunk
+        @ _yaw(0.3 * wave(0.13, 0.9) * (1 - gait) + 0.1 * lively * wave(0.4, 0.1))
+        @ _pitch(0.06 * wave(0.29, 0.3) - 0.03)
+    )
+    limb(
+        neck - trunk @ np.array([0, 0, 0.04 * k]),
+        skull - trunk @ np.array([0, 0.01, 0.03 * k]),
+        0.058 * k,
+        0.052 * k,
+        right,
+        **bare,
+    )
+    ball(
+        skull,
+        head,
+        (0.077 * k, 0.098 * k, 0.122 * k),
+        instance=who.instance,
+        texture="face",
+        tint=who.skin,
+        repeat=(1.0, 0.5),
+        shift=(0.5, 0.5),
+    )
+    ball(skull + head @ np.array([0, 0.092 * k, -0.012 * k]), head, (0.015 * k, 0.022 * k, 0.026 * k), **bare)
+    for side in (-1, 1):
+        ball(
+            skull + head @ np.array([side * 0.077 * k, -0.005, -0.01]), head, (0.012 * k, 0.024 * k, 0.033 * k), **bare
+        )
+    mane: dict[str, Any] = {"instance": who.instance, "texture": "hair", "repeat": (3.0, 0.5), "tint": who.hair}
+    ball(
+        skull + head @ np.array([0, -0.018 * k, 0.03 * k]),
+        head @ _pitch(0.35),
+        (0.086 * k, 0.101 * k, 0.108 * k),
+        **mane,
+    )
+    if who.long_hair:
+        limb(
+            skull + head @ np.array([0, -0.06, 0.0]),
+            skull + head @ np.array([0, -0.075, -0.15 * k]),
+            0.075 * k,
+            0.055 * k,
+            head @ _X,
+            0.6,
+            **{**mane, "repeat": (4.0, 2.0)},
+        )
+    if who.cap:
+        ball(
+            skull + head @ np.array([0, 0.01, 0.075 * k]),
+            head @ _pitch(0.15),
+            (0.088 * k, 0.108 * k, 0.065 * k),
+            **{**mane, "tint": who.trousers},
+        )
+        ball(
+            skull + head @ np.array([0, 0.12 * k, 0.06 * k]),
+            head,
+            (0.07 * k, 0.06 * k, 0.008 * k),
+            **{**mane, "tint": who.trousers},
+        )
+    for index, side in enumerate((-1, 1)):
+        # Arms: counter-swing of the gait, gestures with the hands before the chest, hands on the lap when sitting.
+        swing = phase + (math.pi if side < 0 else 0.0)
+        talk = lively * (0.5 + 0.5 * wave(0.11, 1.5 * side)) ** 0.7
+        pitch = (
+            gait * 0.42 * math.sin(swing)
+            + sit * (1 - talk) * 0.35
+            + talk * (0.45 + 0.35 * wave(0.47 + 0.06 * side, side))
+        )
+        abduct = side * (0.14 + 0.05 * (1 - gait) + talk * (0.12 + 0.15 * wave(0.33, 2.0 * side)))
+        bend = (
+            0.2
+            + gait * (0.25 + 0.15 * math.sin(swing))
+            + sit * (1 - talk) * 0.95
+            + talk * (1.35 + 0.5 * wave(0.61, 1.1 * side))
+        )
+        shoulder = neck + trunk @ np.array([side * 0.185 * k * b, 0.0, -0.055 * k])
+        arm = trunk @ _roll(-abduct) @ _pitch(pitch)
+        elbow = shoulder + arm @ np.array([0, 0, -upper])
+        lower = arm @ _roll(side * 0.35 * min(bend, 1.0)) @ _pitch(bend)
+        wrist = elbow + lower @ np.array([0, 0, -fore])
+        limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, arm @ _Y, repeat=(2.0, 6.0), **shirt)
+        if who.long_sleeves:
+            limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, lower @ _Y, repeat=(2.0, 6.0), **shirt)
+        else:
+            limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, lower @ _Y, **bare)
+        hand = lower @ _pitch(0.25 * wave(0.7, side))
+        ball(wrist + hand @ np.array([0, 0.005, -0.055 * k]), hand, (0.022 * k, 0.038 * k, 0.058 * k), **bare)
+        ball(
+            wrist + hand @ np.array([0.0, 0.035 * k, -0.035 * k]),
+            hand @ _pitch(0.6),
+            (0.011 * k, 0.013 * k, 0.034 * k),
+            **bare,
+        )
+        # Legs.
+        joint = root + hipline @ np.array([side * 0.095 * k * b, 0.0, -0.01])
+        upper_leg = hipline @ _roll(-side * (0.02 + 0.1 * sit)) @ _pitch(hips[index])
+        knee_at = joint + upper_leg @ np.array([0, 0, -thigh])
+        lower_leg = upper_leg @ _pitch(-knees[index])
+        ankle = knee_at + lower_leg @ np.array([0, 0, -shin])
+        limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, upper_leg @ _Y, **jeans)
+        limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, lower_leg @ _Y, **jeans)
+        ground = hipline @ _pitch((hips[index] - knees[index]) * 0.6 * (1 - sit))
+        heel, toe = (
+            ankle + ground @ np.array([0, -0.03, -0.035 * k]),
+            ankle + ground @ np.array([0, 0.15 * k, -0.05 * k]),
+        )
+        limb(heel, toe, 0.045 * k, 0.034 * k, ground @ _X, 0.95, instance=who.instance, texture="plain", tint=who.shoes)

@@ -1,0 +1,1 @@
+"""What is rendered: the room, its furniture and textures, and the ways of the camera."""

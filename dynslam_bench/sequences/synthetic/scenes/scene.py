@@ -1,0 +1,153 @@
+"""A scene: the room's primitives, those of people and chairs at any time, and their motion between two times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.seeding import stream
+
+from ..people.bodies import add_person, draw_person
+from ..people.script import chair_place, posture, write_script
+from ..settings import FPS, RenderSettings, SyntheticId
+from . import textures
+from .camera_paths import camera_poses
+from .furniture import add_chair
+from .parts import QUAD, ROUND_CONE, Parts, turn
+from .plan import plan_room
+from .room import build_room
+
+Array = NDArray[np.float64]
+
+CLASS_NAMES = {1: "person", 2: "person", 3: "chair", 4: "chair"}
+MOVED_M = 5e-4
+"""An instance moves in a frame if a point of it has moved by more than this since the previous frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """All primitives at one time: world placement, and the map from the camera to each local frame.
+
+    Attributes:
+        T_world_cam: The camera's pose.
+        rotation: ``[P, 3, 3]`` local (scaled) to world.
+        origin: ``[P, 3]``.
+        local: ``[P, 12]`` row-major 3x4 map of points of the camera frame into the local frame.
+    """
+
+    T_world_cam: Array
+    rotation: Array
+    origin: Array
+    local: Array
+
+
+class _Poses(Parts):
+    """Collects the placement only; everything else is known from the first time."""
+
+    def add(self, kind: int, rotation: Array, origin: Array, *_: object, **__: object) -> None:
+        self.rotation.append(rotation)
+        self.origin.append(origin)
+
+
+class Scene:
+    """Everything of a sequence that does not depend on pixels.
+
+    Args:
+        sequence: Which sequence.
+        settings: Renderer settings; only `people` matters here.
+    """
+
+    def __init__(self, sequence: SyntheticId, settings: RenderSettings) -> None:
+        self.id = sequence
+        self.mode = settings.people
+        self.plan = plan_room(sequence.instance)
+        self.script = write_script(sequence.people, sequence.instance)
+        self.cast = [draw_person(sequence.instance, k) for k in range(2)]
+        room = build_room(sequence.instance, self.plan)
+        self._chairs = []
+        for k in range(2):
+            chair = Parts()
+            add_chair(chair, 3 + k, self.plan.tints["chair"] * (1.0 if k == 0 else 0.8), self.plan.tints["metal"])
+            self._chairs.append((np.stack(chair.rotation), np.stack(chair.origin)))
+            for name in ("kind", "rotation", "origin", "scale", "shape", "instance", "texture", "uv", "tint"):
+                getattr(room, name).extend(getattr(chair, name))
+        self.fixed = len(room) - sum(len(origin) for _, origin in self._chairs)
+        if self.mode != "none":
+            for person, keys in zip(self.cast, self.script.people, strict=True):
+                add_person(room, person, posture(keys, self.script.period, 0.0))
+        self.kind = np.array(room.kind, np.int32)
+        self.scale, self.shape = np.stack(room.scale), np.stack(room.shape)
+        self.instance = np.array(room.instance, np.int32)
+        self.uv, self.tint = np.stack(room.uv), np.stack(room.tint)
+        self._fixed_rotation = np.stack(room.rotation[: self.fixed])
+        self._fixed_origin = np.stack(room.origin[: self.fixed])
+        names = sorted({name for row in room.texture for name in row})
+        index = {name: i for i, name in enumerate(names)}
+        self.texture = np.array([[index[name] for name in row] for row in room.texture], np.int32)
+        self.texture_names = names
+        self.corners = self._corners()
+
+    def atlas(self) -> textures.Atlas:
+        """The instance's textures."""
+        images = {}
+        for name in self.texture_names:
+            maker = textures.MAKERS[name.partition(":")[0]]
+            images[name] = maker(stream(self.id.instance, "synthetic", "texture", name))
+        return textures.build_atlas(images)
+
+    def poses(self, times: Array) -> Array:
+        """Camera-to-world poses ``[N, 4, 4]``."""
+        return camera_poses(self.id.motion, self.id.people, self.id.instance, times)
+
+    def place(self, time: float) -> tuple[Array, Array]:
+        """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start)."""
+        t = 0.0 if self.mode == "frozen" else time
+        parts = _Poses()
+        if self.mode != "none":
+            for person, keys in zip(self.cast, self.script.people, strict=True):
+                add_person(parts, person, posture(keys, self.script.period, t))
+        rotations, origins = [self._fixed_rotation], [self._fixed_origin]
+        for (rotation, origin), path in zip(self._chairs, self.script.chairs, strict=True):
+            x, y, facing = chair_place(path, self.script.period, 0.0 if self.mode == "none" else t)
+            body = turn(facing + 180.0)
+            rotations.append(body @ rotation)
+            origins.append(origin @ body.T + (x, y, 0.0))
+        if parts.rotation:
+            rotations.append(np.stack(parts.rotation))
+            origins.append(np.stack(parts.origin))
+        return np.concatenate(rotations), np.concatenate(origins)
+
+    def snapshot(self, time: float) -> Snapshot:
+        """The scene as the camera sees it at a time (seconds from the start)."""
+        pose = self.poses(np.array([time]))[0]
+        rotation, origin = self.place(time)
+        inverse = np.swapaxes(rotation, 1, 2) / self.scale[:, :, None]
+        local = np.empty((len(origin), 3, 4))
+        local[:, :, :3] = inverse @ pose[:3, :3]
+        local[:, :, 3] = (inverse @ (pose[:3, 3] - origin)[:, :, None])[:, :, 0]
+        return Snapshot(pose, rotation, origin, np.ascontiguousarray(local.reshape(-1, 12)))
+
+    def moving(self, index: int) -> frozenset[int]:
+        """Instances with a point that moved by more than `MOVED_M` since the previous frame; frame 0 has none."""
+        if index == 0 or self.mode != "moving":
+            return frozenset()
+        before, after = self.place((index - 1) / FPS), self.place(index / FPS)
+        box = self.corners[:, :, :] * self.scale[:, None, :]
+        moved = np.linalg.norm(
+            box @ np.swapaxes(after[0] - before[0], 1, 2) + (after[1] - before[1])[:, None, :], axis=2
+        ).max(axis=1)
+        return frozenset(int(k) for k in np.unique(self.instance[moved > MOVED_M]) if k > 0)
+
+    def _corners(self) -> Array:
+        """Corners ``[P, 8, 3]`` of each primitive's box in its local frame."""
+        low, high = -self.shape.copy(), self.shape.copy()
+        low[self.kind == QUAD, 2] = high[self.kind == QUAD, 2] = 0.0
+        cones = self.kind == ROUND_CONE
+        h, r1, r2 = self.shape[cones].T
+        radius = np.maximum(r1, r2)
+        low[cones] = np.stack([-radius, -radius, np.minimum(-r1, h - r2)], 1)
+        high[cones] = np.stack([radius, radius, np.maximum(h + r2, r1)], 1)
+        choose = np.array([[(i >> a) & 1 for a in range(3)] for i in range(8)], dtype=bool)
+        return np.where(choose[None], high[:, None, :], low[:, None, :])

@@ -1,0 +1,1 @@
+"""Local bundle adjustment: the own solver, and gtsam as its reference."""

@@ -1,0 +1,1 @@
+"""Where is this frame? First pose, local map, pose, relocalisation."""

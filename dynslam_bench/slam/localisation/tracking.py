@@ -1,0 +1,174 @@
+"""Where is this frame? Matching against the last frame and the map, and the pose that follows.
+
+All functions are pure: they read the map and never change it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.features.matching import rotation_consistent, search_in_radius
+from dynslam_bench.geometry import se3
+
+from ..mapping.map import Map
+from ..settings import TrackingSettings
+from .observation import Observations
+from .pose import PoseEstimate, optimise_pose
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
+
+
+ENOUGH_FIRST = 20
+"""Matches with the last frame that make a second, wider search unnecessary (ORB-SLAM2's number)."""
+
+
+@dataclass(eq=False)
+class Tracked:
+    """A frame with a pose, kept until the next one was tracked.
+
+    Attributes:
+        seen: Its features.
+        point: int64 ``[N]``, slot of the map point that each feature observes (inliers only), or -1.
+        T_cam_world: World-to-camera pose.
+        timestamp: Seconds.
+    """
+
+    seen: Observations
+    point: Slots
+    T_cam_world: Array
+    timestamp: float
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Features of the new frame and the world points that they may show.
+
+    Attributes:
+        feature: int64 ``[M]``, feature of the new frame.
+        point: int64 ``[M]``, map slot, or -1 for a point that only the last frame's depth gives.
+        position: World points ``[M, 3]``, metres.
+    """
+
+    feature: Slots
+    point: Slots
+    position: Array
+
+    def __len__(self) -> int:
+        return len(self.feature)
+
+    def select(self, index: NDArray[np.bool_]) -> Matches:
+        """The matches of a mask."""
+        return Matches(self.feature[index], self.point[index], self.position[index])
+
+    def joined(self, other: Matches) -> Matches:
+        """These matches, then the others."""
+        return Matches(
+            np.concatenate([self.feature, other.feature]), np.concatenate([self.point, other.point]),
+            np.concatenate([self.position, other.position]),
+        )  # fmt: skip
+
+
+def match_last_frame(
+    world: Map, last: Tracked, seen: Observations, T_cam_world: Array, radius_px: float, close_m: float,
+    max_distance: int,
+) -> Matches:  # fmt: skip
+    """Look for the last frame's points around their projections into the new frame.
+
+    Beside map points these are points that only the last frame's depth gives, nearer than `close_m`.
+
+    Args:
+        world: The map.
+        last: The last tracked frame.
+        seen: The new frame's features.
+        T_cam_world: Predicted pose of the new frame.
+        radius_px: Half side of the window at octave 0; it grows with the feature's scale.
+        close_m: Depth below which the last frame's own depth is used, metres; 0 to use map points alone.
+        max_distance: Largest Hamming distance.
+    """
+    camera = world.camera
+    from_map = last.point >= 0
+    from_depth = ~from_map & (last.seen.z > 0) & (last.seen.z < close_m)
+    rows = np.flatnonzero(from_map | from_depth)
+    position = np.zeros((len(rows), 3))
+    mapped = from_map[rows]
+    position[mapped] = world.position[last.point[rows[mapped]]]
+    own = rows[~mapped]
+    position[~mapped] = se3.transform(
+        se3.inverse(last.T_cam_world), camera.unproject(last.seen.xy[own], last.seen.z[own])
+    )
+    local = se3.transform(T_cam_world, position)
+    ahead = local[:, 2] > 0.05
+    uv = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+    margin = 8.0
+    inside = (
+        ahead & (uv[:, 0] >= -margin) & (uv[:, 0] < camera.width + margin) & (uv[:, 1] >= -margin)
+        & (uv[:, 1] < camera.height + margin)
+    )  # fmt: skip
+    rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
+    octave = last.seen.octave[rows]
+    found, _ = search_in_radius(
+        seen.grid, seen.arrays, np.ones(len(seen), bool),
+        (uv, uv[:, 0] - camera.fx * camera.baseline_m / depth, radius_px * world.scales[octave]),
+        (octave - 1, octave + 1), last.seen.words[rows], max_distance=max_distance, ratio=0.9,
+    )  # fmt: skip
+    hit = found >= 0
+    rows, position, found = rows[hit], position[hit], found[hit]
+    steady = rotation_consistent(last.seen.angle[rows], seen.angle[found])
+    return Matches(found[steady], last.point[rows[steady]], position[steady])
+
+
+def match_map(
+    world: Map, seen: Observations, T_cam_world: Array, known: Matches, candidates: Slots, settings: TrackingSettings,
+    widen: float = 1.0,
+) -> tuple[Matches, Slots]:  # fmt: skip
+    """Look for map points in view among the features that have no match yet.
+
+    Args:
+        world: The map.
+        seen: The new frame's features.
+        T_cam_world: Its pose so far.
+        known: Matches already found; their features and points are left alone.
+        candidates: Slots of the points to look for.
+        settings: Radius and descriptor distances.
+        widen: Factor on the radius.
+
+    Returns:
+        New matches, and the slots of all candidates in view (whether found or not).
+    """
+    points, uv, right, octave, cosine = world.project(T_cam_world, candidates)
+    taken = np.zeros(world.alive.size, bool)
+    taken[known.point[known.point >= 0]] = True
+    free = np.ones(len(seen), bool)
+    free[known.feature] = False
+    rest = ~taken[points]
+    radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
+    wanted = points[rest]
+    found, _ = search_in_radius(
+        seen.grid, seen.arrays, free, (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1),
+        world.words[wanted], max_distance=settings.max_distance, ratio=settings.ratio,
+    )  # fmt: skip
+    hit = found >= 0
+    return Matches(found[hit], wanted[hit], world.position[wanted[hit]]), points
+
+
+def solve(world: Map, seen: Observations, matches: Matches, T_cam_world: Array, *, rounds: int = 4) -> PoseEstimate:
+    """The pose that fits the matches, starting from a given one."""
+    f = matches.feature
+    return optimise_pose(
+        T_cam_world, matches.position, seen.xy[f], seen.right[f], seen.info[f], seen.info_right[f], world.camera,
+        rounds=rounds,
+    )  # fmt: skip
+
+
+def local_points(world: Map, known: Matches, mode: str, limit: int = 80) -> Slots:
+    """Which map points to look for: all, or those that keyframes see which share points with the known matches."""
+    if mode == "all":
+        return world.points
+    near, _ = world.covisible_of(known.point)
+    near = near[:limit]
+    points = np.unique(world.kf_point[near])
+    return points[points >= 0].astype(np.int64)

@@ -1,0 +1,1 @@
+"""The map and what a new keyframe does to it."""

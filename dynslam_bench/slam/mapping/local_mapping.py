@@ -1,0 +1,283 @@
+"""Local mapping: what a new keyframe does to the map."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.features.matching import CellGrid, search_in_radius
+from dynslam_bench.geometry import se3
+
+from ..bundle.schur import BundleProblem, adjust_bundle
+from ..localisation.observation import Observations
+from ..settings import BackendSettings, BundleAdjustmentSettings
+from .map import Map
+from .triangulation import triangulate
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
+
+
+class LocalMapper:
+    """Adds keyframes to the map and keeps it clean and consistent.
+
+    Args:
+        world: The map to work on.
+        settings: Of the back end.
+    """
+
+    def __init__(self, world: Map, settings: BackendSettings) -> None:
+        self.world = world
+        self.settings = settings
+        self.merged: dict[int, int] = {}
+        """Points that the last `insert` replaced by others."""
+        self.dropped: list[tuple[int, int, Array]] = []
+        """Keyframes that the last `insert` removed: slot, heir's slot, and the pose ``T_dropped_heir``."""
+        self._young: Slots = np.zeros(0, np.int64)
+
+    @property
+    def close_m(self) -> float:
+        """Depth below which a point is close, metres."""
+        return self.settings.tracking.close_factor * self.world.camera.baseline_m
+
+    def insert(
+        self, seen: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float
+    ) -> tuple[int, dict[str, float]]:
+        """Make a frame a keyframe: new points, fusion, bundle adjustment, culling.
+
+        Args:
+            seen: The frame's features.
+            point: Map slot that each feature observes, or -1.
+            T_cam_world: The frame's pose.
+            frame: Index of the frame.
+            stamp: Its timestamp.
+
+        Returns:
+            The keyframe's slot, and the seconds spent on ``mapping`` and ``bundle_adjustment``.
+        """
+        begin = perf_counter()
+        world = self.world
+        self.merged.clear()
+        self.dropped.clear()
+        first = world.keyframe_count == 0
+        slot = world.add_keyframe(seen, T_cam_world, frame, stamp)
+        features = np.flatnonzero(point >= 0)
+        world.observe(slot, features, point[features])
+        world.refresh(np.unique(world.kf_point[slot, features][world.kf_point[slot, features] >= 0]).astype(np.int64))
+        self._cull_points()
+        self._points_from_depth(slot, seen, everything=first)
+        adjusted = 0.0
+        if not first:
+            neighbours, _ = world.covisible(slot)
+            neighbours = neighbours[: self.settings.mapping.neighbours]
+            share = np.count_nonzero((seen.z > 0) & (seen.z < self.close_m)) / max(len(seen), 1)
+            if share < self.settings.mapping.triangulate_below:
+                self._points_from_views(slot, seen, neighbours)
+            self._fuse(slot, neighbours)
+            start = perf_counter()
+            if self.settings.bundle_adjustment.enabled:
+                self._adjust(slot)
+            adjusted = perf_counter() - start
+            self._cull_keyframes(slot)
+        return slot, {"mapping": perf_counter() - begin - adjusted, "bundle_adjustment": adjusted}
+
+    # ------------------------------------------------------------------ points
+
+    def _points_from_depth(self, slot: int, seen: Observations, *, everything: bool) -> None:
+        """Points for features without one: all close ones, and the nearest hundred in any case."""
+        world = self.world
+        n = len(seen)
+        free = np.flatnonzero((world.kf_point[slot, :n] < 0) & (seen.z > 0))
+        if not len(free):
+            return
+        free = free[np.argsort(seen.z[free], kind="stable")]
+        if not everything:
+            close = int(np.count_nonzero(seen.z[free] < self.close_m))
+            free = free[: max(close, min(len(free), 100))]
+        local = world.camera.unproject(seen.xy[free], seen.z[free])
+        position = se3.transform(world.T_world_cam(slot), local)
+        created = world.add_points(position, seen.rgb[free], slot, free)
+        world.refresh(created)
+        self._young = np.concatenate([self._young, created])
+
+    def _points_from_views(self, slot: int, seen: Observations, neighbours: Slots) -> None:
+        """Points for features that have no point yet, by triangulation with the neighbours."""
+        world = self.world
+        for other in neighbours.tolist():
+            ours, theirs, position = triangulate(world, slot, other, self.settings.mapping.min_parallax_deg)
+            if len(ours):
+                created = world.add_points(position, seen.rgb[ours], slot, ours)
+                world.observe(other, theirs, created)
+                world.refresh(created)
+                self._young = np.concatenate([self._young, created])
+
+    def _cull_points(self) -> None:
+        """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
+        world, s = self.world, self.settings.mapping
+        young = self._young[world.alive[self._young]]
+        age = world.next_keyframe - 1 - world.born[young]
+        poor = world.found[young] < s.min_found_ratio * world.visible[young]
+        lonely = (age >= 2) & (world.n_obs[young] < s.min_observations)
+        bad = poor | lonely
+        world.remove_points(young[bad])
+        self._young = young[~bad & (age < 3)]
+
+    # ------------------------------------------------------------------ fusion
+
+    def _fuse(self, slot: int, neighbours: Slots) -> None:
+        """Find the new keyframe's points in its neighbours and theirs in it; merge what is one thing."""
+        world = self.world
+        n = int(world.kf_count[slot])
+        for other in neighbours.tolist():
+            own = world.kf_point[slot, :n]
+            self._fuse_into(other, np.unique(own[own >= 0]).astype(np.int64))
+        theirs = world.kf_point[neighbours]
+        self._fuse_into(slot, np.unique(theirs[theirs >= 0]).astype(np.int64))
+        own = world.kf_point[slot, :n]
+        world.refresh(np.unique(own[own >= 0]).astype(np.int64))
+
+    def _fuse_into(self, keyframe: int, candidates: Slots) -> None:
+        world = self.world
+        n = int(world.kf_count[keyframe])
+        seen_here = np.zeros(world.alive.size, bool)
+        here = world.kf_point[keyframe, :n]
+        seen_here[here[here >= 0]] = True
+        candidates = candidates[world.alive[candidates] & ~seen_here[candidates]]
+        points, uv, right, octave, _ = world.project(world.kf_pose[keyframe], candidates)
+        if not len(points):
+            return
+        xy = world.kf_xy[keyframe, :n]
+        grid = CellGrid.of(xy, world.camera.width, world.camera.height)
+        arrays = (
+            xy, world.kf_right[keyframe, :n], world.kf_octave[keyframe, :n].astype(np.int64),
+            world.kf_words[keyframe, :n],
+        )  # fmt: skip
+        found, _ = search_in_radius(
+            grid, arrays, np.ones(n, bool), (uv, right, 3.0 * world.scales[octave]), (octave - 1, octave + 1),
+            world.words[points], max_distance=50,
+        )  # fmt: skip
+        hit = found >= 0
+        points, found = points[hit], found[hit]
+        residual = ((xy[found] - uv[hit]) ** 2).sum(axis=1) / world.scales[arrays[2][found]] ** 2
+        good = residual < 5.991
+        points, found = points[good], found[good]
+        empty = here[found] < 0
+        world.observe(keyframe, found[empty], points[empty])
+        for feature, point in zip(found[~empty].tolist(), points[~empty].tolist(), strict=True):
+            rival = int(world.kf_point[keyframe, feature])
+            if rival < 0 or rival == point or not world.alive[point]:
+                continue
+            if world.n_obs[rival] > world.n_obs[point]:
+                self._merge(point, rival)
+            else:
+                self._merge(rival, point)
+
+    def _merge(self, old: int, new: int) -> None:
+        self.world.merge(old, new)
+        self.merged[old] = new
+
+    # ------------------------------------------------------------------ bundle adjustment
+
+    def _adjust(self, slot: int) -> None:
+        world = self.world
+        chosen = choose_bundle(world, slot, self.settings.bundle_adjustment)
+        if chosen is None:
+            return
+        problem, poses, points, features = chosen
+        solver = adjust_bundle
+        if self.settings.bundle_adjustment.solver == "gtsam":
+            from ..bundle.with_gtsam import adjust_bundle_gtsam as solver
+        result = solver(problem, self.settings.bundle_adjustment.iterations)
+        if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
+            return
+        for k in range(problem.variable):
+            world.set_pose(int(poses[k]), result.poses[k])
+        world.position[points] = result.points
+        out = ~result.inliers
+        world.unobserve(poses[problem.obs_pose[out]], features[out])
+        world.refresh(points[world.alive[points]])
+
+    # ------------------------------------------------------------------ keyframes
+
+    def _cull_keyframes(self, slot: int) -> None:
+        world, s = self.world, self.settings.keyframes
+        neighbours, _ = world.covisible(slot)
+        newest = world.keyframes[-2:]
+        for other in neighbours.tolist():
+            if world.kf_id[other] == 0 or other in newest:
+                continue
+            total, redundant = world.redundancy(other, self.close_m)
+            if total and redundant > s.redundant_share * total:
+                self.drop_keyframe(other)
+        while world.keyframe_count > s.maximum:
+            shares = []
+            for other in world.keyframes[1:-2].tolist():
+                total, redundant = world.redundancy(other, self.close_m)
+                shares.append((-redundant / max(total, 1), int(world.kf_id[other]), other))
+            self.drop_keyframe(min(shares)[2])
+
+    def drop_keyframe(self, slot: int) -> None:
+        """Remove a keyframe; the heirs of its frames are told through `dropped`."""
+        world = self.world
+        heirs, _ = world.covisible(slot)
+        heir = int(heirs[0]) if len(heirs) else int(world.keyframes[world.keyframes != slot][-1])
+        self.dropped.append((slot, heir, world.kf_pose[slot] @ se3.inverse(world.kf_pose[heir])))
+        world.remove_keyframe(slot)
+
+
+def choose_bundle(
+    world: Map, slot: int, settings: BundleAdjustmentSettings
+) -> tuple[BundleProblem, Slots, Slots, Slots] | None:
+    """The local window around a keyframe, cut to the observation budget.
+
+    Variable are the keyframe and its most covisible ones; fixed are further keyframes that see the same points, and
+    always at least one. The oldest keyframe of all is never variable.
+
+    Returns:
+        The problem, the slots of its poses and points, and the feature number of each observation; None if there is
+        nothing to refine.
+    """
+    near, _ = world.covisible(slot)
+    variable = np.concatenate([[slot], near[: settings.window - 1]]).astype(np.int64)
+    variable = variable[world.kf_id[variable] > 0]
+    if not len(variable):
+        return None
+    table = world.kf_point[variable]
+    counts = np.bincount(table[table >= 0].astype(np.int64), minlength=world.alive.size)
+    points = np.flatnonzero(counts)
+    further, _ = world.covisible_of(points)
+    further = further[~np.isin(further, variable)][: settings.fixed]
+    if not len(further):
+        if len(variable) < 2:
+            return None
+        further, variable = variable[-1:], variable[:-1]
+    poses = np.concatenate([variable, further])
+    rank = np.full(world.kf_alive.size, -1, np.int64)
+    rank[poses] = np.arange(len(poses))
+    n_obs = world.n_obs[points]
+    width = int(n_obs.max())
+    valid = np.arange(width)[None] < n_obs[:, None]
+    keyframe = world.obs_kf[points, :width]
+    pose = np.where(valid, rank[keyframe], -1)
+    used = pose >= 0
+    support = used.sum(axis=1)
+    worth = support >= 2
+    points, pose, used, support = points[worth], pose[worth], used[worth], support[worth]
+    order = np.lexsort((world.id[points], -support))  # long tracks first
+    order = order[np.cumsum(support[order]) <= settings.observations]
+    order.sort()
+    points, pose, used = points[order], pose[order], used[order]
+    if not len(points):
+        return None
+    obs_point, column = np.nonzero(used)
+    obs_pose = pose[obs_point, column]
+    features = world.obs_ft[points[obs_point], column].astype(np.int64)
+    at = poses[obs_pose]
+    problem = BundleProblem(
+        world.kf_pose[poses], len(variable), world.position[points], obs_pose.astype(np.int64),
+        obs_point.astype(np.int64), world.kf_xy[at, features], world.kf_right[at, features],
+        world.kf_info[at, features], world.kf_info_right[at, features], world.camera,
+    )  # fmt: skip
+    return problem, poses, points, features

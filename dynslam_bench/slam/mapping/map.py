@@ -1,0 +1,289 @@
+"""The map: keyframes and points in flat tables, so that compiled loops and numpy run over them without objects.
+
+Keyframes and points live in numbered slots; a freed slot is used again, after the mapping step that freed it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+
+from ..localisation.observation import Observations
+from . import map_kernels as kernels
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
+
+
+def _grown(table: NDArray[np.generic], length: int, axis: int = 0) -> NDArray[np.generic]:
+    shape = list(table.shape)
+    shape[axis] = length
+    bigger = np.zeros(shape, table.dtype)
+    bigger[tuple(slice(0, n) for n in table.shape)] = table
+    return bigger
+
+
+class Map:
+    """Keyframes, points and who observes what.
+
+    Attributes (keyframes, by slot; F is the largest number of features so far):
+        kf_alive, kf_id, kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count,
+        kf_raw ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave,
+        kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``, kf_point ``[S, F]`` (slot of the observed point, -1).
+
+    Attributes (points, by slot):
+        alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
+        the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible, found (frames that should
+        have and did see it), born (id of the keyframe that made it), n_obs, obs_kf and obs_ft ``[M, K]`` (observing
+        keyframe slots and feature numbers, oldest first).
+    """
+
+    def __init__(self, camera: Camera, scales: Array) -> None:
+        self.camera = camera
+        self.scales = np.ascontiguousarray(scales, np.float64)
+        self.next_keyframe = 0
+        self.next_point = 0
+        self._kf_tables: dict[str, tuple[str, tuple[int, ...]]] = {}
+        self._free_points: list[int] = []
+        self._freed_points: list[int] = []
+        self._top = 0
+        self._features = 0
+        self._words = 4
+        self._allocate()
+
+    def _allocate(self) -> None:
+        s, f, w, m, k = 0, self._features, self._words, 0, 8
+        self.kf_alive = np.zeros(s, bool)
+        self.kf_id = np.zeros(s, np.int64)
+        self.kf_frame = np.zeros(s, np.int64)
+        self.kf_stamp = np.zeros(s)
+        self.kf_pose = np.zeros((s, 4, 4))
+        self.kf_centre = np.zeros((s, 3))
+        self.kf_count = np.zeros(s, np.int64)
+        self.kf_raw = np.zeros((s, f, 2), np.float32)
+        self.kf_response = np.zeros((s, f), np.float32)
+        self.kf_xy = np.zeros((s, f, 2))
+        self.kf_right = np.zeros((s, f))
+        self.kf_z = np.zeros((s, f), np.float32)
+        self.kf_octave = np.zeros((s, f), np.int8)
+        self.kf_angle = np.zeros((s, f), np.float32)
+        self.kf_info = np.zeros((s, f))
+        self.kf_info_right = np.zeros((s, f))
+        self.kf_words = np.zeros((s, f, w), np.uint64)
+        self.kf_point = np.zeros((s, f), np.int32)
+        self.alive = np.zeros(m, bool)
+        self.id = np.zeros(m, np.int64)
+        self.position = np.zeros((m, 3))
+        self.normal = np.zeros((m, 3))
+        self.far = np.zeros(m)
+        self.words = np.zeros((m, w), np.uint64)
+        self.rgb = np.zeros((m, 3), np.uint8)
+        self.visible = np.zeros(m, np.int32)
+        self.found = np.zeros(m, np.int32)
+        self.born = np.zeros(m, np.int64)
+        self.n_obs = np.zeros(m, np.int32)
+        self.obs_kf = np.zeros((m, k), np.int32)
+        self.obs_ft = np.zeros((m, k), np.int32)
+
+    _KEYFRAME_TABLES = (
+        "kf_alive", "kf_id", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_raw", "kf_response",
+        "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right", "kf_words", "kf_point",
+    )  # fmt: skip
+    _FEATURE_TABLES = (
+        "kf_raw", "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right",
+        "kf_words", "kf_point",
+    )  # fmt: skip
+    _POINT_TABLES = (
+        "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_kf",
+        "obs_ft",
+    )  # fmt: skip
+
+    # ------------------------------------------------------------------ keyframes
+
+    @property
+    def keyframes(self) -> Slots:
+        """Slots of all keyframes, oldest first."""
+        slots = np.flatnonzero(self.kf_alive)
+        return slots[np.argsort(self.kf_id[slots], kind="stable")]
+
+    @property
+    def keyframe_count(self) -> int:
+        """Number of keyframes."""
+        return int(np.count_nonzero(self.kf_alive))
+
+    def add_keyframe(self, seen: Observations, T_cam_world: Array, frame: int, stamp: float) -> int:
+        """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
+        if seen.words.shape[1] != self._words:
+            if self.next_keyframe:
+                raise ValueError(f"descriptors changed from {self._words} to {seen.words.shape[1]} words")
+            self._words = seen.words.shape[1]
+            self._allocate()
+        n = len(seen)
+        if n > self._features:
+            self._features = n
+            for name in self._FEATURE_TABLES:
+                setattr(self, name, _grown(getattr(self, name), n, axis=1))
+        free = np.flatnonzero(~self.kf_alive)
+        if not len(free):
+            length = max(16, self.kf_alive.size + self.kf_alive.size // 2)
+            free = np.array([self.kf_alive.size])
+            for name in self._KEYFRAME_TABLES:
+                setattr(self, name, _grown(getattr(self, name), length))
+        slot = int(free[0])
+        self.kf_alive[slot] = True
+        self.kf_id[slot] = self.next_keyframe
+        self.next_keyframe += 1
+        self.kf_frame[slot] = frame
+        self.kf_stamp[slot] = stamp
+        self.kf_count[slot] = n
+        self.set_pose(slot, T_cam_world)
+        self.kf_raw[slot, :n] = seen.keypoints.xy
+        self.kf_response[slot, :n] = seen.keypoints.response
+        self.kf_xy[slot, :n] = seen.xy
+        self.kf_right[slot, :n] = seen.right
+        self.kf_z[slot, :n] = seen.z
+        self.kf_octave[slot, :n] = seen.octave
+        self.kf_angle[slot, :n] = seen.angle
+        self.kf_info[slot, :n] = seen.info
+        self.kf_info_right[slot, :n] = seen.info_right
+        self.kf_words[slot, :n] = seen.words
+        self.kf_point[slot] = -1
+        return slot
+
+    def set_pose(self, slot: int, T_cam_world: Array) -> None:
+        """Set a keyframe's world-to-camera pose."""
+        self.kf_pose[slot] = T_cam_world
+        self.kf_centre[slot] = -T_cam_world[:3, :3].T @ T_cam_world[:3, 3]
+
+    def T_world_cam(self, slot: int) -> Array:
+        """A keyframe's camera-to-world pose."""
+        return se3.inverse(self.kf_pose[slot])
+
+    def covisible(self, slot: int) -> tuple[Slots, Slots]:
+        """Keyframes that observe points of this one, most shared points first, and how many they share."""
+        return self.covisible_of(self.kf_point[slot, : self.kf_count[slot]], exclude=slot)
+
+    def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
+        """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
+        counts = kernels.covisibility(self.obs_kf, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size)
+        if exclude >= 0:
+            counts[exclude] = 0
+        slots = np.flatnonzero(counts)
+        order = np.lexsort((-self.kf_id[slots], -counts[slots]))
+        return slots[order], counts[slots[order]]
+
+    def remove_keyframe(self, slot: int) -> None:
+        """Remove a keyframe, its observations, and the points that nobody observes any more."""
+        n = self.kf_count[slot]
+        features = np.flatnonzero(self.kf_point[slot, :n] >= 0)
+        points = self.kf_point[slot, features].astype(np.int64)
+        kernels.unlink_many(
+            self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, np.full(len(features), slot, np.int64), features
+        )
+        self.kf_alive[slot] = False
+        self.remove_points(points[self.n_obs[points] == 0])
+
+    # ------------------------------------------------------------------ points
+
+    @property
+    def points(self) -> Slots:
+        """Slots of all points, ascending."""
+        return np.flatnonzero(self.alive[: self._top])
+
+    def add_points(self, position: Array, rgb: NDArray[np.uint8], keyframe: int, features: Slots) -> Slots:
+        """New points ``[N, 3]`` that features of a keyframe observe; returns their slots."""
+        n = len(position)
+        reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
+        fresh = n - len(reused)
+        if self._top + fresh > self.alive.size:
+            length = max(2048, self._top + fresh, self.alive.size + self.alive.size // 2)
+            for name in self._POINT_TABLES:
+                setattr(self, name, _grown(getattr(self, name), length))
+        slots = np.concatenate([np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)])
+        self._top += fresh
+        self.alive[slots] = True
+        self.id[slots] = np.arange(self.next_point, self.next_point + n)
+        self.next_point += n
+        self.position[slots] = position
+        self.rgb[slots] = rgb
+        self.visible[slots] = 1
+        self.found[slots] = 1
+        self.born[slots] = self.kf_id[keyframe]
+        self.n_obs[slots] = 0
+        self.observe(keyframe, features, slots)
+        return slots
+
+    def observe(self, keyframe: int, features: Slots, points: Slots) -> None:
+        """Note that features of a keyframe observe points."""
+        if not len(points):
+            return
+        self._reserve(kernels.fullest(self.n_obs, points) + 1)
+        kernels.link(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, keyframe, features, points)
+
+    def unobserve(self, keyframes: Slots, features: Slots) -> None:
+        """Forget observations; points that lose their last one are removed."""
+        points = self.kf_point[keyframes, features].astype(np.int64)
+        kernels.unlink_many(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, keyframes, features)
+        points = np.unique(points[points >= 0])
+        self.remove_points(points[self.n_obs[points] == 0])
+
+    def remove_points(self, points: Slots) -> None:
+        """Remove points and their observations."""
+        points = np.unique(points)
+        points = points[self.alive[points]]
+        kernels.drop_points(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, points)
+        self.alive[points] = False
+        self._freed_points.extend(points.tolist())
+
+    def merge(self, old: int, new: int) -> None:
+        """Replace a point by another that is the same thing in the world."""
+        if old == new or not self.alive[old] or not self.alive[new]:
+            return
+        self._reserve(int(self.n_obs[old]) + int(self.n_obs[new]))
+        kernels.merge(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, old, new)
+        self.visible[new] += self.visible[old]
+        self.found[new] += self.found[old]
+        self.alive[old] = False
+        self._freed_points.append(old)
+
+    def refresh(self, points: Slots) -> None:
+        """Renew descriptor, viewing direction and scale range of points from their observations."""
+        kernels.refresh(
+            points, self.position, self.normal, self.far, self.words, self.obs_kf, self.obs_ft, self.n_obs,
+            self.kf_words, self.kf_octave, self.kf_centre, self.scales,
+        )  # fmt: skip
+
+    def release(self) -> None:
+        """Allow the slots freed so far to be used again; called once nobody holds them any more."""
+        self._free_points.extend(sorted(self._freed_points, reverse=True))
+        self._freed_points.clear()
+
+    def _reserve(self, observations: int) -> None:
+        if observations > self.obs_kf.shape[1]:
+            length = max(observations, 2 * self.obs_kf.shape[1])
+            self.obs_kf = np.asarray(_grown(self.obs_kf, length, axis=1), np.int32)
+            self.obs_ft = np.asarray(_grown(self.obs_ft, length, axis=1), np.int32)
+
+    # ------------------------------------------------------------------ views
+
+    def project(
+        self, T_cam_world: Array, candidates: Slots, *, min_cosine: float = 0.5, wide: float = 1.25
+    ) -> tuple[Slots, Array, Array, Slots, Array]:
+        """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
+        c = self.camera
+        return kernels.project(  # type: ignore[no-any-return]
+            np.ascontiguousarray(T_cam_world), candidates, self.position, self.normal, self.far,
+            c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, float(c.width), float(c.height),
+            float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales), min_cosine, wide,
+        )  # fmt: skip
+
+    def redundancy(self, slot: int, close_m: float, others: int = 3) -> tuple[int, int]:
+        """A keyframe's close points, and how many of them `others` keyframes see at the same scale or finer."""
+        total, redundant = kernels.redundancy(
+            slot, int(self.kf_count[slot]), self.kf_point, self.kf_octave, self.kf_z, close_m, self.obs_kf,
+            self.obs_ft, self.n_obs, others,
+        )  # fmt: skip
+        return int(total), int(redundant)

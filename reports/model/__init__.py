@@ -1,0 +1,1 @@
+"""What a report knows: rows, the board, statistics, published numbers."""

@@ -1,0 +1,83 @@
+"""All rows as one pandas frame: what CSV is written from, and what own analyses start with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.runs.storage.store import RunStore
+
+from .columns import name_columns
+from .labels import make_labels
+from .rows import RunRow, load_runs, open_stores
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_TEXT = ("run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split",
+         "repeat", "status", "ending", "protocol_id", "protocol_digest", "trajectory", "segmentation")  # fmt: skip
+_WHOLE = ("seed", "offset", "n_frames", "n_processed", "n_tracked")
+_FLAGS = ("ranked", "failed", "cached")
+_NUMBERS = ("coverage", "score_m", "held_ate_m", "final_ate_m", "never_move_m", "frame_ms", "real_time_factor",
+            "peak_memory_mb", "mask_iou", "epipolar_skipped")  # fmt: skip
+
+
+def load_frame(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str, protocol: Protocol | str = "tum-rgbd/v1"
+) -> pd.DataFrame:
+    """All runs of some results folders, scored under one protocol, one row a run.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+
+    Returns:
+        The frame that `rows_frame` describes.
+
+    Raises:
+        ReportError: There are no runs.
+    """
+    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
+    return rows_frame(rows, name_columns(rows), make_labels(rows))
+
+
+def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
+    """Rows as a frame.
+
+    Args:
+        rows: One a run.
+        columns: Column id to the name of its sequence, see `name_columns`.
+        labels: Variant key to the name of the tracker in tables, see `make_labels`.
+
+    Returns:
+        One line a run, ordered by label, sequence and repeat. ``string`` columns: run_id, kind (``run here``,
+        ``imported``), tracker, label, settings (what sets the variant apart, ``name=value; ...``), provenance,
+        sequence (name of the column in tables), column_id, frames, split, repeat, status, ending (of a failed run),
+        protocol_id, protocol_digest, trajectory (``online``, ``final``: whose errors they are), segmentation.
+        ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked. ``boolean``:
+        ranked, failed, cached (whether stage times come from the stage cache). ``float64``, nan where unknown:
+        coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
+        failures as never moving or worse), held_ate_m, final_ate_m and never_move_m (metres), frame_ms (median,
+        milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), and every metric of the protocol under
+        its own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
+    """
+    import pandas as pd
+
+    ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
+    metrics = sorted({name for row in rows for name in row.metrics})
+    lines = []
+    for row in ordered:
+        own: dict[str, Any] = {
+            "label": labels[row.variant_key],
+            "sequence": columns[row.column_id],
+            "settings": "; ".join(f"{name}={value}" for name, value in row.variant.items()),
+        }
+        names = (*_TEXT, *_WHOLE, "noise", *_FLAGS, *_NUMBERS)
+        lines.append(
+            {n: own[n] if n in own else getattr(row, n) for n in names} | {m: row.metrics.get(m) for m in metrics}
+        )
+    kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys((*_WHOLE, "noise"), "Int64")
+    kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "float64")
+    return pd.DataFrame(lines, columns=list(kinds)).astype(kinds)

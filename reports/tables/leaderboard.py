@@ -1,0 +1,213 @@
+"""The leaderboard, made of a board, and the cells that several tables share."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from statistics import median
+
+import numpy as np
+
+from dynslam_bench.evaluation.protocol import Protocol
+
+from ..model.board import Board
+from ..model.cell import Cell, mean_skipped
+from ..model.rows import RunRow
+from ..model.statistics import FEWEST, Interval, Standing
+from .formats import percent
+from .table import Column, Emphasis, Table, TableCell
+
+_PROVENANCE = {
+    "own": "parts of it are in no paper",
+    "faithful-code": "follows the published code",
+    "faithful-paper": "follows the paper",
+    "inspired": "follows an abstract or a survey; constants are ours",
+    "assumed": "identity or rule unknown, assumed",
+    "external": "not part of this project",
+    "control": "a control, not a system",
+}
+_NAMES = {"own": "our own system"}
+CACHED_MARK = "†"
+CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
+
+
+def leaderboard(board: Board, protocol: Protocol) -> Table:
+    """Ranking with what the data leave open, success, coverage, speed and provenance."""
+    epipolar = any(row.epipolar_skipped is not None for row in board.rows)
+    standings = {standing.key: standing for standing in board.standings}
+    rows, muted = [], set()
+    for position, key in enumerate(board.trackers):
+        if key not in board.ranked:
+            muted.add(position)
+        runs = board.runs(key)
+        cells = [*_standing_cells(board, key, standings.get(key)), *_run_cells(runs)]
+        if epipolar:
+            cells.insert(-2, skipped_cell(runs))
+        rows.append(cells)
+    columns = _columns(board, epipolar)
+    caption = _caption(board, protocol, epipolar)
+    return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators())
+
+
+def _columns(board: Board, epipolar: bool) -> list[Column]:
+    skipped = Column(
+        "F skipped",
+        meaning="share of the tracked frames on which the epipolar test had no say, since F was not used",
+    )
+    return [
+        Column("#", meaning="ranks that the data leave open; several: not separable from the others with that rank"),
+        Column("success", meaning="runs that ended and could be evaluated, of all"),
+        Column("tracker", numeric=False),
+        Column(
+            "ATE ratio", meaning=f"geometric mean over sequences of the median ATE over that of {board.reference_name}"
+        ),
+        Column("mean rank", meaning="mean over sequences of the rank there"),
+        Column("wins", meaning="sequences with a smaller median ATE than the reference; behind it the probability that "
+               "a run has a smaller error than one of the reference"),
+        Column("p", meaning="paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it "
+               "could never be below 0.05"),
+        Column("coverage", meaning="tracked frames over associated input frames"),
+        Column(
+            "× real time",
+            meaning="frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
+            "segmentation included, decoding excluded",
+        ),
+        Column("MB", meaning="peak resident memory"),
+        *([skipped] if epipolar else []),
+        Column("rows", numeric=False),
+        Column("provenance", numeric=False),
+    ]  # fmt: skip
+
+
+def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
+    failed = sum(row.failed for row in board.rows)
+    intervals = (
+        "Brackets: Student's 95 % intervals over sequences."
+        if len(board.common) >= FEWEST
+        else f"No intervals: they would need {FEWEST} sequences."
+    )
+    parts = [
+        f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
+        f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
+        f"{board.reference_name}; below 1 is better. {intervals}",
+        f"A run that failed or was lost counts as a camera that never moves, or worse ({failed} of "
+        f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
+        "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, trackers that lack "
+        "sequences or never succeeded.",
+    ]
+    if epipolar:
+        parts.append("F skipped: frames on which an epipolar system did not use its fundamental matrix.")
+    if any(row.cached for row in board.rows):
+        parts.append(CACHED_NOTE)
+    return " ".join(parts)
+
+
+def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[TableCell]:
+    runs = board.runs(key)
+    good = sum(not row.failed for row in runs)
+    success = TableCell(f"{good}/{len(runs)}", value=good / len(runs))
+    name = TableCell(board.labels[key], tip=board.first(key).tracker)
+    if key in board.hopeless:
+        return [TableCell("–"), success, name, TableCell("nothing succeeded", emphasis="failed"), *[TableCell()] * 3]
+    if standing is None:
+        return [TableCell("–"), success, name, *[TableCell()] * 4]
+    ratio = interval_cell(standing.ratio, ".2f", _mark(board, standing))
+    if standing.sequences < len(board.common):
+        text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
+        ratio = TableCell(ratio.text, text, ratio.value)
+    wins = TableCell("reference") if key == board.reference else wins_cell(standing)
+    return [rank_cell(standing), success, name, ratio, number_cell(standing.mean_rank, ".2f"), wins,
+            number_cell(standing.p_value, ".3f")]  # fmt: skip
+
+
+def _mark(board: Board, standing: Standing) -> Emphasis:
+    """Bold for those that may be first, unless that is everybody."""
+    first = [s for s in board.standings if s.group is not None and s.group[0] == 1]
+    return "best" if standing in first and len(first) < len(board.ranked) else ""
+
+
+def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
+    coverage = float(np.mean([row.coverage for row in runs]))
+    ended = [row for row in runs if not row.failed]
+    kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
+    provenance = runs[0].provenance
+    masks = " + ".join(sorted({row.segmentation for row in runs if row.segmentation not in ("", "none")}))
+    return [
+        TableCell(f"{100 * coverage:.1f} %", value=coverage),
+        speed_cell(ended),
+        number_cell(middle(row.peak_memory_mb for row in ended), ".0f"),
+        TableCell(tag=kinds),
+        TableCell(_NAMES.get(provenance, provenance), f"{masks} masks" if masks else "",
+                  tip=_PROVENANCE.get(provenance, "")),
+    ]  # fmt: skip
+
+
+def timed(runs: Sequence[RunRow]) -> list[RunRow]:
+    """The runs whose times count: those that took them themselves, where there is one; else the cached ones."""
+    fresh = [row for row in runs if not row.cached and row.real_time_factor is not None]
+    return fresh or [row for row in runs if row.real_time_factor is not None]
+
+
+def speed_cell(ended: Sequence[RunRow]) -> TableCell:
+    """Real-time factor and frame time, marked where they come from the stage cache."""
+    rows = timed(ended)
+    factor, frame_ms = middle(row.real_time_factor for row in rows), middle(row.frame_ms for row in rows)
+    mark, tip = (CACHED_MARK, CACHED_NOTE) if any(row.cached for row in rows) else ("", "")
+    small = "" if frame_ms is None else f"{frame_ms:.1f} ms{mark}"
+    if factor is None:
+        return TableCell(small=small, tip=tip)
+    return TableCell((f"{factor:.2f}" if factor < 100 else f"{factor:.0f}") + mark, small, factor, tip=tip)
+
+
+def rank_cell(standing: Standing) -> TableCell:
+    """The ranks that the data leave open."""
+    if standing.rank is None or standing.group is None:
+        return TableCell("–")
+    first, last = standing.group
+    return TableCell(str(first)) if first == last else TableCell(f"{first}–{last}", "not separable")
+
+
+def wins_cell(standing: Standing) -> TableCell:
+    """Sequences won against the reference; the probability only where there are enough of them."""
+    small = f"P {standing.better:.2f}" if standing.sequences >= FEWEST else ""
+    return TableCell(f"{standing.wins} of {standing.sequences}", small, standing.wins)
+
+
+def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
+    """A value with its interval, if it has one."""
+    known = math.isfinite(interval.low) and math.isfinite(interval.high)
+    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if known else ""
+    return TableCell(f"{interval.value:{digits}}", small, interval.value, emphasis)
+
+
+def skipped_cell(rows: Sequence[RunRow]) -> TableCell:
+    """Share of the frames on which the fundamental matrix was not used; empty for systems without an epipolar test."""
+    share = mean_skipped(rows)
+    return TableCell() if share is None else TableCell(percent(share), value=share)
+
+
+def skipped_words(cell: Cell) -> str:
+    """The same for the number of a cell, e.g. ``F skipped 98 %``."""
+    share = cell.epipolar_skipped
+    return "" if share is None else f"F skipped {percent(share)}"
+
+
+def sequence_columns(board: Board) -> list[Column]:
+    """One column for every sequence, grouped."""
+    return [Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences]
+
+
+def middle(values: Iterable[float | None]) -> float | None:
+    """Median of what is present; None if nothing is."""
+    present = [value for value in values if value is not None]
+    return median(present) if present else None
+
+
+def number_cell(value: float | None, digits: str = "") -> TableCell:
+    """A number, written with a format specification or with all its digits; an empty cell for None."""
+    return TableCell() if value is None else TableCell(format(value, digits) if digits else repr(value), value=value)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"

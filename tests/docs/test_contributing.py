@@ -1,0 +1,75 @@
+"""The tour of the rooms in CONTRIBUTING is true."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text()
+CONTENT = {
+    "dynslam_bench/flow/searches/": r"Eq\. 13",
+    "dynslam_bench/culling/blocks/epipolar.py": r"Eq\. 25|Eq\. 23",
+    "dynslam_bench/runs/storage/store.py": r"run\.json",
+    "reports/tables/": r"Table\(",
+    "dynslam_bench/slam/pipeline.py": r"def track\(",
+    "dynslam_bench/contracts/tracker.py": r"class Tracker\(Protocol\)",
+    "dynslam_bench/trackers/systems/dynaslam.py": r"compose\(",
+    "dynslam_bench/evaluation/protocol.py": r"class Protocol",
+    "dynslam_bench/slam/mapping/keyframes.py": r"def ",
+    "dynslam_bench/sequences/synthetic/people/": r"skeleton",
+}
+"""What must be found behind each answer for it to be one."""
+
+
+def answers() -> list[str]:
+    section = TEXT.partition("## Where is ...?")[2].partition("\n## ")[0]
+    return re.findall(r"\? \| `([^`]+)` \|", section)
+
+
+def test_ten_questions_are_answered() -> None:
+    assert sorted(answers()) == sorted(CONTENT)
+
+
+@pytest.mark.parametrize("path", sorted(CONTENT))
+def test_the_answer_is_there(path: str) -> None:
+    place = ROOT / path
+    files = sorted(place.glob("*.py")) if path.endswith("/") else [place]
+    assert any(re.search(CONTENT[path], file.read_text()) for file in files), f"{path} no longer holds {CONTENT[path]}"
+
+
+def test_every_room_is_on_the_tour() -> None:
+    tour = TEXT.partition("## A tour of the rooms")[2].partition("\n## ")[0]
+    named = {name.rpartition("/")[2] for name in re.findall(r"`([\w/]+)`", tour)}
+    rooms = {
+        init.parent.name for init in (*(ROOT / "dynslam_bench").glob("*/__init__.py"), *ROOT.glob("*/__init__.py"))
+    }
+    assert not rooms - named - {"dynslam_bench", "tests"}
+
+
+def _functions() -> list[tuple[str, int]]:
+    found = []
+    for room in ("dynslam_bench", "envs", "tuning", "reports"):
+        for file in (ROOT / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.FunctionDef):
+                    found.append((f"{file.relative_to(ROOT)}:{node.name}", (node.end_lineno or 0) - node.lineno + 1))
+    return found
+
+
+LONG_FUNCTIONS: dict[str, str] = {}
+"""Functions above 60 lines, each with the reason why it is not divided."""
+
+
+def test_files_and_functions_stay_readable() -> None:
+    long_files = {
+        str(file.relative_to(ROOT))
+        for room in ("dynslam_bench", "envs", "tuning", "reports")
+        for file in (ROOT / room).rglob("*.py")
+        if len(file.read_text().splitlines()) > 400
+    }
+    assert not long_files
+    assert {name for name, lines in _functions() if lines > 60} == set(LONG_FUNCTIONS)
