@@ -31,7 +31,8 @@ from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 from .spec import RunSpec
 
 _ROOMS = (
-    "core", "geometry", "contracts", "sequences", "features", "segmentation", "flow", "culling", "slam", "trackers", "envs",
+    "core", "geometry", "contracts", "sequences", "features", "segmentation", "flow", "culling", "slam", "trackers",
+    "envs",
 )  # fmt: skip
 """The rooms whose source a trajectory may depend on."""
 

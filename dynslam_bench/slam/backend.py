@@ -37,6 +37,10 @@ MIN_INITIAL = 60
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
+FIRST_INTERVAL_S = 1 / 30
+"""Taken for the interval between frames until one was measured."""
+JITTER = 0.1
+"""Share of the last interval by which a stamp may be off and still count as regular: the noise of stamping."""
 
 
 class RgbdBackend:
@@ -74,6 +78,7 @@ class RgbdBackend:
         self.history = History()
         self.state: State = "initialising"
         self._last: Tracked | None = None
+        self._interval = FIRST_INTERVAL_S
         self._motion: MotionState | None = None
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
@@ -93,7 +98,7 @@ class RgbdBackend:
         Args:
             timestamp: The stamp of the frame to come, seconds.
         """
-        return None if self._last is None else se3.inverse(self._predicted(self._last, timestamp))
+        return None if self._last is None else se3.inverse(self._predicted(self._last, self._expected(timestamp)))
 
     def motion_covariance(self, timestamp: float) -> Array | None:
         """How far the camera's motion since the last frame may be from the predicted one.
@@ -105,9 +110,17 @@ class RgbdBackend:
             Covariance ``[6, 6]`` of (position in the world in metres, rotation in the camera frame in radians); None
             while lost, when nothing is known yet, and after a gap that nothing is assumed about.
         """
-        if self._last is None or (dt := self._known_gap(self._last, timestamp)) is None or self._motion is None:
+        if self._last is None or self._motion is None:
             return None
-        return self._motion.motion_covariance(dt, self.settings.motion)
+        dt = self._known_gap(self._last, self._expected(timestamp))
+        return None if dt is None else self._motion.motion_covariance(dt, self.settings.motion)
+
+    def _expected(self, timestamp: float) -> float:
+        """The stamp, or where it is within `JITTER` of a regular one, the regular one."""
+        if self._last is None:
+            return timestamp
+        regular = abs(timestamp - self._last.timestamp - self._interval) <= JITTER * self._interval
+        return self._last.timestamp + self._interval if regular else timestamp
 
     def _known_gap(self, last: Tracked, timestamp: float) -> float | None:
         """Seconds since the last frame; None where the motion model says nothing of them."""
@@ -129,6 +142,7 @@ class RgbdBackend:
         if dt is None or self._motion is None:
             self._motion = MotionState.at(measured, covariance)
             return measured
+        self._interval = dt
         self._motion = self._motion.predicted(dt, s).updated(measured, covariance)
         return self._motion.T_cam_world if s.filter else measured
 
