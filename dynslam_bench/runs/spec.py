@@ -18,7 +18,7 @@ class Limits(Record):
 
     Attributes:
         time_s: Wall-clock time of the whole run; None for no limit.
-        start_s: Time until frame 0 is tracked: loading networks, compiling kernels.
+        start_s: Time until frame 0 is tracked, and until frame 1 is: loading networks, compiling kernels.
         frame_s: Time for any later frame, and for the final optimisation.
         memory_mb: Memory of the run's process and its children, shared pages counted once; None for the default, a
             share of the machine's memory (see `memory.memory_limit`), 0 for no limit.

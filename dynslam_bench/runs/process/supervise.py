@@ -19,6 +19,8 @@ from .memory import memory_limit
 Message = dict[str, Any]
 _POLL_S = 0.1
 _STOP_GRACE_S = 30.0
+_FIRST_WARM = 1
+"""The first frame after which nothing is loaded or compiled any more: a flow needs two frames before it compiles."""
 _END_GRACE_S = 10.0
 
 
@@ -173,7 +175,7 @@ class _Watch:
             return self._verdict("stopped", f"stopped on request after frame {self.frame}")
         if limits.time_s is not None and now - self.began > limits.time_s:
             return self._verdict("timeout", f"not done within {limits.time_s:g} s{self._where()}")
-        patience = limits.start_s if self.frame < 0 else limits.frame_s
+        patience = limits.start_s if self.frame < _FIRST_WARM else limits.frame_s
         if now - self.sign_of_life > patience:
             return self._verdict("timeout", f"no sign of life for {patience:g} s{self._where()}")
         if now < self.next_look:
