@@ -1,4 +1,4 @@
-"""The starvation guard that all filters share."""
+"""The starvation guard that all filters share, and its settings; no heavy import."""
 
 from __future__ import annotations
 
@@ -7,7 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .settings import GuardSettings
+from dynslam_bench.core.settings import Settings, tunable
+
+
+class GuardSettings(Settings):
+    """The starvation guard: no filter may leave tracking without features (SG-SLAM restores below 10 %)."""
+
+    min_features: int = tunable(
+        60,
+        low=10,
+        high=200,
+        limits=(0, 2000),
+        online=True,
+        meaning="fewest keypoints that culling must leave: as many as the back end needs to begin a map",
+    )
+    min_fraction: float = tunable(
+        0.05, low=0.0, high=0.3, limits=(0.0, 1.0), meaning="smallest share of the keypoints that culling must leave"
+    )
 
 
 def restore_starved(verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings) -> tuple[NDArray[np.bool_], int]:

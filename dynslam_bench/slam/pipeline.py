@@ -26,8 +26,7 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.core.steering import Steerable, Steering
-from dynslam_bench.culling.guard import restore_starved
-from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.culling.guard import GuardSettings, restore_starved
 from dynslam_bench.culling.tools.ego_motion import refine_prediction
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera

@@ -159,7 +159,7 @@ class RelocalisationSettings(Settings):
     )
 
 
-class MotionSettings(Settings):
+class MotionModelSettings(Settings):
     """White-noise acceleration as motion model: prediction and filter while tracking, smoother afterwards."""
 
     filter: bool = tunable(True, meaning="weigh the pose that the image gives against the motion model, causally")
@@ -204,7 +204,7 @@ class BackendSettings(Settings):
     """All settings of the back end."""
 
     tracking: TrackingSettings = TrackingSettings()
-    motion: MotionSettings = MotionSettings()
+    motion: MotionModelSettings = MotionModelSettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     mapping: MappingSettings = MappingSettings()
     bundle_adjustment: BundleAdjustmentSettings = BundleAdjustmentSettings()

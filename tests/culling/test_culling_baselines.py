@@ -8,28 +8,26 @@ import pytest
 from scenes import CAMERA, Scene, box_instance, bundle, keyframe, keypoints, scene
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState
-from dynslam_bench.culling.baseline_settings import (
-    BoxEpipolarSettings,
-    BoxSettings,
-    ClassRuleSettings,
-    CorrelationSettings,
-    DepthRansacSettings,
-    MovingVoteSettings,
-    MultiViewSettings,
-    ProbabilitySettings,
-    ResidualSettings,
-    TemplateSettings,
-)
 from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 from dynslam_bench.culling.blocks.boxes import BoxFilter
+from dynslam_bench.culling.blocks.boxes_settings import BoxSettings
 from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
+from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
 from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
+from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
 from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
+from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
 from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
+from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
 from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
 from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
+from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
 from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
+from dynslam_bench.culling.blocks.residual_clusters_settings import ResidualSettings
 from dynslam_bench.culling.blocks.template_matching import TemplateFilter
+from dynslam_bench.culling.blocks.template_matching_settings import TemplateSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

@@ -7,14 +7,17 @@ import pytest
 from scenes import CAMERA, Scene, box_instance, bundle, keyframe, scene
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState
-from dynslam_bench.culling.blocks.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
+from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
+from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
 from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-from dynslam_bench.culling.blocks.rigid_motion import MotionFilter
+from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
+from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
+from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
 from dynslam_bench.culling.blocks.semantic import SemanticFilter
-from dynslam_bench.culling.guard import restore_starved
-from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, GuardSettings, MotionSettings
+from dynslam_bench.culling.guard import GuardSettings, restore_starved
 from dynslam_bench.culling.tools.coherence import coherent
 from dynslam_bench.culling.tools.ego_motion import refine_prediction
+from dynslam_bench.culling.tools.fundamental_matrix import Estimator, epipolar_distance, fundamental_matrix
 from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
@@ -37,8 +40,7 @@ def test_epipolar_distance_agrees_with_the_definition() -> None:
 @pytest.mark.parametrize("estimator", ["ransac", "lmeds", "magsac"])
 def test_fundamental_matrix_is_that_of_the_true_motion(estimator: str) -> None:
     made = scene(SIDEWAYS, n_moving=0, noise_px=0.05)
-    settings = EpipolarSettings(estimator=estimator)  # type: ignore[arg-type]
-    matrix = fundamental_matrix(made.state.flow.xy.astype(float), made.frame.xy, settings)
+    matrix = fundamental_matrix(made.state.flow.xy.astype(float), made.frame.xy, Estimator(estimator))
     assert matrix is not None
     T_cur_prev = se3.inverse(SIDEWAYS)
     essential = se3.hat(T_cur_prev[:3, 3]) @ T_cur_prev[:3, :3]
@@ -98,9 +100,10 @@ def test_motion_sees_what_moves_along_epipolar_lines_and_under_rotation() -> Non
     forward = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
     for camera_motion, motion in ((forward, np.array([0, 0, -0.1])), (ROTATION, ACROSS), (np.eye(4), ACROSS)):
         made = scene(camera_motion, motion=motion)
-        verdict = MotionFilter(MotionSettings(min_share=0.0)).apply(made.frame, made.state)
+        verdict = RigidMotionFilter(RigidMotionSettings(min_share=0.0)).apply(made.frame, made.state)
         np.testing.assert_array_equal(verdict.keep, ~made.moving)
-        assert MotionFilter(MotionSettings()).apply((still := scene(camera_motion)).frame, still.state).keep.all()
+        still = scene(camera_motion)
+        assert RigidMotionFilter(RigidMotionSettings()).apply(still.frame, still.state).keep.all()
 
 
 def test_ego_motion_resists_a_large_moving_object() -> None:
@@ -137,7 +140,7 @@ def test_a_walker_before_a_far_wall_does_not_drag_the_camera_along() -> None:
     made = far_wall_and_walker(WALK, 250, 120)
     made.state.T_world_pred = refined = refine_prediction(made.frame, made.state)  # the speed is not known
     assert refined is not None and np.linalg.norm(refined[:3, 3]) < 4e-3
-    verdict = MotionFilter(MotionSettings()).apply(made.frame, made.state)
+    verdict = RigidMotionFilter(RigidMotionSettings()).apply(made.frame, made.state)
     assert not verdict.keep[made.moving].any() and verdict.keep[~made.moving].mean() > 0.97
 
 
@@ -150,7 +153,7 @@ def test_a_moving_majority_drags_the_camera_along_unless_its_speed_is_known() ->
     assert free is not None and np.linalg.norm(free[:3, 3]) > 0.02
     assert held is not None and np.linalg.norm(held[:3, 3]) < 4e-3
     made.state.T_world_pred = held
-    verdict = MotionFilter(MotionSettings()).apply(made.frame, made.state)
+    verdict = RigidMotionFilter(RigidMotionSettings()).apply(made.frame, made.state)
     assert not verdict.keep[made.moving].any() and verdict.keep[~made.moving].mean() > 0.97
 
 
@@ -163,7 +166,7 @@ def test_the_motion_model_does_not_hold_back_a_camera_that_really_accelerates() 
     assert held is not None
     assert se3.rotation_angle(se3.inverse(jerk) @ held) < 3e-3 < se3.rotation_angle(jerk) / 5
     made.state.T_world_pred = held
-    assert MotionFilter(MotionSettings()).apply(made.frame, made.state).keep.all()
+    assert RigidMotionFilter(RigidMotionSettings()).apply(made.frame, made.state).keep.all()
 
 
 def test_free_space_culls_what_stands_where_a_keyframe_saw_through() -> None:
@@ -196,7 +199,7 @@ def test_semantic_drops_the_features_on_people_only() -> None:
 FILTERS = [
     EpipolarFilter(EpipolarSettings()),
     EpipolarFilter(EpipolarSettings(estimator="magsac")),
-    MotionFilter(MotionSettings()),
+    RigidMotionFilter(RigidMotionSettings()),
     FreeSpaceFilter(FreeSpaceSettings()),
     SemanticFilter(SegmentationSettings()),
 ]

@@ -10,18 +10,16 @@ from scenes import CAMERA, box_instance, bundle, keypoints, scene
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import build
-from dynslam_bench.culling.baseline_settings import (
-    BoxEpipolarSettings,
-    ClassRuleSettings,
-    DepthBlockSettings,
-    ReseedingSettings,
-)
 from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
+from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
 from dynslam_bench.culling.blocks.correlation_graph import depth_variance, point_covariance
 from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter, covered_blocks
+from dynslam_bench.culling.blocks.depth_blocks_settings import DepthBlockSettings
 from dynslam_bench.culling.blocks.moving_probability import expand
 from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
+from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
 from dynslam_bench.culling.tools.ego_motion import depth_sigma
 from dynslam_bench.culling.tools.light_track import light_track
 from dynslam_bench.features.orb import OrbExtractor

@@ -9,9 +9,10 @@ import pytest
 from scenes import CAMERA, bundle, keypoints, scene
 
 from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeView
-from dynslam_bench.culling.baseline_settings import CorrelationSettings, MultiViewSettings
 from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
+from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
 from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
+from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
 from dynslam_bench.culling.blocks.multiview_kernels import BIN_M, grow, hidden
 from dynslam_bench.geometry import se3
 from dynslam_bench.trackers import TRACKERS

@@ -12,12 +12,12 @@ from dynslam_bench.culling.tools.ego_motion import CORRELATION, prior_informatio
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.localisation.motion_model import MotionState
-from dynslam_bench.slam.settings import MotionSettings
+from dynslam_bench.slam.settings import MotionModelSettings
 
 
 def test_motion_covariance_is_the_speeds_plus_the_accelerations() -> None:
     state = MotionState.at(np.eye(4), 1e-6 * np.eye(6))
-    settings = MotionSettings(acceleration=4.0, angular_acceleration=20.0)
+    settings = MotionModelSettings(acceleration=4.0, angular_acceleration=20.0)
     dt = 0.1
     got = state.motion_covariance(dt, settings)
     expected = np.diag(

@@ -11,7 +11,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import dilate
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import BoxDepthSettings
+from .box_depth_settings import BoxDepthSettings
 from .boxes import dynamic_boxes
 from .semantic import inside
 

@@ -9,11 +9,10 @@ from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterSt
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import BoxEpipolarSettings
-from ..settings import EpipolarSettings
+from ..tools.fundamental_matrix import Estimator, Matches, f_stats
 from ..tools.links import judged_by_flow
+from .box_epipolar_settings import BoxEpipolarSettings
 from .boxes import dynamic_boxes, in_boxes
-from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
 
 MIN_OUTSIDE = 20
 """SG-SLAM takes all matches where fewer than this lie outside the boxes."""
@@ -41,35 +40,29 @@ class BoxEpipolarFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
         keep = np.ones(len(frame), dtype=bool)
-        flow = state.flow
+        flow, matches = state.flow, Matches.by_flow(frame, state)
         boxes = dynamic_boxes(frame, self.segmentation)
-        stats = dict.fromkeys(("matches", "lost", "failed", "f_asked", "f_judged"), 0.0) | {"boxes": float(len(boxes))}
-        if flow is None or state.previous is None:
-            return FilterResult.of(keep, stats)
-        stats["f_asked"] = 1.0
+        stats = {"matches": 0.0, "lost": 0.0, "failed": 0.0, "boxes": float(len(boxes))}
+        if flow is None or matches is None:
+            return FilterResult.of(keep, stats | f_stats(asked=False))
         lost = state.keep & ~flow.valid
         stats["lost"] = float(np.count_nonzero(lost))
         if self.settings.unmatched == "drop":
             keep &= ~lost
         judged = judged_by_flow(flow, state.keep, self.settings.unmatched)
         inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
-        before = state.camera.undistort_points(flow.xy)
         fit = judged & ~self._left_out(inside, state)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
             fit = judged
         stats["matches"] = float(np.count_nonzero(fit))
-        options = EpipolarSettings(inlier_px=self.settings.inlier_px, confidence=self.settings.confidence)
-        matrix = None
-        if stats["matches"] >= MIN_MATCHES:
-            matrix = fundamental_matrix(before[fit], frame.xy[fit], options)
-        if matrix is None:
-            return FilterResult.of(keep, {**stats, "failed": 1.0})
-        stats["f_judged"] = 1.0
-        distance = epipolar_distance(matrix, before[judged], frame.xy[judged])
+        options = Estimator(inlier_px=self.settings.inlier_px, confidence=self.settings.confidence)
+        distance = matches.distances(fit, judged, options)
+        if distance is None:
+            return FilterResult.of(keep, stats | {"failed": 1.0} | f_stats(asked=True))
         outside_px = self.settings.outside_px if self.settings.test_outside else np.inf
-        limit = np.where(inside[judged], self.settings.inside_px, outside_px)
-        keep[judged] = distance <= limit
-        return FilterResult.of(keep, stats)
+        limit = np.where(inside, self.settings.inside_px, outside_px)
+        keep[judged] = (distance <= limit)[judged]
+        return FilterResult.of(keep, stats | f_stats(asked=True, judged=True))
 
     def _left_out(self, inside: NDArray[np.bool_], state: FilterState) -> NDArray[np.bool_]:
         """Matches that F is not fitted to, bool ``[N]``."""

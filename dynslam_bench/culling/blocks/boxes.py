@@ -11,7 +11,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import BoxSettings
+from .boxes_settings import BoxSettings
 
 
 def dynamic_boxes(frame: FrameBundle, settings: SegmentationSettings) -> NDArray[np.float32]:

@@ -9,10 +9,9 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import dynamic_mask, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import ClassRuleSettings
-from ..settings import EpipolarSettings
+from ..tools.fundamental_matrix import Estimator, Flags, Matches, f_stats
 from ..tools.links import judged_by_flow
-from .epipolar import MIN_MATCHES, epipolar_distance, fundamental_matrix
+from .class_rule_settings import ClassRuleSettings
 from .semantic import inside
 
 
@@ -38,19 +37,20 @@ class ClassRuleFilter(DynamicFilter):
         """Judge by class first, then movable things by geometry."""
         keep = np.ones(len(frame), dtype=bool)
         stats = dict.fromkeys(("on_people", "on_movable", "moving_objects", "lost"), 0.0)
-        stats |= {"f_asked": float(state.flow is not None and state.previous is not None), "f_judged": 0.0}
+        matches = Matches.by_flow(frame, state)
         if frame.instances is None or not len(frame.instances):
-            return FilterResult.of(keep, stats)
+            return FilterResult.of(keep, stats | f_stats(asked=matches is not None))
         people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
         keep &= ~inside(people, frame.keypoints.xy)
         stats["on_people"] = float(np.count_nonzero(~keep))
         movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
         lost = np.zeros(len(frame), dtype=bool)
-        if state.flow is not None and state.previous is not None:
+        if matches is not None and state.flow is not None:
             lost = state.keep & ~state.flow.valid
         stats["lost"] = float(np.count_nonzero(lost))
-        off_line, tested = self._off_line(frame, state, keep & ~inside(movable.union(), frame.keypoints.xy))
-        stats["f_judged"] = float(tested.any())
+        static = keep & ~inside(movable.union(), frame.keypoints.xy)
+        off_line, tested = self._off_line(matches, state, static)
+        stats |= f_stats(asked=matches is not None, judged=bool(tested.any()))
         for mask in movable.masks:
             on = inside(mask, frame.keypoints.xy) & keep
             stats["on_movable"] += float(np.count_nonzero(on))
@@ -65,19 +65,11 @@ class ClassRuleFilter(DynamicFilter):
             keep &= ~drop
         return FilterResult.of(keep, stats, people)
 
-    def _off_line(self, frame: FrameBundle, state: FilterState, static: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _off_line(self, matches: Matches | None, state: FilterState, static: Flags) -> tuple[Flags, Flags]:
         """Which points fail the epipolar test with F of the static-labelled ones, and which were tested at all."""
-        none = np.zeros(len(frame), dtype=bool)
-        if state.flow is None or state.previous is None:
+        none = np.zeros(len(static), dtype=bool)
+        if matches is None or state.flow is None:
             return none, none
         judged = judged_by_flow(state.flow, state.keep, self.settings.unmatched)
-        fit = judged & static
-        before = state.camera.undistort_points(state.flow.xy)
-        matrix = (
-            fundamental_matrix(before[fit], frame.xy[fit], EpipolarSettings()) if fit.sum() >= MIN_MATCHES else None
-        )
-        if matrix is None:
-            return none, none
-        failing = none.copy()
-        failing[judged] = epipolar_distance(matrix, before[judged], frame.xy[judged]) > self.settings.threshold_px
-        return failing, judged
+        distance = matches.distances(judged & static, judged, Estimator())
+        return (none, none) if distance is None else (distance > self.settings.threshold_px, judged)

@@ -13,9 +13,9 @@ from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterSt
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
-from ..baseline_settings import CorrelationSettings
 from ..tools.ego_motion import depth_sigma
 from ..tools.links import link_to_previous
+from .correlation_graph_settings import CorrelationSettings
 
 MIN_POINTS = 20
 _NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])

@@ -12,7 +12,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import dilate, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import DepthBlockSettings
+from .depth_blocks_settings import DepthBlockSettings
 from .semantic import inside
 
 

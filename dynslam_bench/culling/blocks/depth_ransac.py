@@ -10,8 +10,8 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import DepthRansacSettings
 from .boxes import dynamic_boxes, in_boxes
+from .depth_ransac_settings import DepthRansacSettings
 
 MIN_POINTS = 3
 

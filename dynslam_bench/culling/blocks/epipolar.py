@@ -2,87 +2,39 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
 
-from ..settings import EpipolarSettings
 from ..tools.coherence import coherent
 from ..tools.ego_motion import rigid_flow
+from ..tools.fundamental_matrix import (
+    MIN_MATCHES,
+    Estimator,
+    Matches,
+    Points,
+    f_stats,
+    homography_share,
+    rotation_residual,
+)
+from .epipolar_settings import EpipolarSettings
 from .semantic import inside
 
-MIN_MATCHES = 16  # twice the eight-point algorithm's minimum
 RIGID_PX = 2.0
 """Nearer than this to where the camera's motion puts it, a point moves with the static world."""
-Points = NDArray[np.float64]
-
-_METHODS = {"ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS, "magsac": cv2.USAC_MAGSAC}
-
-
-def fundamental_matrix(first: Points, second: Points, settings: EpipolarSettings) -> NDArray[np.float64] | None:
-    """The matrix F with ``x2^T F x1 = 0`` (Eq. 24) for matched pixels, robustly.
-
-    Args:
-        first: Undistorted pixels x1, float64 ``[N, 2]``.
-        second: Undistorted pixels x2, float64 ``[N, 2]``.
-        settings: Estimator and thresholds.
-
-    Returns:
-        F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate, the estimator gave up).
-    """
-    if len(first) < MIN_MATCHES:
-        return None
-    try:
-        matrix, _ = cv2.findFundamentalMat(
-            first, second, _METHODS[settings.estimator], settings.inlier_px, settings.confidence, 2000
-        )
-    except cv2.error:  # OpenCV 5.0's MAGSAC raises "!model.empty()" where no model was found
-        return None
-    for _ in range(2):  # the minimal sample's F is noisy at the image's fringe: refit it to all that agree
-        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-            return None
-        agree = epipolar_distance(np.asarray(matrix, np.float64), first, second) < settings.inlier_px
-        if np.count_nonzero(agree) < MIN_MATCHES:
-            return None
-        matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
-    return None if matrix is None or matrix.shape != (3, 3) else np.asarray(matrix, dtype=np.float64)
-
-
-def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points) -> NDArray[np.float64]:
-    """Distances ``[N]`` in pixels of x2 to the epipolar line of x1 (Eq. 25, with the root that the text lost)."""
-    lines = np.column_stack([first, np.ones(len(first))]) @ matrix.T
-    signed = (lines[:, :2] * second).sum(axis=1) + lines[:, 2]
-    return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
-
-
-def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
-    """How much of the flow a pure rotation of the camera leaves unexplained: median residual in pixels.
-
-    Args:
-        first: Undistorted pixels ``[N, 2]``.
-        second: Undistorted pixels ``[N, 2]``.
-        camera: Intrinsics.
-    """
-    rays = [np.column_stack([(xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(xy))])
-            for xy in (first, second)]  # fmt: skip
-    rays = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
-    weight = np.ones(len(first))
-    residual = np.zeros(len(first))
-    for _ in range(3):  # iteratively reweighted, so that moving things do not turn the rotation
-        u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
-        weight = 1.0 / np.maximum(residual, 0.5)
-    return float(np.median(residual))
-
-
-def homography_share(first: Points, second: Points) -> float:
-    """Share of the matches ``[N, 2]`` that one homography explains within 1 px: 1 for a plane or a pure rotation."""
-    matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=300, confidence=0.99)
-    return 0.0 if matrix is None else float(np.mean(mask))
+STATS = (
+    "matches",
+    "inliers",
+    "parallax_px",
+    "homography_share",
+    "contradiction",
+    "degenerate",
+    "moving_objects",
+    "f_asked",
+    "f_judged",
+)
 
 
 def contradiction(frame: FrameBundle, state: FilterState, failing: NDArray[np.bool_], before: Points) -> float:
@@ -129,47 +81,42 @@ class EpipolarFilter(DynamicFilter):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
-        stats = dict.fromkeys(
-            (
-                "matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate",
-                "moving_objects", "f_asked", "f_judged",
-            ),
-            0.0,
-        )  # fmt: skip
+        stats = dict.fromkeys(STATS, 0.0)
         keep = np.ones(len(frame), dtype=bool)
-        flow = state.flow
-        if flow is None or state.previous is None:
+        matches = Matches.by_flow(frame, state)
+        if matches is None or state.flow is None:
             return FilterResult.of(keep, stats)
-        stats["f_asked"] = 1.0
-        before = state.camera.undistort_points(flow.xy)
-        fit = flow.valid & state.keep
-        stats["matches"] = float(np.count_nonzero(fit))
-        if stats["matches"] < MIN_MATCHES:
-            return FilterResult.of(keep, {**stats, "degenerate": 1.0})
-        stats["parallax_px"] = rotation_residual(before[fit], frame.xy[fit], state.camera)
-        flow_px = float(np.median(np.linalg.norm(before[fit] - frame.xy[fit], axis=1)))
-        needed = max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px)
-        degenerate = stats["parallax_px"] < needed
-        if not degenerate:
-            stats["homography_share"] = homography_share(before[fit], frame.xy[fit])
-            degenerate = stats["homography_share"] > self.settings.homography_share
-        matrix = None if degenerate else fundamental_matrix(before[fit], frame.xy[fit], self.settings)
-        if matrix is None:
-            return FilterResult.of(keep, {**stats, "degenerate": 1.0})
-        failing = np.zeros(len(frame), dtype=bool)
-        distance = epipolar_distance(matrix, before[flow.valid], frame.xy[flow.valid])
-        failing[flow.valid] = distance > self.settings.threshold_px
+        valid = state.flow.valid
+        fit = valid & state.keep
+        stats |= f_stats(asked=True) | {"matches": float(np.count_nonzero(fit)), "degenerate": 1.0}
+        if stats["matches"] < MIN_MATCHES or self._means_nothing(matches, fit, state.camera, stats):
+            return FilterResult.of(keep, stats)
+        options = self.settings
+        distance = matches.distances(fit, valid, Estimator(options.estimator, options.inlier_px, options.confidence))
+        if distance is None:
+            return FilterResult.of(keep, stats)
+        failing = distance > options.threshold_px
         stats["inliers"] = float(np.count_nonzero(fit & ~failing))
-        if self.settings.max_contradiction < 1:
-            stats["contradiction"] = contradiction(frame, state, failing, before)
-            if stats["contradiction"] > self.settings.max_contradiction:
-                return FilterResult.of(keep, {**stats, "degenerate": 1.0})
-        stats["f_judged"] = 1.0
-        if self.settings.mode == "point":
-            moving = coherent(failing, flow.valid, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
+        if options.max_contradiction < 1:
+            stats["contradiction"] = contradiction(frame, state, failing, matches.before)
+            if stats["contradiction"] > options.max_contradiction:
+                return FilterResult.of(keep, stats)
+        stats |= f_stats(asked=True, judged=True) | {"degenerate": 0.0}
+        if options.mode == "point":
+            moving = coherent(failing, valid, frame.keypoints.xy, options.min_share, frame.gray.shape)
             return FilterResult.of(~moving, stats)
-        keep, stats["moving_objects"] = vote_on_objects(frame, failing, flow.valid, self.settings.vote_share)
+        keep, stats["moving_objects"] = vote_on_objects(frame, failing, valid, options.vote_share)
         return FilterResult.of(keep, stats)
+
+    def _means_nothing(self, matches: Matches, fit: NDArray[np.bool_], camera: Camera, stats: dict[str, float]) -> bool:
+        """Whether the view is degenerate: too little parallax, or one homography says it all; fills in both stats."""
+        before, now = matches.before[fit], matches.now[fit]
+        stats["parallax_px"] = rotation_residual(before, now, camera)
+        flow_px = float(np.median(np.linalg.norm(before - now, axis=1)))
+        if stats["parallax_px"] < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
+            return True
+        stats["homography_share"] = homography_share(before, now)
+        return stats["homography_share"] > self.settings.homography_share
 
 
 def vote_on_objects(

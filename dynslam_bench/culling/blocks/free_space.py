@@ -18,9 +18,9 @@ from dynslam_bench.contracts.filter import (
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
-from ..settings import FreeSpaceSettings
 from ..tools.coherence import coherent
 from ..tools.ego_motion import depth_sigma
+from .free_space_settings import FreeSpaceSettings
 
 PATCH = np.ones((7, 7), np.uint8)
 """Neighbourhood whose smallest depth must lie behind the point: depth edges and pose errors prove nothing."""

@@ -13,9 +13,9 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import ProbabilitySettings
 from ..tools.links import inherit, link_to_previous
 from .boxes import dynamic_boxes, in_boxes
+from .moving_probability_settings import ProbabilitySettings
 from .semantic import inside
 
 UNKNOWN = 0.5

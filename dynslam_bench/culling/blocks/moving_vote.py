@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +13,16 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import MovingVoteSettings
-from .epipolar import epipolar_distance
+from ..tools.fundamental_matrix import Estimator, Matches, f_stats
+from .moving_vote_settings import MovingVoteSettings
 from .semantic import inside
 
 BORDER_PX = 5
 HARRIS_K = 0.04
 """Of the corner measure that the authors' code chooses (Harris, blocks of 3 px)."""
 LEVELS = 5
+ESTIMATOR = Estimator(max_draws=1000, min_matches=8, refits=0)
+"""Eight matches suffice and RANSAC's own F is taken, as in the authors' code."""
 WINDOW = (22, 22)
 
 
@@ -43,13 +47,12 @@ class MovingVoteFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Vote, and drop the points on people if the vote says that they move."""
         keep = np.ones(len(frame), dtype=bool)
-        stats = dict.fromkeys(("corners", "moving", "votes", "f_judged"), 0.0)
-        stats["f_asked"] = float(state.previous is not None)
+        stats = dict.fromkeys(("corners", "moving", "votes"), 0.0) | f_stats(asked=state.previous is not None)
         if state.previous is None or frame.instances is None:
             return FilterResult.of(keep, stats)
         people = select(frame.instances, self.segmentation).union()
         moving, stats["corners"], judged = self._moving_corners(state.previous.gray, frame.gray, state.camera)
-        stats["f_judged"] = float(judged)
+        stats |= f_stats(asked=True, judged=judged)
         stats["moving"] = float(len(moving))
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
         around = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
@@ -67,7 +70,7 @@ class MovingVoteFilter(DynamicFilter):
         corners = cv2.goodFeaturesToTrack(
             previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
         )
-        if corners is None or len(corners) < 8:
+        if corners is None or len(corners) < ESTIMATOR.min_matches:
             return nothing, 0.0, False
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
         corners = cv2.cornerSubPix(previous, corners, (10, 10), (-1, -1), criteria)
@@ -83,16 +86,13 @@ class MovingVoteFilter(DynamicFilter):
             good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
         good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
         before, after = before[good], after[good]
-        if len(before) < 8:
+        if len(before) < ESTIMATOR.min_matches:
             return nothing, float(len(before)), False
-        first, second = camera.undistort_points(before), camera.undistort_points(after)
-        try:
-            matrix, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, self.settings.inlier_px, 0.99)
-        except cv2.error:
-            matrix = None
-        if matrix is None or matrix.shape != (3, 3):
+        every = np.ones(len(before), dtype=bool)
+        matches = Matches(camera.undistort_points(before), camera.undistort_points(after))
+        distance = matches.distances(every, every, replace(ESTIMATOR, inlier_px=self.settings.inlier_px))
+        if distance is None:
             return nothing, float(len(before)), False
-        distance = epipolar_distance(np.asarray(matrix, np.float64), first, second)
         return after[distance > self.settings.threshold_px], float(len(before)), True
 
 

@@ -19,8 +19,8 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import dilate
 
-from ..baseline_settings import MultiViewSettings
 from ..tools.light_track import light_track
+from .multiview_depth_settings import MultiViewSettings
 from .multiview_kernels import BIN_M, grow, hidden
 from .semantic import inside
 

@@ -10,7 +10,7 @@ from dynslam_bench.features.orb import EDGE, level_quotas, spread
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry.camera import Camera
 
-from ..baseline_settings import ReseedingSettings
+from .reseeding_settings import ReseedingSettings
 
 ORIGIN = EDGE - 3
 """Where the extractor's cells begin, pixels of a level."""

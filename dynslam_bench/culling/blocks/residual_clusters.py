@@ -13,7 +13,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import ResidualSettings
+from .residual_clusters_settings import ResidualSettings
 from .semantic import inside
 
 STEP = 8

@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
 
-from ..settings import MotionSettings
 from ..tools.coherence import coherent
 from ..tools.ego_motion import CELL, depth_sigma, rigid_flow
+from .rigid_motion_settings import RigidMotionSettings
 
 
-class MotionFilter(DynamicFilter):
+class RigidMotionFilter(DynamicFilter):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
     A point's evidence is 1 where it fails in the image or in depth; it fades over the following frames
-    (`MotionSettings.memory`), carried along by the flow, so that people who pause for a moment stay culled.
+    (`RigidMotionSettings.memory`), carried along by the flow, so that people who pause for a moment stay culled.
     Stats: ``dropped``, ``tested``, ``failed`` (in this frame alone).
     """
 
@@ -25,7 +25,7 @@ class MotionFilter(DynamicFilter):
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
     provenance: Provenance = "assumed"
 
-    def __init__(self, settings: MotionSettings) -> None:
+    def __init__(self, settings: RigidMotionSettings) -> None:
         self.settings = settings
         self._evidence: NDArray[np.float64] | None = None
 

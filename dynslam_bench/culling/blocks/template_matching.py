@@ -12,8 +12,8 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from ..baseline_settings import TemplateSettings
 from .boxes import dynamic_boxes, in_boxes
+from .template_matching_settings import TemplateSettings
 
 
 class TemplateFilter(DynamicFilter):

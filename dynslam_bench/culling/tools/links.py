@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowResult
 
-from ..baseline_settings import Unmatched
+from .unmatched import Unmatched
 
 
 def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 2.5) -> NDArray[np.intp]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..settings import MotionSettings
+from ..settings import MotionModelSettings
 from .pose import apply_twist
 
 Array = NDArray[np.float64]
@@ -108,14 +108,14 @@ class MotionState:
         r = T_cam_world[:3, :3]
         return MotionState(-r.T @ T_cam_world[:3, 3], r.copy(), self.speed, self.covariance)
 
-    def predicted(self, dt: float, settings: MotionSettings) -> MotionState:
+    def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
         """The state `dt` seconds later."""
         f = _transition(dt)
         noise = _process_noise(dt, settings.acceleration, settings.angular_acceleration)
         step = np.concatenate([self.speed * dt, np.zeros(6)])
         return self.moved(step, f @ self.covariance @ f.T + noise)
 
-    def motion_covariance(self, dt: float, settings: MotionSettings) -> Array:
+    def motion_covariance(self, dt: float, settings: MotionModelSettings) -> Array:
         """Covariance ``[6, 6]`` of the motion in the next `dt` seconds.
 
         Of (position in the world, rotation in the camera frame); where the camera is now plays no part.
@@ -137,8 +137,8 @@ class MotionState:
         return self.moved(gain @ innovation, 0.5 * (reduced + reduced.T))
 
 
-def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: MotionSettings) -> Array:
-    """Fixed-interval smoothing of measured poses; gaps longer than `MotionSettings.max_gap_s` are not bridged.
+def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: MotionModelSettings) -> Array:
+    """Fixed-interval smoothing of measured poses; gaps longer than `MotionModelSettings.max_gap_s` are not bridged.
 
     Args:
         stamps: Seconds ``[N]``, ascending.
@@ -157,7 +157,7 @@ def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: Moti
     return out
 
 
-def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: MotionSettings) -> Array:
+def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings) -> Array:
     state = MotionState.at(poses[0], covariances[0])
     filtered, predicted, steps = [state], [state], np.diff(stamps)
     for k in range(1, len(stamps)):

@@ -11,7 +11,7 @@ from pydantic import Field
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.classes import expand_classes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import CorrelationSettings
+from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
 from dynslam_bench.flow.settings import FlowSettings
 
 from .composition import SystemSettings, compose

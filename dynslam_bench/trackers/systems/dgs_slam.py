@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import ResidualSettings
+from dynslam_bench.culling.blocks.residual_clusters_settings import ResidualSettings
 
 from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import masks_in_words

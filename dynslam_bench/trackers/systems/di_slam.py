@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings, MultiViewSettings
-from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
+from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
+from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .composition import SemanticSystemSettings, compose

@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, MotionSettings
+from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
+from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
+from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
 from dynslam_bench.flow.settings import FlowSettings
 
 from .composition import CFPN, SHARED_MASKS, ObjectSettings, SemanticSystemSettings, SystemSettings, compose
@@ -30,7 +32,7 @@ class EpipolarTestSettings(SystemSettings):
 class DepthTestSettings(EpipolarTestSettings):
     """The tests of depth besides."""
 
-    motion: MotionSettings = MotionSettings()
+    motion: RigidMotionSettings = RigidMotionSettings()
     free_space: FreeSpaceSettings = FreeSpaceSettings()
 
 
@@ -111,13 +113,13 @@ def build_object_mode(settings: MaskedEpipolarTestSettings, context: TrackerCont
 def _with_geometry(settings: SystemSettings, context: TrackerContext, filters: list[DynamicFilter]) -> SlamPipeline:
     from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
     from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-    from dynslam_bench.culling.blocks.rigid_motion import MotionFilter
+    from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
 
     if not isinstance(settings, EpipolarTestSettings):
         return compose(settings, context, filters)
     filters.append(EpipolarFilter(settings.epipolar))
     if isinstance(settings, DepthTestSettings) and settings.motion.enabled:
-        filters.append(MotionFilter(settings.motion))
+        filters.append(RigidMotionFilter(settings.motion))
     if isinstance(settings, DepthTestSettings) and settings.free_space.enabled:
         filters.append(FreeSpaceFilter(settings.free_space))
     return compose(settings, context, filters, settings.flow)

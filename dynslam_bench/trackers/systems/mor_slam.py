@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import BoxEpipolarSettings
+from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .composition import SemanticSystemSettings, compose

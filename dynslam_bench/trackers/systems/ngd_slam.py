@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import BoxDepthSettings, ReseedingSettings
+from dynslam_bench.culling.blocks.box_depth_settings import BoxDepthSettings
+from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

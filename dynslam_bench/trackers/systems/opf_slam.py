@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.settings import EpipolarSettings
+from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
 
 from .composition import SystemSettings, compose
 from .published import PublishedFlowSettings

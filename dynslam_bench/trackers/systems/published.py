@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field
 
 from dynslam_bench.core.settings import tunable
-from dynslam_bench.culling.baseline_settings import Unmatched
+from dynslam_bench.culling.tools.unmatched import Unmatched
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import ClassRuleSettings
+from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
 
 from .composition import SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.baseline_settings import DepthRansacSettings
+from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
 
 from .composition import SemanticSystemSettings, compose
 from .published import masks_in_words
