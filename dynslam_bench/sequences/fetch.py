@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 from dynslam_bench.core.download import Report, download, file_sha256
-from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.records import Record, atomic_folder, write_atomic
+from dynslam_bench.core.records import Record
 
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from .published.archives import extract
@@ -133,9 +134,11 @@ def fetch(
     entry, address = found.entry, url or found.entry.url
     archive = find_data_root(data_root) / ".downloads" / address.rpartition("/")[2]
     expected = entry.sha256 if checksum else None
-    sha256 = download(
-        address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s, timeout_s=timeout_s
-    )
+    how = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s}
+    try:
+        sha256 = download(address, archive, sha256=expected, progress=progress, **how)
+    except DownloadError as error:
+        raise SequenceError(str(error.args[0]), error.hint) from error
     try:
         with atomic_folder(found.place) as work:
             sums = extract(archive, work, progress)

@@ -14,9 +14,10 @@ from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network
 from dynslam_bench.segmentation.networks.mask_rcnn.roi_heads import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
-from dynslam_bench.segmentation.training.labelled import LabelledImage, open_labelled
+from dynslam_bench.segmentation.training.labelled import LabelledImage
 from dynslam_bench.segmentation.training.labelled_files import CocoImages, YoloImages, decode_runs
 from dynslam_bench.segmentation.training.labelled_sequences import RenderedFrames
+from dynslam_bench.segmentation.training.open_labelled import open_labelled
 from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
 from dynslam_bench.segmentation.training.train import network_config, train

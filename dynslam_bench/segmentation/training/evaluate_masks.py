@@ -13,12 +13,14 @@ from pydantic import ConfigDict
 from dynslam_bench.contracts.segmenter import Segmenter
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.core.records import Record, write_atomic
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.records import Record
 
 from ..build_segmenter import build_segmenter, resolve_source, weights_digest
 from ..settings import SegmentationSettings
-from .labelled import LabelledImages, open_labelled
+from .labelled import LabelledImages
 from .mask_metrics import MaskQuality, MaskTally
+from .open_labelled import open_labelled
 
 Progress = Callable[[int, int], None]
 

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.files import replacing
 
 from .config import COCO_CLASSES, NetworkConfig
 from .network import MaskRCNN
@@ -184,12 +185,14 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
 
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     """Write a network with its shape, in our format; `half` stores float16."""
-    state = {key: value.detach().cpu().half() if half and value.is_floating_point() else value.detach().cpu()
-             for key, value in network.state_dict().items() if not key.endswith("num_batches_tracked")}  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    torch.save({"format": FORMAT, "config": network.config.model_dump_json(), "model": state}, temporary)
-    temporary.replace(path)
+    state: dict[str, Tensor] = {}
+    for key, value in network.state_dict().items():
+        if not key.endswith("num_batches_tracked"):
+            stored = value.detach().cpu()
+            state[key] = stored.half() if half and stored.is_floating_point() else stored
+    content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}
+    with replacing(path) as temporary, temporary.open("wb") as file:  # a file of no name: the bytes hold none either
+        torch.save(content, file)
 
 
 def _some(keys: Iterable[str]) -> str:

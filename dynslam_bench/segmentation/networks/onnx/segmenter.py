@@ -18,7 +18,9 @@ from dynslam_bench.core.errors import SegmentationError
 from ...settings import SegmentationSettings
 from ..images import as_rgb
 from .header import OnnxHeader, TensorInfo, read_header
-from .heads import Layout, Placement, decode, detect_layout
+from .heads import decode
+from .layout import Layout, detect_layout
+from .placement import Placement
 
 Scaling = Literal["unit", "symmetric", "imagenet"]
 _SCALINGS: dict[Scaling, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
