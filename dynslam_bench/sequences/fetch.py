@@ -146,9 +146,13 @@ def fetch(
             prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
             inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
             receipt = Receipt(
-                id=entry.id, url=address, sha256=sha256, size_bytes=archive.stat().st_size,
-                checked=expected is not None, files=len(inside),
-            )  # fmt: skip
+                id=entry.id,
+                url=address,
+                sha256=sha256,
+                size_bytes=archive.stat().st_size,
+                checked=expected is not None,
+                files=len(inside),
+            )
             write_atomic(top / RECEIPT, receipt.to_json())
             write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(inside.items())))
             open_folder(top, entry=entry)

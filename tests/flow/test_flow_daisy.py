@@ -28,9 +28,11 @@ def ours(image, points, scale=1.0, rotation=0.0):
     points = torch.as_tensor(np.atleast_2d(points), dtype=torch.float64)[None]
     shape = points.shape[:2]
     return describe(
-        torch.as_tensor(image)[None], points, torch.full(shape, scale, dtype=torch.float64),
+        torch.as_tensor(image)[None],
+        points,
+        torch.full(shape, scale, dtype=torch.float64),
         torch.full(shape, rotation, dtype=torch.float64),
-    )[0].numpy()  # fmt: skip
+    )[0].numpy()
 
 
 def slow(image, x, y):

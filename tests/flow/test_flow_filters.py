@@ -125,8 +125,11 @@ def test_dense_flow_of_a_similarity_and_its_thread_independence():
 @pytest.mark.parametrize("kind", ["identical", "black", "textureless"])
 def test_dense_flow_of_degenerate_images(kind):
     image = scene(2)
-    pair = {"identical": (image, image.copy()), "black": (np.zeros_like(image), np.zeros_like(image) + 1),
-            "textureless": (np.full_like(image, 90), np.full_like(image, 120))}[kind]  # fmt: skip
+    pair = {
+        "identical": (image, image.copy()),
+        "black": (np.zeros_like(image), np.zeros_like(image) + 1),
+        "textureless": (np.full_like(image, 90), np.full_like(image, 120)),
+    }[kind]
     dense = DenseDaisyFlow(FlowSettings(dense_budget=16, dense_sweeps=1))
     result = dense.flow(dense.prepare(pair[0]), dense.prepare(pair[1]))
     assert np.isfinite(result.flow).all()

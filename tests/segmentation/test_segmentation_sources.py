@@ -107,8 +107,14 @@ def test_class_tables():
 
 def test_any_image_becomes_rgb():
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    for image in (grey, grey[:, :, None], grey[:, :, None].repeat(3, 2), grey[:, :, None].repeat(4, 2),
-                  grey.astype(np.uint16) * 257, grey / 255.0):  # fmt: skip
+    for image in (
+        grey,
+        grey[:, :, None],
+        grey[:, :, None].repeat(3, 2),
+        grey[:, :, None].repeat(4, 2),
+        grey.astype(np.uint16) * 257,
+        grey / 255.0,
+    ):
         assert np.array_equal(as_rgb(image), grey[:, :, None].repeat(3, 2))
     for bad in (np.zeros((3, 4, 2), np.uint8), np.zeros(5, np.uint8), np.zeros((0, 4, 3), np.uint8),
                 np.full((3, 4), 2.0), np.full((3, 4), np.nan), np.zeros((3, 4), np.int32)):  # fmt: skip
@@ -332,8 +338,6 @@ def test_a_damaged_or_missing_download_leaves_nothing(monkeypatch, tmp_path, pub
     with pytest.raises(SegmentationError, match=r"has the checksum .* expected 00000000 .put the file of .*1 MB"):
         checkpoints.fetch_checkpoint(checkpoint)
     (tmp_path / "published.pth").unlink()
-    with pytest.raises(
-        SegmentationError, match=r"cannot fetch the checkpoint 'test': .* 404.*test.pth"
-    ):
+    with pytest.raises(SegmentationError, match=r"cannot fetch the checkpoint 'test': .* 404.*test.pth"):
         checkpoints.fetch_checkpoint(checkpoint)
     assert not list((tmp_path / "cache").iterdir())

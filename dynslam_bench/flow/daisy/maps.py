@@ -79,9 +79,12 @@ def map_geometry(height: int, width: int) -> MapGeometry:
         bias.append(layout.SUBPIXEL // 2 + margin * step * layout.SUBPIXEL)
         total += (rows + 2 * margin) * (columns + 2 * margin)
     return MapGeometry(
-        np.asarray(base, dtype=np.int64), np.asarray(stride, dtype=np.int64), np.asarray(shift, dtype=np.int64),
-        np.asarray(bias, dtype=np.int64), total,
-    )  # fmt: skip
+        np.asarray(base, dtype=np.int64),
+        np.asarray(stride, dtype=np.int64),
+        np.asarray(shift, dtype=np.int64),
+        np.asarray(bias, dtype=np.int64),
+        total,
+    )
 
 
 def orientation_maps(
@@ -105,9 +108,10 @@ def orientation_maps(
     (rows, columns), (quarter_rows, quarter_columns) = _level_shape(height, width, 2), _level_shape(height, width, 4)
     buffers = buffers or BufferPool()
     histograms, whole, half = buffers.take(
-        (geometry.total, layout.BINS), (height + 2 * BORDER, width + 2 * BORDER),
+        (geometry.total, layout.BINS),
+        (height + 2 * BORDER, width + 2 * BORDER),
         (rows + 2 * BORDER, columns + 2 * BORDER),
-    )  # fmt: skip
+    )
     coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
     floor = np.float32(NORM_FLOOR * FIXED_POINT)
     blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)

@@ -85,9 +85,13 @@ class SparseDaisyFlow:
         return self._track(reference, target, points, guess, seed)
 
     def _track(
-        self, reference: OrientationMaps, target: OrientationMaps, points: NDArray[np.float32],
-        guess: NDArray[np.float32] | None, seed: int,
-    ) -> FlowResult:  # fmt: skip
+        self,
+        reference: OrientationMaps,
+        target: OrientationMaps,
+        points: NDArray[np.float32],
+        guess: NDArray[np.float32] | None,
+        seed: int,
+    ) -> FlowResult:
         settings = self.settings
         tables = tables_for(reference.gray.shape, settings)
         described = self.describe(reference, points, tables)
@@ -190,9 +194,13 @@ class SparseDaisyFlow:
         return state
 
     def parabola(
-        self, described: Reference, labels: NDArray[np.float32], target: OrientationMaps, tables: CostTables,
+        self,
+        described: Reference,
+        labels: NDArray[np.float32],
+        target: OrientationMaps,
+        tables: CostTables,
         evaluations: NDArray[np.int64],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Move labels in place to the lowest point of a parabola through the costs around them; counts evaluations."""
         run_stripes(
             parabola, len(labels), self.threads, self.pool, labels, np.float32(PARABOLA_STEP_PX), described,
@@ -200,9 +208,12 @@ class SparseDaisyFlow:
         )  # fmt: skip
 
     def refine(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], reference: OrientationMaps,
+        self,
+        points: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        reference: OrientationMaps,
         target: OrientationMaps,
-    ) -> NDArray[np.float32]:  # fmt: skip
+    ) -> NDArray[np.float32]:
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
         correlation = np.empty(len(points), dtype=np.float32)
         fine = (self.settings.refinement_window_px // 2, FINE_MARGIN, FINE_WARPS)
@@ -257,9 +268,13 @@ class SparseDaisyFlow:
         labels[chosen[better]], correlation[chosen[better]] = other[better], seen[better]
 
     def _way_back(
-        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32],
-        reference: OrientationMaps, target: OrientationMaps,
-    ) -> NDArray[np.float32]:  # fmt: skip
+        self,
+        points: NDArray[np.float32],
+        xy: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        reference: OrientationMaps,
+        target: OrientationMaps,
+    ) -> NDArray[np.float32]:
         """Distance in pixels between each point and where the inverse label, refined the other way, takes it."""
         inverse = -labels
         correlation = np.empty(len(points), dtype=np.float32)

@@ -88,9 +88,11 @@ class DenseDaisyFlow:
         if says_nothing(reference.gray, target.gray):
             shape = (height, width)
             return DenseFlow(
-                np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_), np.zeros(shape, np.float32),
+                np.zeros((*shape, 2), np.float32),
+                np.zeros(shape, np.bool_),
+                np.zeros(shape, np.float32),
                 {"evaluations": 0.0, "valid": 0.0, "degenerate": 1.0},
-            )  # fmt: skip
+            )
         forward = self._one_way(reference, target, seed)
         valid = np.ones((height, width), dtype=np.bool_)
         rounds, back = [forward], None

@@ -122,9 +122,8 @@ def flown(
 
 
 def opposites(
-    xp: Any, members: Any, least: Any, greatest: Any, low: Any, high: Any,
-    uniform: Callable[[tuple[int, ...]], Any],
-) -> Any:  # fmt: skip
+    xp: Any, members: Any, least: Any, greatest: Any, low: Any, high: Any, uniform: Callable[[tuple[int, ...]], Any]
+) -> Any:
     """Elite opposition-based learning (Eq. 19-22).
 
     Args:

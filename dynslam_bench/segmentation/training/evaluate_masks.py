@@ -90,8 +90,11 @@ def evaluate_segmenter(
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
     quality, seconds = measure(segmenter, images, settings, min_area=min_area, limit=limit, progress=progress)
-    classes = {name: {key: _finite(value) for key, value in asdict(one).items()}
-               for name, one in quality.classes.items() if one.truths or one.detections}  # fmt: skip
+    classes = {
+        name: {key: _finite(value) for key, value in asdict(one).items()}
+        for name, one in quality.classes.items()
+        if one.truths or one.detections
+    }
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
         data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,

@@ -124,18 +124,24 @@ def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
     Raises:
         SegmentationError: Weights that give the shape are missing, or the classes have no names.
     """
-    needed = ("backbone.body.conv1.weight", "roi_heads.box_predictor.cls_score.weight",
-              "backbone.fpn.inner_blocks.0.0.weight", "rpn.head.cls_logits.weight",
-              "roi_heads.mask_head.0.0.weight")  # fmt: skip
+    needed = (
+        "backbone.body.conv1.weight",
+        "roi_heads.box_predictor.cls_score.weight",
+        "backbone.fpn.inner_blocks.0.0.weight",
+        "rpn.head.cls_logits.weight",
+        "roi_heads.mask_head.0.0.weight",
+    )
     missing = [key for key in needed if key not in state or state[key].dim() not in (2, 4)]
     if missing:
         raise SegmentationError(
             f"{where} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
-        )  # fmt: skip
+        )
     bottleneck = "backbone.body.layer1.0.conv3.weight" in state
-    blocks = tuple(len({key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{stage}.")})
-                   for stage in range(1, 5))  # fmt: skip
+    blocks = tuple(
+        len({key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{stage}.")})
+        for stage in range(1, 5)
+    )
     classes = int(state["roi_heads.box_predictor.cls_score.weight"].shape[0]) - 1
     if classes == len(COCO_CLASSES):
         names = COCO_CLASSES
@@ -171,8 +177,11 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
     unknown = [key for key in state if key not in own]
-    shapes = [f"{key} {_shape(state[key])} instead of {_shape(own[key])}"
-              for key in own if key in state and state[key].shape != own[key].shape]  # fmt: skip
+    shapes = [
+        f"{key} {_shape(state[key])} instead of {_shape(own[key])}"
+        for key in own
+        if key in state and state[key].shape != own[key].shape
+    ]
     found = (("keys are missing", missing), ("keys are unknown", unknown), ("shapes differ", shapes))
     faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in found if keys]
     if faults:
