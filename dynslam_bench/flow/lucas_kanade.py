@@ -16,7 +16,7 @@ _MIN_EIGENVALUE = 1e-4
 
 
 class LucasKanadeFlow:
-    """Bouguet's pyramidal tracker, with its way back as a check; see `estimator.FlowEstimator`."""
+    """Bouguet's pyramidal tracker, with its way back as a check; see `contracts.flow.FlowEstimator`."""
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         self.settings = settings or FlowSettings(method="lucas-kanade")

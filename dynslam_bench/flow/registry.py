@@ -14,7 +14,7 @@ class FlowSpec:
     Attributes:
         id: Name that `FlowSettings.method` (built in) or `FlowSettings.plugin` takes.
         entry_point: ``"module:factory"``; called as ``factory(settings: FlowSettings, *, device: str, threads: int)``,
-            returns an `estimator.FlowEstimator`.
+            returns an `contracts.flow.FlowEstimator`.
         summary: One line.
         license: SPDX id or remark.
     """

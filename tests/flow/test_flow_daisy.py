@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from daisy_reference import describe, gaussian_weights
 from scipy import ndimage
 
 from dynslam_bench.flow.daisy import cost as matching
 from dynslam_bench.flow.daisy import layout
-from dynslam_bench.flow.daisy.descriptor import describe
-from dynslam_bench.flow.daisy.maps import gaussian_weights, orientation_maps
+from dynslam_bench.flow.daisy.maps import orientation_maps
 from dynslam_bench.flow.settings import FlowSettings
 
 
