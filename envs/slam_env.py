@@ -17,9 +17,9 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Settings, apply_overrides
-from dynslam_bench.core.stage_cache import default_folder
 from dynslam_bench.core.steering import Steerable
 from dynslam_bench.evaluation.online import OnlineError, OnlineSample
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
@@ -142,7 +142,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
-        self._cache = str(default_folder()) if cache else None
+        self._cache = str(stage_cache_folder()) if cache else None
         self._open: Callable[[str | FrameSequence], FrameSequence] = lambda name: open_frames(
             name, data_root, camera, frames, stride, preprocessing_of(self.settings)
         )

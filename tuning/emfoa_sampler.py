@@ -14,7 +14,7 @@ from optuna.study import Study
 from optuna.study._study_direction import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from dynslam_bench.flow.searches.rules import EMFOA, flames_left, flight, flown, opposites
+from dynslam_bench.flow.searches.moth_flame import EMFOA, flames_left, flight, flown, opposites
 
 Array = NDArray[np.float64]
 CAUCHY_SHARE = 0.05

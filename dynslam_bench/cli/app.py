@@ -9,6 +9,7 @@ from typing import Annotated, Optional
 import typer
 
 from dynslam_bench import __version__
+from dynslam_bench.core.download_progress import show_downloads
 from dynslam_bench.core.errors import DynslamError
 
 from . import (
@@ -24,6 +25,7 @@ from . import (
     studies,
     trackers,
 )
+from .output import drawn_download
 
 app = typer.Typer(
     name="dynslam-bench",
@@ -61,6 +63,7 @@ def _root(
     ] = None,
 ) -> None:
     """Benchmark and tune visual SLAM in dynamic scenes."""
+    show_downloads(drawn_download)
 
 
 _INTERRUPTED = "interrupted; what is finished is stored, the same command goes on from there"

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from dynslam_bench.core.download_progress import Report
+
 SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
 
@@ -161,6 +163,13 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
             bar.update(task, completed=done, total=total if total is not None else done + 1, description=shown)
 
         yield told
+
+
+@contextmanager
+def drawn_download(name: str) -> Iterator[Report]:
+    """`progress` of one file's download, for `core.download.show_downloads`."""
+    with progress(name, unit="bytes") as advance:
+        yield lambda state: advance(state.done, state.total)
 
 
 def _text(value: object) -> str:

@@ -13,32 +13,16 @@ import shutil
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from .errors import SequenceError
+from .download_progress import Progress, Report, reporting
+from .errors import DownloadError
+
+__all__ = ["CHUNK", "Progress", "Report", "download", "file_sha256", "forget"]
 
 CHUNK = 1 << 18
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a fetch is.
-
-    Attributes:
-        stage: What is being done.
-        done: Bytes done, those of earlier calls included.
-        total: Bytes in all; None if the server does not say.
-    """
-
-    stage: Literal["download", "check", "extract"]
-    done: int
-    total: int | None
-
-
-Report = Callable[[Progress], None]
 
 
 def download(
@@ -53,13 +37,13 @@ def download(
 ) -> str:
     """Download a file; what an earlier call got is kept, and the download goes on where that stopped.
 
-    The bytes gather in ``<target>.part``; `target` appears only when it is whole, and stays only if its checksum fits.
+    The bytes gather in ``<target>.part``; `target` appears only when it is whole and its checksum fits.
 
     Args:
         url: An ``http`` or ``https`` address.
         target: The file to write.
-        sha256: Expected checksum; None if it is not known.
-        progress: Called with the bytes done.
+        sha256: Expected checksum, or its first digits; None if it is not known.
+        progress: Called with the bytes done; None leaves that to what `download_progress.show_downloads` was given.
         attempts: Connections in a row that may fail without bringing a single byte.
         wait_s: Pause before the second attempt, doubled before each further one.
         timeout_s: How long a connection may be silent.
@@ -68,32 +52,32 @@ def download(
         SHA-256 of the file.
 
     Raises:
-        SequenceError: The server cannot be reached, refuses, or announces another length than it sends; the disk is
+        DownloadError: The server cannot be reached, refuses, or announces another length than it sends; the disk is
             full; the checksum is wrong (then the bytes are thrown away), or another process downloads the same file.
     """
     if not url.startswith(("http://", "https://")):
-        raise SequenceError(f"cannot download {url}", "the address has to begin with http:// or https://")
-    report = progress or (lambda _: None)
+        raise DownloadError(f"cannot download {url}", "the address has to begin with http:// or https://")
     part = target.with_name(target.name + ".part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SequenceError(
-            f"cannot write into {target.parent}: {error.strerror}", "name another --data-root"
-        ) from error
-    with _only_one(part.with_name(part.name + ".lock"), url):
-        if not target.is_file():
+        raise DownloadError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
+    with _only_one(part.with_name(part.name + ".lock"), url), reporting(target.name, progress) as report:
+        here = target if target.is_file() else part
+        if here is part:
             _complete(url, part, report, attempts, wait_s, timeout_s)
-            part.replace(target)
+        found = file_sha256(here, report)
+        if sha256 is not None and not found.startswith(sha256):
+            size = here.stat().st_size
+            here.unlink()
             forget(part)
-        found = file_sha256(target, report)
-        if sha256 is not None and found != sha256:
-            size = target.stat().st_size
-            target.unlink()
-            raise SequenceError(
+            raise DownloadError(
                 f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
                 "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
             )
+        if here is part:
+            part.replace(target)
+            forget(part)
         return found
 
 
@@ -125,7 +109,7 @@ def _complete(url: str, part: Path, report: Report, attempts: int, wait_s: float
             reason = "the server closed the connection early"
         except urllib.error.HTTPError as error:
             if error.code < 500 and error.code not in (408, 429):
-                raise SequenceError(f"the server answers {error.code} {error.reason} for {url}") from error
+                raise DownloadError(f"the server answers {error.code} {error.reason} for {url}") from error
             reason = f"the server answers {error.code} {error.reason}"
         except (OSError, http.client.HTTPException) as error:  # no route, time-out, reset, TLS
             reason = str(getattr(error, "reason", "") or error) or type(error).__name__
@@ -138,7 +122,7 @@ def _complete(url: str, part: Path, report: Report, attempts: int, wait_s: float
             pause = min(2 * pause, 30.0)
     announced = _read_notes(part).get("total")
     expected = f" of {announced}" if announced else ""
-    raise SequenceError(
+    raise DownloadError(
         f"download of {url} stopped at {_size(part)}{expected} bytes: {reason}",
         "run the same command again, it goes on from there",
     )
@@ -197,7 +181,7 @@ def _receive(response: Any, part: Path, start: int, total: int | None, report: R
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EIO):
             raise
-        raise SequenceError(
+        raise DownloadError(
             f"cannot write {part} at {done} of {total if total is not None else 'unknown'} bytes: {error.strerror}",
             "make room and run the same command again, it goes on from there",
         ) from error
@@ -206,9 +190,9 @@ def _receive(response: Any, part: Path, start: int, total: int | None, report: R
 def _check_space(part: Path, total: int | None, start: int) -> None:
     free = shutil.disk_usage(part.parent).free
     if total is not None and total - start > free:
-        raise SequenceError(
+        raise DownloadError(
             f"{part.parent} has {free / 1e9:.2f} GB free, but {(total - start) / 1e9:.2f} GB are still to download",
-            "make room, or name another --data-root",
+            "make room, or name another folder",
         )
 
 
@@ -219,9 +203,9 @@ def _only_one(lock: Path, url: str) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise SequenceError(f"another process is downloading {url}", "wait for it") from error
+            raise DownloadError(f"another process is downloading {url}", "wait for it") from error
         if not lock.exists() or lock.stat().st_ino != os.fstat(file.fileno()).st_ino:
-            raise SequenceError(f"another process has just downloaded {url}", "run the same command again")
+            raise DownloadError(f"another process has just downloaded {url}", "run the same command again")
         try:
             yield
         finally:

@@ -57,6 +57,10 @@ class TrackerError(DynslamError):
     """A tracker cannot be built, or broke its contract while it ran."""
 
 
+class DownloadError(DynslamError):
+    """A file cannot be downloaded."""
+
+
 class RunError(DynslamError):
     """A run cannot be started, stored or found."""
 

@@ -26,9 +26,7 @@ from .errors import PluginError
 from .records import digest
 from .settings import Settings, flatten, named
 
-OPENCV = (
-    "opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python",
-)  # fmt: skip
+OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 """The distributions that bring OpenCV; more than one may be installed, over each other."""
 _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""

@@ -1,4 +1,9 @@
-"""Where sequences lie: an argument, else the environment, else the user's cache folder."""
+"""Every folder outside the working directory that this package reads or writes, and the variable that moves it.
+
+Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``weights/`` (downloaded
+checkpoints) and ``vocabularies/`` (decompressed ORB vocabularies). Compiled kernels lie where numba puts them: beside
+the source, or in its own folder (``NUMBA_CACHE_DIR``).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,9 @@ import os
 import sys
 from pathlib import Path
 
-ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_DATA"
+DATA_VARIABLE = "DYNSLAM_BENCH_DATA"
+STAGES_VARIABLE = "DYNSLAM_BENCH_CACHE"
+WEIGHTS_VARIABLE = "DYNSLAM_BENCH_WEIGHTS"
 
 
 def user_cache() -> Path:
@@ -26,10 +33,27 @@ def find_data_root(argument: str | Path | None = None) -> Path:
     """
     if argument is not None:
         return Path(argument).expanduser().absolute()
-    configured = os.environ.get(ENVIRONMENT_VARIABLE)
-    if configured:
-        return Path(configured).expanduser().absolute()
-    return user_cache() / "data"
+    return _named(DATA_VARIABLE, user_cache() / "data").absolute()
+
+
+def stage_cache_folder() -> Path:
+    """The folder of the stage cache: ``stages/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
+    return _named(STAGES_VARIABLE, user_cache()) / "stages"
+
+
+def weights_folder() -> Path:
+    """The folder of downloaded weights: ``DYNSLAM_BENCH_WEIGHTS``, else in the user's cache folder."""
+    return _named(WEIGHTS_VARIABLE, user_cache() / "weights")
+
+
+def vocabularies_folder() -> Path:
+    """The folder of decompressed ORB vocabularies, in the user's cache folder."""
+    return user_cache() / "vocabularies"
+
+
+def _named(variable: str, otherwise: Path) -> Path:
+    value = os.environ.get(variable)
+    return Path(value).expanduser() if value else otherwise
 
 
 def is_writable(folder: Path) -> bool:

@@ -291,9 +291,13 @@ def _describe(name: str, field: FieldInfo) -> Parameter:
     prefix = name.rpartition(".")[0]
     when = tuple((f"{prefix}.{key}" if prefix else key, tuple(values)) for key, values in note["when"].items())
     common: dict[str, Any] = {
-        "name": name, "default": field.default, "unit": note["unit"], "online": note["online"],
-        "meaning": field.description or "", "when": when,
-    }  # fmt: skip
+        "name": name,
+        "default": field.default,
+        "unit": note["unit"],
+        "online": note["online"],
+        "meaning": field.description or "",
+        "when": when,
+    }
     base = _strip_optional(field.annotation)
     if note["choices"]:
         return Parameter(kind="categorical", choices=tuple(note["choices"]), **common)

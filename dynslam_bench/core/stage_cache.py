@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import io
 import os
-import time
 import zipfile
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DynslamError
+from .files import replacing
+from .folders import STAGES_VARIABLE, stage_cache_folder
 
-ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_CACHE"
 DEFAULT_MAX_BYTES = 8 * 2**30
 _PRUNE_EVERY = 512
 """Writes between two looks at the cache's size."""
@@ -54,13 +53,6 @@ class CacheInfo:
     entries_by_stage: Mapping[str, int]
 
 
-def default_folder() -> Path:
-    """``DYNSLAM_BENCH_CACHE``, or `dynslam-bench` in the user's cache folder; stages lie below ``stages/``."""
-    named = os.environ.get(ENVIRONMENT_VARIABLE)
-    base = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "dynslam-bench"
-    return base / "stages"
-
-
 class StageCache:
     """A folder of stage results, bounded in size.
 
@@ -70,7 +62,7 @@ class StageCache:
     """
 
     def __init__(self, folder: Path | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
-        self.folder = default_folder() if folder is None else folder
+        self.folder = stage_cache_folder() if folder is None else folder
         self.max_bytes = max_bytes
         self._writes = 0
 
@@ -103,17 +95,13 @@ class StageCache:
         path = self._path(stage, key)
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(buffer.getbuffer())
-            temporary.replace(path)
+            with replacing(path) as temporary:
+                temporary.write_bytes(buffer.getbuffer())
         except OSError as error:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
             raise DynslamError(
                 f"cannot write the stage cache {self.folder}: {error.strerror}",
-                f"free some space, or name another folder by {ENVIRONMENT_VARIABLE}",
+                f"free some space, or name another folder by {STAGES_VARIABLE}",
             ) from error
         self._writes += 1
         if self._writes % _PRUNE_EVERY == 1:

@@ -86,9 +86,7 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         moves = variance > np.finfo(float).eps * max(1.0, float((source**2).max()))
         scale = weighted / variance if moves else 1.0  # without motion every scale gives the same positions
     uncertainty = None if degenerate else rotation_uncertainty_deg(source, target, rotation)
-    return Similarity(
-        rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, uncertainty
-    )  # fmt: skip
+    return Similarity(rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, uncertainty)
 
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:

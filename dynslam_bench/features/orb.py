@@ -101,9 +101,12 @@ class OrbExtractor:
         count = sum(len(xy) for xy, _, _ in parts)
         if count == 0:
             return Keypoints(
-                np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32),
+                np.zeros((0, 2), np.float32),
+                np.zeros(0, np.int32),
+                np.zeros(0, np.float32),
+                np.zeros(0, np.float32),
                 np.zeros((0, 32), np.uint8),
-            )  # fmt: skip
+            )
         scales = self.settings.scale_factor ** np.arange(len(parts))
         octave = np.repeat(np.arange(len(parts), dtype=np.int32), [len(xy) for xy, _, _ in parts])
         level_xy = np.concatenate([xy for xy, _, _ in parts]).astype(np.float64)

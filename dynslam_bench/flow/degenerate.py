@@ -23,17 +23,16 @@ def flow_stats(points: int, valid: int = 0, evaluations: int = 0, *, degenerate:
         degenerate: Whether the images allow no flow: identical, without texture, too small.
     """
     return {
-        "points": float(points), "valid": float(valid), "evaluations": float(evaluations),
+        "points": float(points),
+        "valid": float(valid),
+        "evaluations": float(evaluations),
         "degenerate": float(degenerate),
-    }  # fmt: skip
+    }
 
 
 def empty_result() -> FlowResult:
     """The result for no points."""
-    return FlowResult(
-        np.empty((0, 2), np.float32), np.empty(0, np.bool_), np.empty(0, np.float32),
-        flow_stats(0),
-    )  # fmt: skip
+    return FlowResult(np.empty((0, 2), np.float32), np.empty(0, np.bool_), np.empty(0, np.float32), flow_stats(0))
 
 
 def unseen_result(points: NDArray[np.float32]) -> FlowResult:

@@ -21,7 +21,7 @@ SMALLEST_SIDE = 32
 
 
 class DisFlow:
-    """Dense flow, read at the points; the way back is a check; see `estimator.FlowEstimator`."""
+    """Dense flow, read at the points; the way back is a check; see `contracts.flow.FlowEstimator`."""
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         self.settings = settings or FlowSettings(method="dis")

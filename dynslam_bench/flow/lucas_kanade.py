@@ -16,7 +16,7 @@ _MIN_EIGENVALUE = 1e-4
 
 
 class LucasKanadeFlow:
-    """Bouguet's pyramidal tracker, with its way back as a check; see `estimator.FlowEstimator`."""
+    """Bouguet's pyramidal tracker, with its way back as a check; see `contracts.flow.FlowEstimator`."""
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         self.settings = settings or FlowSettings(method="lucas-kanade")
@@ -59,9 +59,12 @@ class LucasKanadeFlow:
         return FlowResult(xy, valid, error, stats)
 
     def _follow(
-        self, first: NDArray[np.uint8], second: NDArray[np.uint8], points: NDArray[np.float32],
+        self,
+        first: NDArray[np.uint8],
+        second: NDArray[np.uint8],
+        points: NDArray[np.float32],
         initial: NDArray[np.float32],
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:  # fmt: skip
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
         xy, status, error = cv2.calcOpticalFlowPyrLK(
             first, second, points, initial.astype(np.float32).copy(), winSize=self._window,
             maxLevel=self.settings.levels - 1, criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,

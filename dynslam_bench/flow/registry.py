@@ -14,7 +14,7 @@ class FlowSpec:
     Attributes:
         id: Name that `FlowSettings.method` (built in) or `FlowSettings.plugin` takes.
         entry_point: ``"module:factory"``; called as ``factory(settings: FlowSettings, *, device: str, threads: int)``,
-            returns an `estimator.FlowEstimator`.
+            returns an `contracts.flow.FlowEstimator`.
         summary: One line.
         license: SPDX id or remark.
     """
@@ -27,14 +27,18 @@ class FlowSpec:
 
 BUILT_IN = (
     FlowSpec(
-        "daisy", "dynslam_bench.flow.build_flow:build_daisy",
-        "DAISY Filter Flow, sparse or dense, with an interchangeable label search", "MIT",
+        "daisy",
+        "dynslam_bench.flow.build_flow:build_daisy",
+        "DAISY Filter Flow, sparse or dense, with an interchangeable label search",
+        "MIT",
     ),
     FlowSpec(
-        "lucas-kanade", "dynslam_bench.flow.build_flow:build_lucas_kanade", "pyramidal Lucas-Kanade (OpenCV)",
+        "lucas-kanade",
+        "dynslam_bench.flow.build_flow:build_lucas_kanade",
+        "pyramidal Lucas-Kanade (OpenCV)",
         "Apache-2.0",
     ),
     FlowSpec("dis", "dynslam_bench.flow.build_flow:build_dis", "dense inverse search (OpenCV)", "Apache-2.0"),
-)  # fmt: skip
+)
 
 FLOWS: Registry[FlowSpec] = Registry("flow", FlowSpec, lambda: BUILT_IN)

@@ -14,9 +14,13 @@ _EMFOA = {
 _PROPAGATING = {
     "method": ["daisy"],
     "search": [
-        "emfoa+propagation", "emfoa-literal+propagation", "patchmatch", "random+propagation", "none+propagation",
+        "emfoa+propagation",
+        "emfoa-literal+propagation",
+        "patchmatch",
+        "random+propagation",
+        "none+propagation",
     ],
-}  # fmt: skip
+}
 _LUCAS_KANADE = {"method": ["lucas-kanade"]}
 _REFINED = {"method": ["daisy"], "refinement": ["lucas-kanade"]}
 _MOTHS = {"method": ["daisy"], "search": [*_EMFOA["search"], "mfo"]}
@@ -60,9 +64,13 @@ class FlowSettings(Settings):
     )  # fmt: skip
     population: int = tunable(6, low=4, high=16, limits=(2, 32), when=_MOTHS, meaning="moths (and flames) a point")
     sweeps: int = tunable(
-        4, low=1, high=8, limits=(1, 32), when={**_PROPAGATING, "mode": ["sparse"]},
+        4,
+        low=1,
+        high=8,
+        limits=(1, 32),
+        when={**_PROPAGATING, "mode": ["sparse"]},
         meaning="times neighbours exchange their best labels",
-    )  # fmt: skip
+    )
     neighbours: int = tunable(
         4, low=1, high=8, limits=(0, 8), when=_PROPAGATING, meaning="neighbours whose labels are tried in each sweep"
     )
@@ -94,14 +102,19 @@ class FlowSettings(Settings):
         meaning="distance of those points",
     )
     terms: Literal[1, 3] = tunable(
-        1, when=_DAISY,
+        1,
+        when=_DAISY,
         meaning="terms of Eq. 1: the descriptors' alone, as in the original DAISY Filter Flow, or grey level and "
         "gradient as well",
-    )  # fmt: skip
+    )
     truncation: float = tunable(
-        0.882, low=0.25, high=2.0, limits=(0.01, 4.0), when=_DAISY,
+        0.882,
+        low=0.25,
+        high=2.0,
+        limits=(0.01, 4.0),
+        when=_DAISY,
         meaning="t of Eq. 1: largest L1 distance of one histogram of unit norm",
-    )  # fmt: skip
+    )
     intensity_weight: float = tunable(
         55.0, low=5.0, high=110.0, limits=(0.0, None), when=_THREE_TERMS, meaning="alpha of Eq. 1, for images in [0, 1]"
     )
@@ -109,17 +122,22 @@ class FlowSettings(Settings):
         7 / 255, low=0.005, high=0.1, limits=(0.0, 1.0), when=_THREE_TERMS, meaning="t1 of Eq. 1, grey levels in [0, 1]"
     )
     gradient_weight: float = tunable(
-        190.0, low=20.0, high=380.0, limits=(0.0, None), when=_THREE_TERMS,
+        190.0,
+        low=20.0,
+        high=380.0,
+        limits=(0.0, None),
+        when=_THREE_TERMS,
         meaning="beta of Eq. 1, for images in [0, 1]",
-    )  # fmt: skip
+    )
     gradient_limit: float = tunable(
         2 / 255, low=0.002, high=0.05, limits=(0.0, 1.0), when=_THREE_TERMS, meaning="t2 of Eq. 1, grey levels a pixel"
     )
     refinement: Literal["none", "parabola", "lucas-kanade"] = tunable(
-        "lucas-kanade", when=_DAISY,
+        "lucas-kanade",
+        when=_DAISY,
         meaning="sub-pixel step: none, a parabola through the costs, or a similarity Lucas-Kanade (sparse: after "
         "the parabola)",
-    )  # fmt: skip
+    )
     refinement_window_px: int = tunable(
         17, low=9, high=31, limits=(5, 41), unit="px", when=_REFINED, meaning="side of the refinement's window, odd"
     )
@@ -152,9 +170,13 @@ class FlowSettings(Settings):
         12, low=8, high=32, limits=(4, 128), unit="px", when=_DENSE, meaning="dense mode: side of a superpixel"
     )
     dense_candidates: int = tunable(
-        5, low=2, high=9, limits=(1, 9), when=_DENSE,
+        5,
+        low=2,
+        high=9,
+        limits=(1, 9),
+        when=_DENSE,
         meaning="dense mode: labels tried at each pixel, its superpixel's own and its neighbours'",
-    )  # fmt: skip
+    )
     dense_filter_radius_px: int = tunable(
         5, low=2, high=16, limits=(2, 32), unit="px", when=_DENSE, meaning="dense mode: guided filter's radius (Eq. 2)"
     )

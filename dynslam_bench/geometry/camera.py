@@ -90,11 +90,11 @@ class Camera:
 
         coefficients = np.asarray(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-        undistorted = cv2.undistortPointsIter(
-            pixels[:, None], self.matrix, coefficients, np.eye(3), self.matrix, criteria
-        ) if hasattr(cv2, "undistortPointsIter") else cv2.undistortPoints(
-            pixels[:, None], self.matrix, coefficients, None, self.matrix, criteria=criteria
-        )  # fmt: skip
+        undistorted = (
+            cv2.undistortPointsIter(pixels[:, None], self.matrix, coefficients, np.eye(3), self.matrix, criteria)
+            if hasattr(cv2, "undistortPointsIter")
+            else cv2.undistortPoints(pixels[:, None], self.matrix, coefficients, None, self.matrix, criteria=criteria)
+        )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
     def distort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.core.errors import TrajectoryError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
 
 from . import se3
 from .trajectory import Trajectory

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
 
 from . import se3
 from .trajectory import Trajectory

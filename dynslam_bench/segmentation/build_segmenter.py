@@ -23,7 +23,7 @@ LOWEST_CONFIDENCE = 0.1
 
 def resolve_source(
     settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None, *, optional: bool = False
-) -> str:  # fmt: skip
+) -> str:
     """What `settings.source` means for a sequence; the label stored with results.
 
     Args:
@@ -47,8 +47,7 @@ def resolve_source(
             return "oracle"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    available = ["onnx:PATH", "recorded:DIR", "weights:PATH",
-                 f"coco (downloads {COCO.megabytes} MB from {COCO.url})"]  # fmt: skip
+    available = ["onnx:PATH", "recorded:DIR", "weights:PATH", f"coco (downloads {COCO.megabytes} MB from {COCO.url})"]
     if masks is not None:
         available.insert(0, "oracle (the sequence's exact masks)")
     if optional:
@@ -168,8 +167,9 @@ class ConfiguredSegmenter:
         if found.masks.shape[1:] != frame.rgb.shape[:2] or len(found.masks) != len(found):
             raise SegmentationError(
                 f"{self.source} gave {len(found)} objects with masks of shape {found.masks.shape}, the frame is "
-                f"{frame.rgb.shape[1]}x{frame.rgb.shape[0]}", "masks must be [K, H, W] at the frame's size"
-            )  # fmt: skip
+                f"{frame.rgb.shape[1]}x{frame.rgb.shape[0]}",
+                "masks must be [K, H, W] at the frame's size",
+            )
         return select(found, self.settings, self.also)
 
 

@@ -63,9 +63,10 @@ class SegmentationSettings(Settings):
         meaning="frames after which the segmenter runs even without a keyframe",
     )  # fmt: skip
     carry: Literal["dis", "sparse"] = tunable(
-        "dis", when={"schedule": ["every_nth", "keyframes"]},
+        "dis",
+        when={"schedule": ["every_nth", "keyframes"]},
         meaning="flow that carries masks: dense (DIS) or a similarity of tracked corners a mask",
-    )  # fmt: skip
+    )
     compensate: int = tunable(
         3, low=0, high=10, limits=(0, None), unit="frames", online=True,
         meaning="missed detections are bridged for so many segmented frames (constant-velocity box); 0 = off",
@@ -82,9 +83,13 @@ class SegmentationSettings(Settings):
         meaning="width of the border in which depth decides, on both sides of the mask's edge",
     )  # fmt: skip
     network_side: int = tunable(
-        480, low=240, high=800, limits=(0, 2000), unit="px",
+        480,
+        low=240,
+        high=800,
+        limits=(0, 2000),
+        unit="px",
         meaning="shorter side of the input of coco and weights networks; 0 = as they were trained",
-    )  # fmt: skip
+    )
     onnx_normalisation: Literal["auto", "unit", "symmetric", "imagenet"] = "auto"
     """Input scaling of an ONNX network: [0, 1], [-1, 1], ImageNet's statistics, or what its kind usually takes."""
 

@@ -2,126 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
-from typing import Any, Literal, cast
-
-from pydantic import Field
+from typing import Any, cast
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError, did_you_mean
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
 from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.settings import Settings, build
-from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera
 
-from .published.cameras import CAMERAS, MARKER_TO_CAMERA, find_camera
-from .published.datasets import DATASETS, DatasetSpec
+from .published.cameras import MARKER_TO_CAMERA, find_camera
+from .published.datasets import DATASETS
+from .published.entries import CatalogueEntry, by_folder, catalogue, entry_of
 from .settings import PreprocessingSettings
-from .synthetic import SYNTHETIC_IDS, open_synthetic
+from .synthetic import open_synthetic
 from .view import SequenceView
 
-Tag = Literal["static", "low-dynamic", "high-dynamic"]
-Split = Literal["tune", "held-out", ""]
-_FILES = ("tum.toml", "bonn.toml")
-
-
-class CatalogueEntry(Settings):
-    """One public sequence.
-
-    A number or checksum that is not known is None, never a guess.
-    """
-
-    id: str = Field(description="for example tum/fr3/walking_xyz")
-    folder: str = Field(description="published folder name, an alias of the id")
-    camera: str = Field(description="name of the camera, see dynslam_bench.sequences.published.cameras")
-    url: str = Field(description="archive")
-    page: str = Field(default="", description="web page of the data set")
-    size_bytes: int | None = Field(default=None, description="exact size of the archive")
-    size_stated: str = Field(default="", description="size as the data set's page states it")
-    sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", description="checksum of the archive")
-    license: str = Field(description="licence of the data")
-    citation: str = Field(description="what to cite")
-    ground_truth: bool = Field(default=True, description="whether the ground truth is public")
-    tags: tuple[Tag, ...] = Field(default=(), description="how much of the scene moves")
-    split: Split = Field(default="", description="whether studies may tune on it")
-    fps: float = Field(default=30.0, gt=0, description="nominal frame rate in Hz")
-    remark: str = Field(default="", description="anything else worth knowing")
-
-    @property
-    def dataset(self) -> str:
-        """First part of the id, ``tum`` or ``bonn``."""
-        return self.id.partition("/")[0]
-
-    def folders(self, data_root: Path) -> tuple[Path, ...]:
-        """Where the sequence may lie below a data root, the place `fetch` puts it first."""
-        inside = data_root / self.dataset
-        places = (inside / self.folder, data_root / self.folder, data_root / self.id)
-        return (*places, data_root / self.folder.removeprefix("rgbd_")) if data_root.name == self.dataset else places
-
-    def find(self, data_root: Path) -> Path | None:
-        """The folder in which the sequence lies, None if it does not."""
-        for folder in self.folders(data_root):
-            if (folder / "rgb.txt").is_file():
-                return folder
-        return None
-
-    def size_text(self) -> str:
-        """The archive's size for people."""
-        if self.size_bytes is not None:
-            return f"{self.size_bytes / 1e9:.2f} GB"
-        return self.size_stated or "size unknown"
-
-    def intrinsics(self) -> Camera:
-        """The camera."""
-        return CAMERAS[self.camera]
-
-
-@cache
-def catalogue() -> dict[str, CatalogueEntry]:
-    """All public sequences by id, in the order of the data files."""
-    entries: dict[str, CatalogueEntry] = {}
-    for name in _FILES:
-        document = read_toml(Path(__file__).parent / "published" / name)
-        common: dict[str, Any] = document["common"]
-        for row in document["sequence"]:
-            entry = build(CatalogueEntry, {**common, **row})
-            entries[entry.id] = entry
-    return entries
-
-
-def entry_of(name: str) -> CatalogueEntry | None:
-    """The catalogue's entry of an id or published folder name, None if there is none."""
-    entries = catalogue()
-    return entries.get(name) or _aliases().get(name)
+__all__ = [
+    "CatalogueEntry",
+    "catalogue",
+    "entry_of",
+    "open_folder",
+    "open_public",
+    "open_rendered",
+    "open_sequence",
+    "parse_frames",
+    "sequence_ids",
+]
 
 
 def sequence_ids() -> list[str]:
     """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins."""
     return [name for found in DATASETS.all() for name in found.spec.sequences]
-
-
-def builtin_datasets() -> Iterator[DatasetSpec]:
-    """The data sets that come with the package."""
-    by_dataset: dict[str, list[CatalogueEntry]] = {}
-    for entry in catalogue().values():
-        by_dataset.setdefault(entry.dataset, []).append(entry)
-    for name, summary in (("tum", "TUM RGB-D benchmark"), ("bonn", "Bonn RGB-D Dynamic Dataset")):
-        entries = by_dataset[name]
-        yield DatasetSpec(
-            name, f"{__name__}:open_public", tuple(entry.id for entry in entries), summary,
-            entries[0].license, entries[0].citation,
-        )  # fmt: skip
-    yield DatasetSpec(
-        "synthetic",
-        f"{__name__}:open_rendered",
-        SYNTHETIC_IDS,
-        "rendered rooms with exact poses, masks and flow",
-        "CC0-1.0",
-        "dynslam-bench",
-    )
 
 
 def open_sequence(
@@ -254,7 +166,7 @@ def _open_whole(
         return open_folder(path, camera=camera, settings=settings)
     if _is_path(name):
         raise SequenceError(f"there is no sequence folder {path.absolute()}", "a path names a folder in TUM layout")
-    known = [*sequence_ids(), *_aliases()]
+    known = [*sequence_ids(), *by_folder()]
     raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, known))
 
 
@@ -299,8 +211,3 @@ def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int 
     if start < 0 or (stop is not None and stop <= start):
         raise SequenceError(f"frames {start}:{'' if stop is None else stop} is no range of frames", "0 <= A < B")
     return start, stop
-
-
-@cache
-def _aliases() -> dict[str, CatalogueEntry]:
-    return {entry.folder: entry for entry in catalogue().values()}

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 from dynslam_bench.core.download import Report, download, file_sha256
-from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.records import Record, atomic_folder, write_atomic
+from dynslam_bench.core.records import Record
 
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from .published.archives import extract
@@ -133,9 +134,11 @@ def fetch(
     entry, address = found.entry, url or found.entry.url
     archive = find_data_root(data_root) / ".downloads" / address.rpartition("/")[2]
     expected = entry.sha256 if checksum else None
-    sha256 = download(
-        address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s, timeout_s=timeout_s
-    )
+    how = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s}
+    try:
+        sha256 = download(address, archive, sha256=expected, progress=progress, **how)
+    except DownloadError as error:
+        raise SequenceError(str(error.args[0]), error.hint) from error
     try:
         with atomic_folder(found.place) as work:
             sums = extract(archive, work, progress)
@@ -143,9 +146,13 @@ def fetch(
             prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
             inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
             receipt = Receipt(
-                id=entry.id, url=address, sha256=sha256, size_bytes=archive.stat().st_size,
-                checked=expected is not None, files=len(inside),
-            )  # fmt: skip
+                id=entry.id,
+                url=address,
+                sha256=sha256,
+                size_bytes=archive.stat().st_size,
+                checked=expected is not None,
+                files=len(inside),
+            )
             write_atomic(top / RECEIPT, receipt.to_json())
             write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(inside.items())))
             open_folder(top, entry=entry)

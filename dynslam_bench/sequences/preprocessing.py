@@ -129,9 +129,7 @@ def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArra
     else:
         mean, std = cv2.meanStdDev(luminance)
         gain = 255 * settings.target_std / std.item() if std.item() > 0 else 1.0
-        luminance = cv2.convertScaleAbs(
-            np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255)
-        )  # fmt: skip
+        luminance = cv2.convertScaleAbs(np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255))
     merged = cv2.merge([luminance, *chroma])
     return np.asarray(cv2.cvtColor(merged, cv2.COLOR_YCrCb2RGB), dtype=np.uint8)
 

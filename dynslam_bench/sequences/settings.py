@@ -18,9 +18,13 @@ class PreprocessingSettings(Settings):
     """
 
     max_time_difference_s: float = tunable(
-        0.02, low=0.005, high=0.04, limits=(1e-6, 1.0), unit="s",
+        0.02,
+        low=0.005,
+        high=0.04,
+        limits=(1e-6, 1.0),
+        unit="s",
         meaning="colour and depth images further apart than this (strictly) are not paired",
-    )  # fmt: skip
+    )
     width: int | None = Field(
         default=None, ge=16, le=16384, description="width of the common resolution; none: as recorded"
     )
@@ -36,17 +40,29 @@ class PreprocessingSettings(Settings):
         meaning="contrast limit of the adaptive histogram equalisation",
     )  # fmt: skip
     clahe_tiles: int = tunable(
-        8, low=2, high=16, limits=(1, 64), when={"normalisation": ["clahe"]},
+        8,
+        low=2,
+        high=16,
+        limits=(1, 64),
+        when={"normalisation": ["clahe"]},
         meaning="tiles along each side of the image in the adaptive histogram equalisation",
-    )  # fmt: skip
+    )
     target_mean: float = tunable(
-        0.45, low=0.3, high=0.6, limits=(0.0, 1.0), when={"normalisation": ["mean-std"]},
+        0.45,
+        low=0.3,
+        high=0.6,
+        limits=(0.0, 1.0),
+        when={"normalisation": ["mean-std"]},
         meaning="mean luminance after normalisation, of [0, 1]",
-    )  # fmt: skip
+    )
     target_std: float = tunable(
-        0.22, low=0.1, high=0.35, limits=(0.001, 1.0), when={"normalisation": ["mean-std"]},
+        0.22,
+        low=0.1,
+        high=0.35,
+        limits=(0.001, 1.0),
+        when={"normalisation": ["mean-std"]},
         meaning="standard deviation of the luminance after normalisation, of [0, 1]",
-    )  # fmt: skip
+    )
 
     @field_validator("height")
     @classmethod

@@ -110,9 +110,11 @@ def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytes
     net = write(tmp_path / "net.onnx", "one")
     write(tmp_path / "voc.txt", "words")
     settings = Whole(
-        vocabulary="voc.txt", word=str(net), weights=Path("net.onnx"),
+        vocabulary="voc.txt",
+        word=str(net),
+        weights=Path("net.onnx"),
         inner=Inner(source="onnx:net.onnx", options={"network": {"file": str(net)}, "side": 3}),
-    )  # fmt: skip
+    )
     found = named_digests(settings)
     assert set(found) == {"vocabulary", "word", "weights", "inner.source", "inner.options.network.file"}
     assert len(set(found.values())) == 2

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.records import Record, atomic_folder, digest, write_atomic
+from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.seeding import derive_seed, stream
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -111,7 +112,7 @@ def test_a_killed_process_leaves_no_target(tmp_path):
     code = f"""
         import os
         from pathlib import Path
-        from dynslam_bench.core.records import atomic_folder
+        from dynslam_bench.core.files import atomic_folder
         with atomic_folder(Path({str(tmp_path / "run")!r})) as work:
             (work / "half").write_text("x")
             os.kill(os.getpid(), 9)

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from daisy_reference import describe, gaussian_weights
 from scipy import ndimage
 
 from dynslam_bench.flow.daisy import cost as matching
 from dynslam_bench.flow.daisy import layout
-from dynslam_bench.flow.daisy.descriptor import describe
-from dynslam_bench.flow.daisy.maps import gaussian_weights, orientation_maps
+from dynslam_bench.flow.daisy.maps import orientation_maps
 from dynslam_bench.flow.settings import FlowSettings
 
 
@@ -28,9 +28,11 @@ def ours(image, points, scale=1.0, rotation=0.0):
     points = torch.as_tensor(np.atleast_2d(points), dtype=torch.float64)[None]
     shape = points.shape[:2]
     return describe(
-        torch.as_tensor(image)[None], points, torch.full(shape, scale, dtype=torch.float64),
+        torch.as_tensor(image)[None],
+        points,
+        torch.full(shape, scale, dtype=torch.float64),
         torch.full(shape, rotation, dtype=torch.float64),
-    )[0].numpy()  # fmt: skip
+    )[0].numpy()
 
 
 def slow(image, x, y):

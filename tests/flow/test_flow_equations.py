@@ -8,14 +8,14 @@ import numpy as np
 import optuna
 import pytest
 import torch
+from moth_flame_minimiser import emfoa_minimise
 
 from dynslam_bench.flow.daisy.cost import tables_for
-from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
+from dynslam_bench.flow.daisy.sparse import Pair, SparseDaisyFlow
 from dynslam_bench.flow.daisy.torch_sparse import TorchSparseFlow
-from dynslam_bench.flow.searches import rules
+from dynslam_bench.flow.searches import moth_flame as rules
 from dynslam_bench.flow.searches.common import advance, scrambled
-from dynslam_bench.flow.searches.moth_flame import fly
-from dynslam_bench.flow.searches.optimiser import emfoa_minimise
+from dynslam_bench.flow.searches.moth_flame_kernel import fly
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
 
@@ -115,7 +115,7 @@ def searched(kind, search):
     tables = tables_for(image.shape, flow.settings)
     first, second = flow.prepare(image), flow.prepare(target)
     described = flow.describe(first, points, tables)
-    return flow.search(described, first, second, tables, flow.neighbours(points), guess, 9)
+    return flow.search(described, Pair(first, second, tables), flow.neighbours(points), guess, 9)
 
 
 STORED = {

@@ -10,8 +10,8 @@ import torch
 
 from dynslam_bench.flow.build_flow import build_flow
 from dynslam_bench.flow.daisy import layout
-from dynslam_bench.flow.daisy.descriptor import _binomial
 from dynslam_bench.flow.daisy.maps import framed, half_image, orientation_maps
+from dynslam_bench.flow.daisy.torch_maps import _binomial
 from dynslam_bench.flow.kernels.buffers import BufferPool
 
 

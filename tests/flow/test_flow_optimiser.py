@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from moth_flame_minimiser import emfoa_minimise
 from scipy.optimize import differential_evolution
 
-from dynslam_bench.flow.searches.optimiser import emfoa_minimise
-from dynslam_bench.flow.searches.rules import EMFOA, EMFOA_LITERAL, MFO, flame_counts
+from dynslam_bench.flow.searches.moth_flame import EMFOA, EMFOA_LITERAL, MFO, flame_counts
 
 SHIFT = np.array([1.3, -0.7, 2.1, -1.9])
 

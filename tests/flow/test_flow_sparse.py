@@ -13,7 +13,7 @@ from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
 from dynslam_bench.flow.build_flow import build_flow
 from dynslam_bench.flow.daisy.cost import tables_for
-from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
+from dynslam_bench.flow.daisy.sparse import Pair, SparseDaisyFlow
 from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.flow.searches.common import new_state
 from dynslam_bench.flow.searches.propagation import common_motions
@@ -27,6 +27,10 @@ SEARCHES = [
 ]  # fmt: skip
 DRAWING = [search for search in SEARCHES if search != "none+propagation"]
 METHODS = ["daisy", "lucas-kanade", "dis"]
+
+
+def pair_of(flow, image, target):
+    return Pair(flow.prepare(image), flow.prepare(target), tables_for(image.shape, flow.settings))
 
 
 def picture(seed=0, shape=(240, 320)):
@@ -79,7 +83,7 @@ def test_refinement_windows_of_every_size_align_to_a_fraction_of_a_pixel(window)
     flow = SparseDaisyFlow(FlowSettings(refinement_window_px=window))
     labels = np.zeros((len(points), 4), np.float32)
     labels[:, :2] = truth - points + np.random.default_rng(0).uniform(-1.5, 1.5, points.shape)
-    correlation = flow.refine(points, labels, flow.prepare(image), flow.prepare(target))
+    correlation = flow.refine(points, labels, pair_of(flow, image, target))
     error = np.hypot(*(points + labels[:, :2] - truth).T)
     assert np.median(error) < (0.25 if window == 5 else 0.1) and (correlation > 0.9).mean() > 0.9
     assert correlation.max() <= 1 + 1e-5
@@ -98,7 +102,7 @@ def test_points_at_the_border_are_refined_without_reading_beyond_the_image():
     rng = np.random.default_rng(0)
     labels = (rng.uniform(-1, 1, (len(points), 4)) * (200, 200, 1.2, 0.8)).astype(np.float32)
     before = labels.copy()
-    correlation = flow.refine(points, labels, flow.prepare(image), flow.prepare(target))
+    correlation = flow.refine(points, labels, pair_of(flow, image, target))
     assert np.isfinite(labels).all() and (np.abs(correlation) <= 1 + 1e-5).all()
     outside = ((points + before[:, :2] < 0) | (points + before[:, :2] > (159, 119))).any(axis=1)
     assert outside.sum() > 50 and (correlation[outside] == -1).all()
@@ -196,7 +200,7 @@ def test_searches_are_anytime_and_monotone(search):
     plan = make_plan(settings)
     extent = np.tile(np.array([40, 40, 1, 0.7], np.float32), (len(points), 1))
     state = new_state(len(points), plan.population, -extent, extent.copy(), tables.ceiling)
-    run = flow._runner(plan, described, reference, prepared, tables, state, 0)
+    run = flow._runner(plan, described, Pair(reference, prepared, tables), state, 0)
     candidates = np.zeros((len(points), 1, 4), np.float32)
     last = state.costs[:, 0].copy()
     for number, end in enumerate(plan.ends):

@@ -10,8 +10,8 @@ import torch
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.flow.build_flow import build_flow
 from dynslam_bench.flow.daisy import cost as matching
-from dynslam_bench.flow.daisy.descriptor import quantised_maps
 from dynslam_bench.flow.daisy.maps import orientation_maps
+from dynslam_bench.flow.daisy.torch_maps import quantised_maps
 from dynslam_bench.flow.daisy.torch_sparse import TorchSparseFlow
 from dynslam_bench.flow.searches.schedule import STRATEGIES
 from dynslam_bench.flow.searches.torch_search import label_costs, rotated_descriptors, torch_tables

@@ -28,10 +28,12 @@ def block(y0, y1, x0, x1):
 def instances(*masks, names=None, scores=None, moving=None):
     stack = np.stack(masks) if masks else np.zeros((0, H, W), bool)
     return Instances(
-        stack, boxes_of(stack), tuple(names or ["person"] * len(stack)),
+        stack,
+        boxes_of(stack),
+        tuple(names or ["person"] * len(stack)),
         np.array(scores if scores is not None else [0.9] * len(stack), np.float32),
         None if moving is None else np.array(moving, bool),
-    )  # fmt: skip
+    )
 
 
 def iou(a, b):

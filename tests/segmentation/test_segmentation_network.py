@@ -179,8 +179,11 @@ def test_the_three_published_layouts_load_strictly(tmp_path, layout, keys):
     state = published(config, layout)
     assert len(state) == keys
     if layout == "2019":
-        assert {"backbone.fpn.inner_blocks.0.weight", "rpn.head.conv.weight",
-                "roi_heads.mask_head.mask_fcn1.weight"} <= set(state)  # fmt: skip
+        assert {
+            "backbone.fpn.inner_blocks.0.weight",
+            "rpn.head.conv.weight",
+            "roi_heads.mask_head.mask_fcn1.weight",
+        } <= set(state)
     torch.save(state, tmp_path / "coco.pth")
     loaded = load_network(tmp_path / "coco.pth")
     assert loaded.config.blocks == (3, 4, 6, 3) and loaded.config.bottleneck and len(loaded.config.classes) == 90
@@ -196,8 +199,11 @@ def test_our_own_format_carries_the_shape(tmp_path):
     save_network(made, tmp_path / "half.pt", half=True)
     loaded = load_network(tmp_path / "own.pt")
     assert loaded.config == SMALL
-    assert all(torch.equal(value, loaded.state_dict()[key]) for key, value in made.state_dict().items()
-               if not key.endswith("num_batches_tracked"))  # fmt: skip
+    assert all(
+        torch.equal(value, loaded.state_dict()[key])
+        for key, value in made.state_dict().items()
+        if not key.endswith("num_batches_tracked")
+    )
     assert (tmp_path / "half.pt").stat().st_size < 0.7 * (tmp_path / "own.pt").stat().st_size
     assert next(load_network(tmp_path / "half.pt").parameters()).dtype == torch.float32
 

@@ -1,9 +1,13 @@
 """Settings, classes, oracle and recorded masks, and the choice among the sources."""
 
+import contextlib
+import functools
 import hashlib
+import http.server
 import json
 import subprocess
 import sys
+import threading
 
 import cv2
 import numpy as np
@@ -11,7 +15,9 @@ import pytest
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
+from dynslam_bench.core import download_progress
 from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
+from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.core.settings import apply_overrides, build, parameters
 from dynslam_bench.segmentation import build_segmenter as building
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
@@ -101,8 +107,14 @@ def test_class_tables():
 
 def test_any_image_becomes_rgb():
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    for image in (grey, grey[:, :, None], grey[:, :, None].repeat(3, 2), grey[:, :, None].repeat(4, 2),
-                  grey.astype(np.uint16) * 257, grey / 255.0):  # fmt: skip
+    for image in (
+        grey,
+        grey[:, :, None],
+        grey[:, :, None].repeat(3, 2),
+        grey[:, :, None].repeat(4, 2),
+        grey.astype(np.uint16) * 257,
+        grey / 255.0,
+    ):
         assert np.array_equal(as_rgb(image), grey[:, :, None].repeat(3, 2))
     for bad in (np.zeros((3, 4, 2), np.uint8), np.zeros(5, np.uint8), np.zeros((0, 4, 3), np.uint8),
                 np.full((3, 4), 2.0), np.full((3, 4), np.nan), np.zeros((3, 4), np.int32)):  # fmt: skip
@@ -202,7 +214,7 @@ def test_recorded_refuses_what_does_not_fit(tmp_path):
 
 
 def test_auto(monkeypatch, tmp_path):
-    monkeypatch.setenv(checkpoints.CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     auto = SegmentationSettings()
     monkeypatch.setattr(building, "embedded_weights", lambda: tmp_path / "embedded.pt")
     assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "embedded"
@@ -268,31 +280,64 @@ def test_plugins():
 # --- downloads ---------------------------------------------------------------------------------------------------
 
 
-def published(tmp_path, content, prefix=None):
-    file = tmp_path / "published.pth"
-    file.write_bytes(content)
-    digest = hashlib.sha256(content).hexdigest()
-    return checkpoints.Checkpoint("test", "test.pth", file.as_uri(), prefix or digest[:8], 1, "MIT", "nothing")
+@pytest.fixture
+def published(tmp_path):
+    """Publishes content at an address of this machine; returns its checkpoint."""
+    handler = functools.partial(QuietHandler, directory=str(tmp_path))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def publish(content, prefix=None):
+        (tmp_path / "published.pth").write_bytes(content)
+        url = f"http://127.0.0.1:{server.server_port}/published.pth"
+        sha256 = prefix or hashlib.sha256(content).hexdigest()[:8]
+        return checkpoints.Checkpoint("test", "test.pth", url, sha256, 1, "MIT", "nothing")
+
+    yield publish
+    server.shutdown()
+    server.server_close()
 
 
-def test_a_checkpoint_is_fetched_once_and_verified(monkeypatch, tmp_path):
-    monkeypatch.setenv(checkpoints.CACHE_VARIABLE, str(tmp_path / "cache"))
+class QuietHandler(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *args):
+        pass
+
+
+def test_a_checkpoint_is_fetched_once_and_verified(monkeypatch, tmp_path, published):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "cache"))
     content = bytes(range(256)) * 3000
-    checkpoint = published(tmp_path, content)
+    checkpoint = published(content)
     told = []
-    path = checkpoints.fetch_checkpoint(checkpoint, lambda done, total: told.append((done, total)))
-    assert path.read_bytes() == content and told[-1] == (len(content), len(content)) and len(told) > 1
+    path = checkpoints.fetch_checkpoint(checkpoint, told.append)
+    assert path.read_bytes() == content
+    whole = [(state.done, state.total) for state in told if state.stage == "download"]
+    assert whole[-1] == (len(content), len(content)) and len(whole) > 1
     (tmp_path / "published.pth").unlink()
     assert checkpoints.fetch_checkpoint(checkpoint) == path
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["test.pth"]
 
 
-def test_a_damaged_or_missing_download_leaves_nothing(monkeypatch, tmp_path):
-    monkeypatch.setenv(checkpoints.CACHE_VARIABLE, str(tmp_path / "cache"))
-    checkpoint = published(tmp_path, b"something else", prefix="00000000")
-    with pytest.raises(SegmentationError, match=r"damaged: SHA-256 .*expected 00000000.*put the file of"):
+def test_a_download_is_drawn_by_who_asked_for_it(monkeypatch, tmp_path, published):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(download_progress, "_shown", [])
+    drawn = []
+
+    @contextlib.contextmanager
+    def draw(name):
+        drawn.append(name)
+        yield drawn.append
+
+    download_progress.show_downloads(draw)
+    checkpoints.fetch_checkpoint(published(b"weights"))
+    assert drawn[0] == "test.pth" and [state.done for state in drawn[1:]] == [7, 7]
+
+
+def test_a_damaged_or_missing_download_leaves_nothing(monkeypatch, tmp_path, published):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "cache"))
+    checkpoint = published(b"something else", prefix="00000000")
+    with pytest.raises(SegmentationError, match=r"has the checksum .* expected 00000000 .put the file of .*1 MB"):
         checkpoints.fetch_checkpoint(checkpoint)
     (tmp_path / "published.pth").unlink()
-    with pytest.raises(SegmentationError, match=r"cannot fetch the checkpoint 'test'.*1 MB.*test.pth"):
+    with pytest.raises(SegmentationError, match=r"cannot fetch the checkpoint 'test': .* 404.*test.pth"):
         checkpoints.fetch_checkpoint(checkpoint)
     assert not list((tmp_path / "cache").iterdir())

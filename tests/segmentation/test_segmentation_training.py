@@ -14,9 +14,10 @@ from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network
 from dynslam_bench.segmentation.networks.mask_rcnn.roi_heads import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
-from dynslam_bench.segmentation.training.labelled import LabelledImage, open_labelled
+from dynslam_bench.segmentation.training.labelled import LabelledImage
 from dynslam_bench.segmentation.training.labelled_files import CocoImages, YoloImages, decode_runs
 from dynslam_bench.segmentation.training.labelled_sequences import RenderedFrames
+from dynslam_bench.segmentation.training.open_labelled import open_labelled
 from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
 from dynslam_bench.segmentation.training.train import network_config, train
@@ -168,8 +169,12 @@ def test_matching_and_sampling():
     best = match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist()
     assert best == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
     assert match(boxes, truth[:0], high=0.7, low=0.3, keep_best=True).tolist() == [NEGATIVE] * 5
-    chosen = sample(torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9), count=8, positive_share=0.25,
-                    generator=torch.Generator().manual_seed(0))  # fmt: skip
+    chosen = sample(
+        torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9),
+        count=8,
+        positive_share=0.25,
+        generator=torch.Generator().manual_seed(0),
+    )
     assert len(chosen.positive) == 2 and len(chosen.negative) == 6 and int(chosen.negative.max()) < 54
 
 
@@ -224,12 +229,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
 def test_losses_fall_on_a_simple_task_and_early_stop_ends_it(tmp_path):
     data = write_yolo(tmp_path / "data", 4)
     seen = []
-    train(settings_for(data, iterations=14, batch=2, evaluate_every=14, checkpoint_every=14),
-          tmp_path / "run", data_cache=tmp_path / "cache",
-          progress=lambda p: seen.append(sum(p.values.values())) if p.stage == "train" else None)  # fmt: skip
+    train(
+        settings_for(data, iterations=14, batch=2, evaluate_every=14, checkpoint_every=14),
+        tmp_path / "run",
+        data_cache=tmp_path / "cache",
+        progress=lambda p: seen.append(sum(p.values.values())) if p.stage == "train" else None,
+    )
     assert np.mean(seen[-3:]) < 0.75 * np.mean(seen[:3])
-    stopped = train(settings_for(data, iterations=50, evaluate_every=1, patience=1, learning_rate=1e-9, warmup=0),
-                    tmp_path / "stop", data_cache=tmp_path / "cache")  # fmt: skip
+    stopped = train(
+        settings_for(data, iterations=50, evaluate_every=1, patience=1, learning_rate=1e-9, warmup=0),
+        tmp_path / "stop",
+        data_cache=tmp_path / "cache",
+    )
     assert stopped.stopped == "no gain"
 
 

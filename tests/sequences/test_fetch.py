@@ -16,7 +16,7 @@ import pytest
 from sequence_folders import make_folder
 
 from dynslam_bench.core.download import download
-from dynslam_bench.core.errors import DynslamError, SequenceError
+from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError
 from dynslam_bench.sequences import fetch as fetching
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.fetch import Receipt, fetch, status, verify
@@ -414,7 +414,7 @@ def test_two_at_once(server, tmp_path):
     target = tmp_path / "file"
     with (tmp_path / "file.part.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(SequenceError, match="another process is downloading"):
+        with pytest.raises(DownloadError, match="another process is downloading"):
             download(server.url, target)
     download(server.url, target)
 

@@ -24,19 +24,26 @@ def part(name: object, offset: int = 0, **how: object) -> Part:
 def test_all_spellings_of_the_same_frames_are_one_part() -> None:
     first = part(f"{WALK}?frames=60")
     spellings = [
-        part(WALK, frames="0:60"), part(f"{WALK}@0", frames=(0, 60)), part(f"{WALK}@000?frames=60"),
-        part(f"{WALK}?frames=100", frames=":60"), part(f"{WALK}?frames=60", frames="0:90"),
+        part(WALK, frames="0:60"),
+        part(f"{WALK}@0", frames=(0, 60)),
+        part(f"{WALK}@000?frames=60"),
+        part(f"{WALK}?frames=100", frames=":60"),
+        part(f"{WALK}?frames=60", frames="0:90"),
         part(f"{WALK}?frames=60", frames="0:"),
-    ]  # fmt: skip
+    ]
     assert all(each == first for each in spellings) and first.id == f"{WALK}@0"
     assert part(WALK) == part(f"{WALK}?frames=600")
 
 
 def test_other_frames_instances_strides_and_cameras_are_other_blocks() -> None:
     others = [
-        part(WALK), part(WALK, frames="0:60"), part(WALK, frames="1:60"), part(WALK, frames="0:60", stride=2),
-        part(f"{WALK}@1", frames="0:60"), part("synthetic/walking_rpy", frames="0:60"),
-    ]  # fmt: skip
+        part(WALK),
+        part(WALK, frames="0:60"),
+        part(WALK, frames="1:60"),
+        part(WALK, frames="0:60", stride=2),
+        part(f"{WALK}@1", frames="0:60"),
+        part("synthetic/walking_rpy", frames="0:60"),
+    ]
     assert len({each.block for each in others}) == len(others)
 
 

@@ -73,6 +73,14 @@ class Reference(NamedTuple):
     appearance: NDArray[np.int32]
 
 
+class MatchingCosts(NamedTuple):
+    """What the searches compute costs from: points, the image they are sought in, tables."""
+
+    reference: Reference
+    target: Side
+    tables: CostTables
+
+
 def side(maps: OrientationMaps) -> Side:
     """The kernels' view of a prepared image."""
     return Side(maps.histograms.reshape(-1), maps.gray)
@@ -82,30 +90,30 @@ def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
     """The tables of an image's shape ``(H, W)`` under the settings' terms and weights of Eq. 1."""
     height, width = shape[:2]
     alpha, beta = (settings.intensity_weight, settings.gradient_weight) if settings.terms == 3 else (0.0, 0.0)
-    return cost_tables(
-        height, width, settings.truncation, alpha, settings.intensity_limit, beta, settings.gradient_limit,
-        settings.support, settings.support_spacing_px,
-    )  # fmt: skip
+    intensity, gradient = (alpha, settings.intensity_limit), (beta, settings.gradient_limit)
+    support = (settings.support, settings.support_spacing_px)
+    return cost_tables(height, width, settings.truncation, intensity, gradient, support)
+
+
+Term = tuple[float, float]
+"""Weight and limit of a term of Eq. 1."""
 
 
 @lru_cache(maxsize=32)
 def cost_tables(
-    height: int, width: int, truncation: float, alpha: float, intensity_limit: float, beta: float,
-    gradient_limit: float, support: int, spacing: int,
-) -> CostTables:  # fmt: skip
+    height: int, width: int, truncation: float, grey_level: Term, slope: Term, around: tuple[int, int]
+) -> CostTables:
     """Tables for an image size and the weights of Eq. 1.
 
     Args:
         height: Image height in pixels.
         width: Image width in pixels.
         truncation: t, largest L1 distance of one histogram of unit norm.
-        alpha: Weight of the grey-level term, for images in [0, 1].
-        intensity_limit: t1, grey levels in [0, 1].
-        beta: Weight of the gradient term.
-        gradient_limit: t2, grey levels a pixel, images in [0, 1].
-        support: Number of points around p: 1, 5 (cross) or 9 (square).
-        spacing: Distance of those points in pixels.
+        grey_level: alpha and t1 (grey levels) of the grey-level term, for images in [0, 1].
+        slope: beta and t2 (grey levels a pixel) of the gradient term, likewise.
+        around: Number of points around p (1, 5 for a cross, 9 for a square) and their distance in pixels.
     """
+    (alpha, intensity_limit), (beta, gradient_limit), (support, spacing) = grey_level, slope, around
     pattern = layout.sampling_table()
     geometry = map_geometry(height, width)
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
@@ -217,10 +225,8 @@ def descriptor_distance(x, y, si, ti, mine, descriptor, target, tables):  # type
     near, near_phase = cell_of(x, y, tables.ring0[si])
     far, far_phase = cell_of(x, y, tables.ring1[si])
     row = 4 * (si * layout.ROTATIONS + ti)
-    return descriptor_sum(
-        target.histograms, tables.samples, row + near_phase, row + far_phase, near, far, descriptor, mine,
-        tables.truncation,
-    )  # fmt: skip
+    theirs, near_row, far_row = target.histograms, row + near_phase, row + far_phase
+    return descriptor_sum(theirs, tables.samples, near_row, far_row, near, far, descriptor, mine, tables.truncation)
 
 
 @inlined

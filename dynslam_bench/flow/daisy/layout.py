@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-RADIUS = 16.0
 RINGS = 2
 ANGLES = 8
 BINS = 8

@@ -2,8 +2,8 @@
 
 Eight rectified directional derivatives are blurred in a cascade of seven Gaussians (`smoothing`). Maps of small
 Gaussians are kept at half, of large ones at quarter resolution; each histogram is normalised on its own (partial
-normalisation) and stored as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `daisy.py` is
-the reference.
+normalisation) and stored as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `tests/flow/
+daisy_reference.py` follows the definition.
 """
 
 from __future__ import annotations
@@ -79,9 +79,12 @@ def map_geometry(height: int, width: int) -> MapGeometry:
         bias.append(layout.SUBPIXEL // 2 + margin * step * layout.SUBPIXEL)
         total += (rows + 2 * margin) * (columns + 2 * margin)
     return MapGeometry(
-        np.asarray(base, dtype=np.int64), np.asarray(stride, dtype=np.int64), np.asarray(shift, dtype=np.int64),
-        np.asarray(bias, dtype=np.int64), total,
-    )  # fmt: skip
+        np.asarray(base, dtype=np.int64),
+        np.asarray(stride, dtype=np.int64),
+        np.asarray(shift, dtype=np.int64),
+        np.asarray(bias, dtype=np.int64),
+        total,
+    )
 
 
 def orientation_maps(
@@ -105,22 +108,19 @@ def orientation_maps(
     (rows, columns), (quarter_rows, quarter_columns) = _level_shape(height, width, 2), _level_shape(height, width, 4)
     buffers = buffers or BufferPool()
     histograms, whole, half = buffers.take(
-        (geometry.total, layout.BINS), (height + 2 * BORDER, width + 2 * BORDER),
+        (geometry.total, layout.BINS),
+        (height + 2 * BORDER, width + 2 * BORDER),
         (rows + 2 * BORDER, columns + 2 * BORDER),
-    )  # fmt: skip
+    )
     coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
     floor = np.float32(NORM_FLOOR * FIXED_POINT)
     blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
     fine = layout.LEVEL_STEPS.count(2)
     cells = histograms.reshape(-1)
-    run_stripes(
-        fine_levels, -(-rows // 2), threads, pool, gray, half, BORDER, blurs[:fine], geometry, layout.MARGIN // 2,
-        floor, cells, coarse,
-    )  # fmt: skip
-    run_stripes(
-        coarse_levels, quarter_rows, threads, pool, coarse, quarter_columns, blurs[fine:], fine, geometry,
-        layout.MARGIN // 4, floor, cells,
-    )  # fmt: skip
+    halves = (gray, half, BORDER, blurs[:fine], geometry, layout.MARGIN // 2)
+    run_stripes(fine_levels, -(-rows // 2), threads, pool, *halves, floor, cells, coarse)
+    quarters = (coarse, quarter_columns, blurs[fine:], fine, geometry, layout.MARGIN // 4)
+    run_stripes(coarse_levels, quarter_rows, threads, pool, *quarters, floor, cells)
     pad_image(half[BORDER : BORDER + rows, BORDER : BORDER + columns], BORDER, half)
     pad_image(gray, BORDER, whole)
     return OrientationMaps(gray, whole, half, histograms, geometry)
@@ -143,14 +143,6 @@ def framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     out = np.empty((image.shape[0] + 2 * BORDER, image.shape[1] + 2 * BORDER), dtype=np.uint8)
     pad_image(image, BORDER, out)
     return out
-
-
-@lru_cache(maxsize=64)
-def gaussian_weights(sigma: float) -> NDArray[np.float32]:
-    """Half of a normalised, sampled Gaussian: weight of the centre, then of each offset; cut at 2.5 sigma."""
-    radius = max(1, int(np.ceil(2.5 * sigma)))
-    weights = np.exp(-0.5 * (np.arange(radius + 1) / sigma) ** 2)
-    return np.asarray(weights / (weights[0] + 2 * weights[1:].sum()), dtype=np.float32)
 
 
 def _level_shape(height: int, width: int, step: int) -> tuple[int, int]:

@@ -6,6 +6,8 @@ warp is updated until it stands. Patch means are removed, so that a change of br
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..kernels.jit import inlined, kernel
@@ -19,6 +21,26 @@ FLAT_GRADIENT = 4.0 * 0.05
 """Smallest mean squared gradient along the worse direction: 0.05 squared levels a pixel, differences over two."""
 SIMILARITY_DAMPING = 0.1
 """Prior on the change of scale and rotation, relative to the translation's information at the window's edge."""
+
+
+class Window(NamedTuple):
+    """The square window that is aligned, and when to stop.
+
+    Attributes:
+        step: Full-image pixels a pixel of the images.
+        radius: In pixels of the images.
+        margin: Largest translation within one warp, in their pixels, at least 1.
+        warps: Times the target is warped, at most.
+        iterations: Translations a warp, at most.
+        tolerance: Stop below this change, in their pixels.
+    """
+
+    step: int
+    radius: int
+    margin: int
+    warps: int
+    iterations: int
+    tolerance: np.float32
 
 
 @kernel
@@ -66,9 +88,8 @@ def warp_patch(image, x, y, a, b, reach, columns, rows, out):  # type: ignore[no
 
 @kernel
 def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
-    start, stop, points, labels, template_image, target_image, border, step, radius, margin, warps, iterations,
-    tolerance, correlation,
-):  # fmt: skip
+    start, stop, points, labels, template_image, target_image, window, correlation
+):
     """Refine labels by photometric alignment of a square window.
 
     The target is warped by the label into the template's frame; within that patch only the translation moves (cheap),
@@ -83,17 +104,13 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
         stop: One past the last.
         points: float32 ``[N, 2]``, full-image pixels of the template image.
         labels: float32 ``[N, 4]``, changed in place.
-        template_image: uint8 ``[h + 2 border, w + 2 border]``, at 1 / `step` of the full resolution, edges repeated.
+        template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full resolution, edges repeated.
         target_image: Likewise.
-        border: Pixels repeated around the images.
-        step: Full-image pixels a pixel of these images.
-        radius: Window radius in their pixels.
-        margin: Largest translation within one warp, in their pixels, at least 1.
-        warps: Times the target is warped, at most.
-        iterations: Translations a warp, at most.
-        tolerance: Stop below this change, in their pixels.
+        window: `Window`, and when to stop.
         correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1 if flat or not seen.
     """
+    step, radius, margin, warps, iterations, tolerance = window
+    border = BORDER
     side, reach = 2 * radius + 1, radius + margin
     pitch = 2 * reach + 1
     length = 16 * ((side * pitch + 15) // 16)
@@ -254,9 +271,8 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
 
 @kernel
 def coarse_to_fine(  # type: ignore[no-untyped-def]
-    start, stop, points, labels, half_template, half_target, template, target, border, coarse, fine, iterations,
-    tolerance, correlation,
-):  # fmt: skip
+    start, stop, points, labels, half_template, half_target, template, target, coarse, fine, correlation
+):
     """`similarity_lucas_kanade` at half, then at full resolution.
 
     Args:
@@ -268,21 +284,12 @@ def coarse_to_fine(  # type: ignore[no-untyped-def]
         half_target: Half-resolution target image.
         template: Template image.
         target: Target image.
-        border: Pixels repeated around the images.
-        coarse: Radius, margin and warps at half resolution.
-        fine: Radius, margin and warps at full resolution.
-        iterations: Translations a warp, at most.
-        tolerance: Stop below this change, in the images' pixels.
+        coarse: `Window` at half resolution.
+        fine: `Window` at full resolution.
         correlation: float32 ``[N]``, filled with that of the full resolution.
     """
-    similarity_lucas_kanade(
-        start, stop, points, labels, half_template, half_target, border, 2, coarse[0], coarse[1], coarse[2],
-        iterations, tolerance, correlation,
-    )  # fmt: skip
-    similarity_lucas_kanade(
-        start, stop, points, labels, template, target, border, 1, fine[0], fine[1], fine[2], iterations, tolerance,
-        correlation,
-    )  # fmt: skip
+    similarity_lucas_kanade(start, stop, points, labels, half_template, half_target, coarse, correlation)
+    similarity_lucas_kanade(start, stop, points, labels, template, target, fine, correlation)
 
 
 @inlined

@@ -6,7 +6,9 @@ refinement, then the way back.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +24,14 @@ from ..searches.schedule import PROPAGATING, Phase, Plan, make_plan, phase_runne
 from ..settings import FlowSettings
 from . import layout
 from .consensus import dissenting_labels
-from .cost import CostTables, Reference, describe, reference_appearance, side, tables_for
+from .cost import CostTables, MatchingCosts, Reference, describe, reference_appearance, side, tables_for
 from .maps import OrientationMaps, orientation_maps
 from .neighbours import nearest_neighbours
-from .refinement import BORDER, coarse_to_fine, similarity_lucas_kanade
+from .refinement import Window, coarse_to_fine, similarity_lucas_kanade
 from .subpixel import parabola
 
-MOTION_HYPOTHESES = 192
-MOTION_TOLERANCE_PX = 5.0
+VOTE = (192, np.float32(5.0))
+"""Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
 NEIGHBOUR_WINDOW = 40
 PARABOLA_STEP_PX = 2.0
 COARSE = (7, 3, 2)
@@ -39,8 +41,16 @@ TOLERANCE_PX = 0.03
 MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
 
 
+class Pair(NamedTuple):
+    """Two prepared images, and the tables of their matching cost."""
+
+    reference: OrientationMaps
+    target: OrientationMaps
+    tables: CostTables
+
+
 class SparseDaisyFlow:
-    """Sparse flow on the processor; see `estimator.FlowEstimator`.
+    """Sparse flow on the processor; see `contracts.flow.FlowEstimator`.
 
     Args:
         settings: How.
@@ -82,43 +92,42 @@ class SparseDaisyFlow:
                 reference, target, points[usable], guess=None if guess is None else guess[usable], seed=seed
             )
             return _scatter(inner, points, usable)
-        return self._track(reference, target, points, guess, seed)
+        pair = Pair(reference, target, tables_for(reference.gray.shape, self.settings))
+        return self._track(pair, points, guess, seed)
 
     def _track(
-        self, reference: OrientationMaps, target: OrientationMaps, points: NDArray[np.float32],
-        guess: NDArray[np.float32] | None, seed: int,
-    ) -> FlowResult:  # fmt: skip
+        self, pair: Pair, points: NDArray[np.float32], guess: NDArray[np.float32] | None, seed: int
+    ) -> FlowResult:
         settings = self.settings
-        tables = tables_for(reference.gray.shape, settings)
-        described = self.describe(reference, points, tables)
+        described = self.describe(pair.reference, points, pair.tables)
         neighbours = self.neighbours(points)
-        state = self.search(described, reference, target, tables, neighbours, guess, seed)
+        state = self.search(described, pair, neighbours, guess, seed)
         labels, cost = state.flames[:, 0].copy(), state.costs[:, 0]
         evaluations = state.used.copy()
         n = len(points)
         if settings.refinement != "none":
-            self.parabola(described, labels, target, tables, evaluations)
-        valid = (cost < settings.max_cost * tables.ceiling) & (evaluations > 0)
+            self.parabola(described, labels, pair, evaluations)
+        valid = (cost < settings.max_cost * pair.tables.ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
-            correlation = self.refine(points, labels, reference, target)
+            correlation = self.refine(points, labels, pair)
             if settings.search in PROPAGATING and n > 2:
-                self.second_opinion(points, labels, correlation, neighbours, reference, target)
+                self.second_opinion(points, labels, correlation, neighbours, pair)
             valid &= correlation > settings.min_correlation
         xy = points + labels[:, :2]
-        height, width = target.gray.shape
+        height, width = pair.target.gray.shape
         valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
         if settings.forward_backward_px > 0:
             going = np.flatnonzero(valid)
-            back = self._way_back(points[going], xy[going], labels[going], reference, target)
+            back = self._way_back(points[going], xy[going], labels[going], pair)
             valid[going] = back <= settings.forward_backward_px
         stats = flow_stats(n, int(valid.sum()), int(evaluations.sum()))
-        return FlowResult(xy, valid, np.asarray(cost / tables.ceiling, dtype=np.float32), stats)
+        return FlowResult(xy, valid, np.asarray(cost / pair.tables.ceiling, dtype=np.float32), stats)
 
     def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
         """What the search needs of the reference points: their rotated descriptors and appearance."""
         count, supports = len(points), len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
-        run_stripes(describe, count, self.threads, self.pool, points, side(image), tables, descriptors)
+        self.stripes(describe, count, points, side(image), tables, descriptors)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
         if tables.appearance:
             reference_appearance(points, side(image), tables, appearance)
@@ -135,20 +144,22 @@ class SparseDaisyFlow:
         found = np.empty((n, count), dtype=np.int64)
         if count:
             order = np.argsort(points[:, 0], kind="stable")
-            run_stripes(nearest_neighbours, n, self.threads, self.pool, points[order], order, NEIGHBOUR_WINDOW, found)
+            self.stripes(nearest_neighbours, n, points[order], order, NEIGHBOUR_WINDOW, found)
         return found
 
-    def _runner(
-        self, plan: Plan, described: Reference, reference: OrientationMaps, target: OrientationMaps,
-        tables: CostTables, state: SearchState, seed: int,
-    ) -> Phase:  # fmt: skip
+    def _runner(self, plan: Plan, described: Reference, pair: Pair, state: SearchState, seed: int) -> Phase:
         """The function that spends one phase's evaluations on all points."""
-        return phase_runner(plan, self.settings, described, side(target), tables, state, seed, self.threads, self.pool)
+        costs = MatchingCosts(described, side(pair.target), pair.tables)
+        return phase_runner(plan, self.settings, costs, state, seed, self.stripes)
 
     def search(
-        self, described: Reference, reference: OrientationMaps, target: OrientationMaps, tables: CostTables,
-        neighbours: NDArray[np.int64], guess: NDArray[np.float32] | None, seed: int,
-    ) -> SearchState:  # fmt: skip
+        self,
+        described: Reference,
+        pair: Pair,
+        neighbours: NDArray[np.int64],
+        guess: NDArray[np.float32] | None,
+        seed: int,
+    ) -> SearchState:
         """The label search alone: phases of `FlowSettings.search` with propagation between them.
 
         Returns:
@@ -160,15 +171,13 @@ class SparseDaisyFlow:
         if guess is not None:
             offset = np.asarray(guess, dtype=np.float32).reshape(-1, 2) - points
             start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
-        extent = np.array(
-            [settings.range_px, settings.range_px, settings.scale_range_octaves,
-             np.deg2rad(settings.rotation_range_deg)], dtype=np.float32,
-        )  # fmt: skip
+        turn = np.deg2rad(settings.rotation_range_deg)
+        extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, turn], dtype=np.float32)
         lower, upper = start[:, 0] - extent, start[:, 0] + extent
         plan = make_plan(settings)
-        state = new_state(n, plan.population, lower, upper, tables.ceiling)
+        state = new_state(n, plan.population, lower, upper, pair.tables.ceiling)
         state.flames[:, :] = start
-        run = self._runner(plan, described, reference, target, tables, state, seed)
+        run = self._runner(plan, described, pair, state, seed)
         run(0, start if plan.shrink > 0 else _with_zero_flow(start))
         if settings.search in PROPAGATING:
             neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
@@ -177,46 +186,41 @@ class SparseDaisyFlow:
             for number in range(1, len(plan.ends)):
                 best = state.flames[:, 0].copy()
                 if settings.similarity_seeds:
-                    common_motions(
-                        points, best, state.costs[:, 0].copy(), MOTION_HYPOTHESES, np.float32(MOTION_TOLERANCE_PX),
-                        np.uint64(seed + number), motions,
-                    )  # fmt: skip
-                turns = label_turns(best)
-                run_stripes(
-                    transported_labels, n, self.threads, self.pool, points, best, turns, neighbours, motions, lower,
-                    upper, candidates,
-                )  # fmt: skip
+                    common_motions(points, best, state.costs[:, 0].copy(), *VOTE, np.uint64(seed + number), motions)
+                told = (label_turns(best), neighbours, motions)
+                self.stripes(transported_labels, n, points, best, *told, lower, upper, candidates)
                 run(number, candidates)
         return state
 
-    def parabola(
-        self, described: Reference, labels: NDArray[np.float32], target: OrientationMaps, tables: CostTables,
-        evaluations: NDArray[np.int64],
-    ) -> None:  # fmt: skip
-        """Move labels in place to the lowest point of a parabola through the costs around them; counts evaluations."""
-        run_stripes(
-            parabola, len(labels), self.threads, self.pool, labels, np.float32(PARABOLA_STEP_PX), described,
-            side(target), tables, evaluations,
-        )  # fmt: skip
+    def stripes(self, function: Callable[..., Any], count: int, *arguments: Any) -> None:
+        """`run_stripes` over the threads of this flow."""
+        run_stripes(function, count, self.threads, self.pool, *arguments)
 
-    def refine(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], reference: OrientationMaps,
-        target: OrientationMaps,
-    ) -> NDArray[np.float32]:  # fmt: skip
+    def parabola(
+        self, described: Reference, labels: NDArray[np.float32], pair: Pair, evaluations: NDArray[np.int64]
+    ) -> None:
+        """Move labels in place to the lowest point of a parabola through the costs around them; counts evaluations."""
+        step, target = np.float32(PARABOLA_STEP_PX), side(pair.target)
+        self.stripes(parabola, len(labels), labels, step, described, target, pair.tables, evaluations)
+
+    def refine(self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
         correlation = np.empty(len(points), dtype=np.float32)
-        fine = (self.settings.refinement_window_px // 2, FINE_MARGIN, FINE_WARPS)
-        run_stripes(
-            coarse_to_fine, len(points), self.threads, self.pool, points, labels, reference.framed_half,
-            target.framed_half, reference.framed, target.framed, BORDER, COARSE, fine,
-            self.settings.refinement_iterations, np.float32(TOLERANCE_PX), correlation,
-        )  # fmt: skip
+        radius, iterations = self.settings.refinement_window_px // 2, self.settings.refinement_iterations
+        coarse = Window(2, *COARSE, iterations, np.float32(TOLERANCE_PX))
+        fine = Window(1, radius, FINE_MARGIN, FINE_WARPS, iterations, np.float32(TOLERANCE_PX))
+        images = (pair.reference.framed_half, pair.target.framed_half, pair.reference.framed, pair.target.framed)
+        self.stripes(coarse_to_fine, len(points), points, labels, *images, coarse, fine, correlation)
         return correlation
 
     def second_opinion(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], correlation: NDArray[np.float32],
-        neighbours: NDArray[np.int64], reference: OrientationMaps, target: OrientationMaps,
-    ) -> None:  # fmt: skip
+        self,
+        points: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        correlation: NDArray[np.float32],
+        neighbours: NDArray[np.int64],
+        pair: Pair,
+    ) -> None:
         """Try what agreeing neighbours, then what most points say, where it contradicts a point's own label.
 
         The other label is taken where, refined, it looks as good: repetitive textures look alike one period off.
@@ -229,45 +233,47 @@ class SparseDaisyFlow:
         alternative = np.empty((n, 4), dtype=np.float32)
         dissents = np.empty(n, dtype=np.bool_)
         dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
-        self._reconsider(points, labels, correlation, alternative, dissents, reference, target)
+        self._reconsider(points, labels, correlation, alternative, dissents, pair)
         if not self.settings.similarity_seeds:
             return
         motions = np.empty((2, 4), dtype=np.float32)
         doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
-        common_motions(points, labels, doubt, MOTION_HYPOTHESES, np.float32(MOTION_TOLERANCE_PX), np.uint64(1), motions)
+        common_motions(points, labels, doubt, *VOTE, np.uint64(1), motions)
         predictions = np.empty((n, 2, 4), dtype=np.float32)
         nobody = np.empty((n, 0), np.int64)
         transported_labels(0, n, points, labels, turns, nobody, motions, -extent, extent, predictions)
         alternative = np.ascontiguousarray(predictions[:, 0])
         with np.errstate(invalid="ignore"):
             dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
-        self._reconsider(points, labels, correlation, alternative, dissents, reference, target)
+        self._reconsider(points, labels, correlation, alternative, dissents, pair)
 
     def _reconsider(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], correlation: NDArray[np.float32],
-        alternative: NDArray[np.float32], dissents: NDArray[np.bool_], reference: OrientationMaps,
-        target: OrientationMaps,
-    ) -> None:  # fmt: skip
+        self,
+        points: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        correlation: NDArray[np.float32],
+        alternative: NDArray[np.float32],
+        dissents: NDArray[np.bool_],
+        pair: Pair,
+    ) -> None:
         chosen = np.flatnonzero(dissents)
         if not len(chosen):
             return
         other = alternative[chosen]
-        seen = self.refine(points[chosen], other, reference, target)
+        seen = self.refine(points[chosen], other, pair)
         better = seen > correlation[chosen] - CONSENSUS_MARGIN
         labels[chosen[better]], correlation[chosen[better]] = other[better], seen[better]
 
     def _way_back(
-        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32],
-        reference: OrientationMaps, target: OrientationMaps,
-    ) -> NDArray[np.float32]:  # fmt: skip
+        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
+    ) -> NDArray[np.float32]:
         """Distance in pixels between each point and where the inverse label, refined the other way, takes it."""
         inverse = -labels
         correlation = np.empty(len(points), dtype=np.float32)
-        run_stripes(
-            similarity_lucas_kanade, len(points), self.threads, self.pool, np.ascontiguousarray(xy), inverse,
-            target.framed, reference.framed, BORDER, 1, self.settings.refinement_window_px // 2, BACK_MARGIN, 1,
-            self.settings.refinement_iterations, np.float32(TOLERANCE_PX), correlation,
-        )  # fmt: skip
+        radius, iterations = self.settings.refinement_window_px // 2, self.settings.refinement_iterations
+        window = Window(1, radius, BACK_MARGIN, 1, iterations, np.float32(TOLERANCE_PX))
+        ends, images = np.ascontiguousarray(xy), (pair.target.framed, pair.reference.framed)
+        self.stripes(similarity_lucas_kanade, len(points), ends, inverse, *images, window, correlation)
         distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
         return distance
 

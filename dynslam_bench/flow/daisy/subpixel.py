@@ -17,9 +17,9 @@ def parabola(start, stop, labels, step, reference, target, tables, used):  # typ
         stop: One past the last.
         labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
         step: Pixels.
-        reference: `matching.Reference`.
-        target: `matching.Side`.
-        tables: `matching.CostTables`.
+        reference: `cost.Reference`.
+        target: `cost.Side`.
+        tables: `cost.CostTables`.
         used: int64 ``[N]``, cost evaluations, counted on.
     """
     far = np.int64(1 << 40)

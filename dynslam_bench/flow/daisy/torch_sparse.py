@@ -19,10 +19,10 @@ from ..searches.common import SearchState
 from ..searches.schedule import Phase, Plan, cauchy_steps
 from ..searches.torch_search import TorchState, moth_flame_phase, random_phase, rotated_descriptors, torch_tables
 from ..settings import FlowSettings
-from .cost import CostTables, Reference
-from .descriptor import quantised_maps
+from .cost import Reference
 from .maps import OrientationMaps, framed, half_image
-from .sparse import SparseDaisyFlow
+from .sparse import Pair, SparseDaisyFlow
+from .torch_maps import quantised_maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class DeviceMaps(OrientationMaps):
 
 
 class TorchSparseFlow(SparseDaisyFlow):
-    """Sparse flow on any torch device; see `estimator.FlowEstimator`.
+    """Sparse flow on any torch device; see `contracts.flow.FlowEstimator`.
 
     Args:
         settings: How. The appearance terms of Eq. 1 exist on the processor only.
@@ -65,12 +65,10 @@ class TorchSparseFlow(SparseDaisyFlow):
         half = half_image(gray)
         return DeviceMaps(gray, framed(gray), framed(half), histograms.cpu().numpy(), geometry, histograms)
 
-    def _runner(
-        self, plan: Plan, described: Reference, reference: OrientationMaps, target: OrientationMaps,
-        tables: CostTables, state: SearchState, seed: int,
-    ) -> Phase:  # fmt: skip
+    def _runner(self, plan: Plan, described: Reference, pair: Pair, state: SearchState, seed: int) -> Phase:
+        reference, target = pair.reference, pair.target
         assert isinstance(reference, DeviceMaps) and isinstance(target, DeviceMaps)
-        device_tables = torch_tables(tables, reference.gray.shape, self.device)
+        device_tables = torch_tables(pair.tables, reference.gray.shape, self.device)
         points = torch.from_numpy(described.points).to(self.device)
         descriptors = rotated_descriptors(reference.on_device, points, device_tables)
         lower, upper = torch.from_numpy(state.lower).to(self.device), torch.from_numpy(state.upper).to(self.device)

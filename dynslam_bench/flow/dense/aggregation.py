@@ -23,9 +23,9 @@ def aggregate_and_choose(  # type: ignore[no-untyped-def]
         starts: `Superpixels.starts`.
         centres: float32 ``[K, 2]``, full-image pixels.
         candidates: float32 ``[K, C, 4]``, labels around the centres; NaN means none.
-        reference: `matching.Side`.
-        target: `matching.Side`.
-        tables: `matching.CostTables` without support.
+        reference: `cost.Side`.
+        target: `cost.Side`.
+        tables: `cost.CostTables` without support.
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
         radius: Of the guided filter, half-resolution pixels.
         epsilon: Of the guided filter.

@@ -14,7 +14,7 @@ from .labels import DenseDaisyFlow
 
 
 class DensePointFlow:
-    """The paper's flow (Eq. 1-3 over every pixel), read at the points; see `estimator.FlowEstimator`.
+    """The paper's flow (Eq. 1-3 over every pixel), read at the points; see `contracts.flow.FlowEstimator`.
 
     The field is read at the pixel that a point lies in, never between two: across the border of a moving thing a mean
     of two motions is nobody's. A point is valid if its pixel is (`dense_forward_backward_px`), if its way back ends

@@ -3,49 +3,27 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..kernels.jit import inlined, kernel
 
 
-def guided_filter(
-    guide: NDArray[np.floating], values: NDArray[np.floating], radius: int, epsilon: float
-) -> NDArray[np.float32]:
+@kernel
+def filter_patch(guide, values, height, width, radius, epsilon, work, out):  # type: ignore[no-untyped-def]
     """Edge-preserving average of `values` that follows the edges of `guide`.
 
     Within each ``(2 radius + 1)**2`` window (clipped at the image's edge) the output is a linear function of the guide;
     overlapping windows are averaged.
 
     Args:
-        guide: ``[H, W]``, grey levels in [0, 1].
-        values: ``[H, W]``, what is filtered (matching costs).
+        guide: float32, flat ``[height * width]``, grey levels in [0, 1].
+        values: float32, flat, what is filtered (matching costs).
+        height: Of the image.
+        width: Of the image.
         radius: Of the window, pixels.
         epsilon: Regularisation, squared grey levels.
-
-    Returns:
-        float32 ``[H, W]``.
-
-    Raises:
-        ValueError: The images differ in size, or radius or epsilon is negative.
+        work: float32 ``[6, height * width]``, scratch.
+        out: float32, flat, filled.
     """
-    if guide.ndim != 2 or guide.shape != values.shape:
-        raise ValueError(f"guide and values must be images of one size, got {guide.shape} and {values.shape}")
-    if radius < 0 or not epsilon >= 0:
-        raise ValueError(f"radius and epsilon must not be negative, got {radius} and {epsilon}")
-    out = np.empty(guide.shape, dtype=np.float32)
-    height, width = guide.shape
-    work = np.empty((6, height * width), dtype=np.float32)
-    filter_patch(
-        np.ascontiguousarray(guide, dtype=np.float32).reshape(-1),
-        np.ascontiguousarray(values, dtype=np.float32).reshape(-1),
-        height, width, radius, np.float32(epsilon), work, out.reshape(-1),
-    )  # fmt: skip
-    return out
-
-
-@kernel
-def filter_patch(guide, values, height, width, radius, epsilon, work, out):  # type: ignore[no-untyped-def]
-    """`guided_filter` on flat float32 arrays of ``height * width``; `work` is float32 ``[6, height * width]``."""
     n = height * width
     mean_guide, mean_value = work[0, :n], work[1, :n]
     product, square, line = work[2, :n], work[3, :n], work[4, :n]

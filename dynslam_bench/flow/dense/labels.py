@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from ..daisy.cost import side, tables_for
 from ..daisy.maps import OrientationMaps
 from ..daisy.refinement import BORDER
-from ..daisy.sparse import SparseDaisyFlow
+from ..daisy.sparse import Pair, SparseDaisyFlow
 from ..degenerate import says_nothing
-from ..kernels.workers import run_stripes
 from ..searches.propagation import label_turns, transported_labels
 from ..settings import FlowSettings
 from .aggregation import aggregate_and_choose, spread_labels
@@ -88,9 +87,11 @@ class DenseDaisyFlow:
         if says_nothing(reference.gray, target.gray):
             shape = (height, width)
             return DenseFlow(
-                np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_), np.zeros(shape, np.float32),
+                np.zeros((*shape, 2), np.float32),
+                np.zeros(shape, np.bool_),
+                np.zeros(shape, np.float32),
                 {"evaluations": 0.0, "valid": 0.0, "degenerate": 1.0},
-            )  # fmt: skip
+            )
         forward = self._one_way(reference, target, seed)
         valid = np.ones((height, width), dtype=np.bool_)
         rounds, back = [forward], None
@@ -125,7 +126,7 @@ class _OneWay:
         self, settings: FlowSettings, sparse: SparseDaisyFlow, reference: OrientationMaps, target: OrientationMaps
     ) -> None:
         self.settings, self._sparse = settings, sparse
-        self._reference, self._target = reference, target
+        self._pair = Pair(reference, target, tables_for(reference.gray.shape, sparse.settings))
         self.half = np.ascontiguousarray(reference.framed_half[BORDER:-BORDER, BORDER:-BORDER])
         self.regions = superpixels(self.half, max(2, settings.dense_superpixel_px // 2))
         self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
@@ -136,19 +137,18 @@ class _OneWay:
 
     def found(self, seed: int) -> None:
         """Search a label for each region and let its pixels choose among it and the neighbours'."""
-        sparse, reference, target = self._sparse, self._reference, self._target
-        tables = tables_for(reference.gray.shape, sparse.settings)
+        sparse, pair = self._sparse, self._pair
         near = sparse.nearest(self.centres)
         neighbours = sparse.neighbours(self.centres)
-        described = sparse.describe(reference, self.centres, tables)
-        state = sparse.search(described, reference, target, tables, neighbours, None, seed)
+        described = sparse.describe(pair.reference, self.centres, pair.tables)
+        state = sparse.search(described, pair, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
         if self.settings.refinement == "lucas-kanade":
-            correlation = sparse.refine(self.centres, labels, reference, target)
+            correlation = sparse.refine(self.centres, labels, pair)
             if neighbours.shape[1] > 1:
-                sparse.second_opinion(self.centres, labels, correlation, neighbours, reference, target)
+                sparse.second_opinion(self.centres, labels, correlation, neighbours, pair)
         elif self.settings.refinement == "parabola":
-            sparse.parabola(described, labels, target, tables, state.used)
+            sparse.parabola(described, labels, pair, state.used)
         self.evaluations += int(state.used.sum())
         self._choose(self._candidates(labels, near))
 
@@ -162,32 +162,29 @@ class _OneWay:
             self._choose(np.ascontiguousarray(suggested[:, None]))
             return
         refined = suggested.copy()
-        self._sparse.refine(self.centres, refined, self._reference, self._target)
+        self._sparse.refine(self.centres, refined, self._pair)
         self._choose(np.stack([suggested, refined], axis=1))
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         evaluations = np.zeros(len(self.centres), dtype=np.int64)
-        run_stripes(
-            aggregate_and_choose, len(self.centres), self._sparse.threads, self._sparse.pool, self.regions.members,
-            self.regions.starts, self.centres, candidates, side(self._reference), side(self._target), self._tables,
-            self.half.astype(np.float32) / np.float32(255), max(1, self.settings.dense_filter_radius_px // 2),
-            np.float32(self.settings.dense_filter_epsilon), self._best, self._winner, evaluations,
-        )  # fmt: skip
+        shape = (self.regions.members, self.regions.starts, self.centres, candidates)
+        sides = (side(self._pair.reference), side(self._pair.target), self._tables)
+        guide, radius = self.half.astype(np.float32) / np.float32(255), self.settings.dense_filter_radius_px
+        smoothing = (guide, max(1, radius // 2), np.float32(self.settings.dense_filter_epsilon))
+        chosen = (self._best, self._winner, evaluations)
+        self._sparse.stripes(aggregate_and_choose, len(self.centres), *shape, *sides, *smoothing, *chosen)
         self.evaluations += int(evaluations.sum())
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
-        height, width = self._reference.gray.shape
+        height, width = self._pair.reference.gray.shape
         flow = np.empty((height, width, 2), dtype=np.float32)
-        run_stripes(
-            spread_labels, height, self._sparse.threads, self._sparse.pool, self._winner, self.regions.labels,
-            self.centres, flow,
-        )  # fmt: skip
+        self._sparse.stripes(spread_labels, height, self._winner, self.regions.labels, self.centres, flow)
         return flow
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        height, width = self._reference.gray.shape
+        height, width = self._pair.reference.gray.shape
         y = np.minimum(np.arange(height) // 2, self.half.shape[0] - 1)
         x = np.minimum(np.arange(width) // 2, self.half.shape[1] - 1)
         share = self._best[np.ix_(y, x)] / np.float32(self._tables.ceiling)

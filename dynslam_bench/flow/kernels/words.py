@@ -1,7 +1,7 @@
 """Thirty-two uint16 numbers as one value inside the compiled kernels: four histograms of eight bins.
 
 Whole numbers throughout (but for one square root and division, which IEEE 754 defines to the last bit), so that every
-processor, and `daisy.quantised_maps` on every torch device, gets the same bytes.
+processor, and `daisy.torch_maps` on every torch device, gets the same bytes.
 """
 
 from __future__ import annotations

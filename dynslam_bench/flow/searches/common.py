@@ -57,7 +57,7 @@ def scrambled(state):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def stream(seed, point, phase):  # type: ignore[no-untyped-def]
+def first_state(seed, point, phase):  # type: ignore[no-untyped-def]
     """First state of a point's random numbers in one phase: a hash of its arguments."""
     return scrambled(np.uint64(seed) + _GOLDEN * (np.uint64(point) * np.uint64(64) + np.uint64(phase) + np.uint64(1)))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..daisy.cost import label_cost
 from ..kernels.jit import kernel
-from .common import advance, insert, scrambled, stream, uniform, widen
+from .common import advance, first_state, insert, scrambled, uniform, widen
 
 
 @kernel
@@ -19,9 +19,9 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
     Args:
         start: First point.
         stop: One past the last.
-        reference: `matching.Reference`.
-        target: `matching.Side`.
-        tables: `matching.CostTables`.
+        reference: `cost.Reference`.
+        target: `cost.Side`.
+        tables: `cost.CostTables`.
         state: `common.SearchState`, changed in place; only the best label is used.
         candidates: float32 ``[N, C, 4]``, labels to try first; not finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
@@ -34,7 +34,7 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
     flames, costs = np.empty((1, 4), dtype=np.float32), np.empty(1, dtype=np.int64)
     lower, upper = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
     for i in range(start, stop):
-        random = stream(seed, i, phase)
+        random = first_state(seed, i, phase)
         for j in range(4):
             lower[j], upper[j], flames[0, j] = state.lower[i, j], state.upper[i, j], state.flames[i, 0, j]
         costs[0] = state.costs[i, 0]

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..daisy.cost import CostTables, Reference, Side
-from ..kernels.workers import run_stripes
+from ..daisy.cost import MatchingCosts
 from ..settings import FlowSettings, SearchName
-from . import rules as rule_book
+from . import moth_flame
 from .common import SearchState
-from .moth_flame import moth_flame_phase
+from .moth_flame_kernel import moth_flame_phase
 from .patchmatch import shrinking_window_phase
 
 
@@ -29,25 +27,27 @@ class Strategy(NamedTuple):
         propagates: Whether neighbours exchange their labels between phases.
     """
 
-    rules: rule_book.MothFlameRules | None
+    rules: moth_flame.MothFlameRules | None
     shrink: float
     propagates: bool
 
 
 STRATEGIES: dict[SearchName, Strategy] = {
-    "emfoa+propagation": Strategy(rule_book.EMFOA, 0.5, True),
-    "emfoa-literal+propagation": Strategy(rule_book.EMFOA_LITERAL, 0.5, True),
+    "emfoa+propagation": Strategy(moth_flame.EMFOA, 0.5, True),
+    "emfoa-literal+propagation": Strategy(moth_flame.EMFOA_LITERAL, 0.5, True),
     "patchmatch": Strategy(None, 0.5, True),
     "random+propagation": Strategy(None, 1.0, True),
     "none+propagation": Strategy(None, 0.0, True),
-    "emfoa": Strategy(rule_book.EMFOA, 0.5, False),
-    "mfo": Strategy(rule_book.MFO, 0.5, False),
-    "emfoa-literal": Strategy(rule_book.EMFOA_LITERAL, 0.5, False),
+    "emfoa": Strategy(moth_flame.EMFOA, 0.5, False),
+    "mfo": Strategy(moth_flame.MFO, 0.5, False),
+    "emfoa-literal": Strategy(moth_flame.EMFOA_LITERAL, 0.5, False),
     "random": Strategy(None, 1.0, False),
 }
 PROPAGATING: frozenset[SearchName] = frozenset(name for name, each in STRATEGIES.items() if each.propagates)
 
 Phase = Callable[[int, NDArray[np.float32]], None]
+Stripes = Callable[..., Any]
+"""Called as ``stripes(kernel, count, *arguments)``; see `kernels.workers.run_stripes`."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Plan:
 
     population: int
     ends: tuple[int, ...]
-    rules: rule_book.MothFlameRules | None
+    rules: moth_flame.MothFlameRules | None
     iterations: int
     shrink: float
 
@@ -89,27 +89,22 @@ def cauchy_steps(settings: FlowSettings) -> NDArray[np.float32]:
 
 
 def phase_runner(
-    plan: Plan, settings: FlowSettings, reference: Reference, target: Side, tables: CostTables, state: SearchState,
-    seed: int, threads: int, pool: ThreadPoolExecutor | None,
-) -> Phase:  # fmt: skip
-    """The function that runs one phase: ``run(number, candidates)``, on all points."""
-    count = len(reference.points)
+    plan: Plan, settings: FlowSettings, costs: MatchingCosts, state: SearchState, seed: int, stripes: Stripes
+) -> Phase:
+    """The function that runs one phase: ``run(number, candidates)``, on all points; `stripes` divides them."""
+    count = len(costs.reference.points)
     if plan.rules is None:
 
         def random_phase(number: int, candidates: NDArray[np.float32]) -> None:
-            run_stripes(
-                shrinking_window_phase, count, threads, pool, reference, target, tables, state, candidates,
-                plan.ends[number], number, np.uint64(seed), np.float32(plan.shrink),
-            )  # fmt: skip
+            limits = (plan.ends[number], number, np.uint64(seed), np.float32(plan.shrink))
+            stripes(shrinking_window_phase, count, *costs, state, candidates, *limits)
 
         return random_phase
-    table = rule_book.flight_table(plan.population, plan.iterations, plan.rules)
-    steps = cauchy_steps(settings)
+    table = moth_flame.flight_table(plan.population, plan.iterations, plan.rules)
+    looked_up = (table, moth_flame.spiral_table(), moth_flame.cauchy_table(), cauchy_steps(settings))
 
-    def moth_flame(number: int, candidates: NDArray[np.float32]) -> None:
-        run_stripes(
-            moth_flame_phase, count, threads, pool, reference, target, tables, state, candidates, plan.ends[number],
-            number, np.uint64(seed), table, rule_book.spiral_table(), rule_book.cauchy_table(), steps,
-        )  # fmt: skip
+    def flying_phase(number: int, candidates: NDArray[np.float32]) -> None:
+        limits = (plan.ends[number], number, np.uint64(seed))
+        stripes(moth_flame_phase, count, *costs, state, candidates, *limits, *looked_up)
 
-    return moth_flame
+    return flying_phase

@@ -1,7 +1,7 @@
 """Matching cost and label searches as batched torch code: the reference of the kernels, and the path for GPUs.
 
-Costs are the same whole numbers as those of `matching` (given equal maps). Random numbers come from a generator on the
-processor, so that every device sees the same ones.
+Costs are the same whole numbers as those of `daisy.cost` (given equal maps). Random numbers come from a generator on
+the processor, so that every device sees the same ones.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from torch import Tensor
 
 from ..daisy import layout
 from ..daisy.cost import OUTSIDE, CostTables
-from .rules import MothFlameRules, flame_counts, flight, flown, opposites
+from .moth_flame import MothFlameRules, landed, opposites
 
 
 class TorchTables(NamedTuple):
-    """`matching.CostTables` on a device."""
+    """`cost.CostTables` on a device."""
 
     samples: Tensor
     ring0: Tensor
@@ -90,7 +90,7 @@ def label_costs(points: Tensor, labels: Tensor, descriptors: Tensor, histograms:
 
     Args:
         points: float32 ``[N, 2]``.
-        labels: float32 ``[N, L, 4]``; labels that are not finite or leave the image cost `matching.OUTSIDE`.
+        labels: float32 ``[N, L, 4]``; labels that are not finite or leave the image cost `cost.OUTSIDE`.
         descriptors: uint8 ``[N, S, ROTATIONS, 17, 8]``.
         histograms: uint8 ``[total, 8]`` of the target.
         tables: Of the image size.
@@ -179,10 +179,9 @@ def moth_flame_phase(
     state: TorchState, candidates: Tensor, end: int, phase: int, rules: MothFlameRules, iterations: int,
     steps: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """The batched counterpart of `searches.moth_flame.moth_flame_phase` (Eq. 4-22)."""
+    """The batched counterpart of `searches.moth_flame_kernel.moth_flame_phase` (Eq. 4-22)."""
     count, population = state.costs.shape
     device = state.points.device
-    counts = flame_counts(population, iterations, rules)
     state.evaluate(candidates, end)
     state.widen()
     if phase == 0:
@@ -199,8 +198,6 @@ def moth_flame_phase(
     scale = torch.as_tensor(steps, device=device)
     while int(state.used.min()) < end:
         iteration = min(max((int(state.used.min()) - founding) // population, 0), iterations - 1)
-        flames = state.flames[:, torch.arange(population, device=device).clamp(max=int(counts[iteration]) - 1)]  # Eq. 8
-        now = flight((iteration + 1) / iterations, rules)
-        position = flown(torch, state.moths, state.flames, flames, state.flames[:, :1], now, scale, state.random)
+        position = landed(torch, state.moths, state.flames, iteration + 1, iterations, rules, scale, state.random)
         state.moths = position.maximum(state.lower).minimum(state.upper)
         state.evaluate(state.moths, end)

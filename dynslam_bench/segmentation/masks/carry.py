@@ -78,16 +78,21 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
     rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
     back = field  # the flow at the place a pixel came from: x = x' - f(x), by fixed-point iteration
     for _ in range(3):
-        back = np.asarray(cv2.remap(field, columns - back[:, :, 0], rows - back[:, :, 1], cv2.INTER_LINEAR,
-                                    borderMode=cv2.BORDER_REPLICATE), np.float32)  # fmt: skip
+        back = np.asarray(
+            cv2.remap(
+                field, columns - back[:, :, 0], rows - back[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            ),
+            np.float32,
+        )
     scale = np.array([width / field.shape[1], height / field.shape[0]], np.float32)
     full = back * scale
     if field.shape[:2] != (height, width):
         full = np.asarray(cv2.resize(full, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     at_x = np.arange(width, dtype=np.float32)[None] - full[:, :, 0]
     at_y = np.arange(height, dtype=np.float32)[:, None] - full[:, :, 1]
-    moved = cv2.remap(mask.view(np.uint8) * np.uint8(255), at_x, at_y, cv2.INTER_LINEAR,
-                      borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    moved = cv2.remap(
+        mask.view(np.uint8) * np.uint8(255), at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return np.asarray(np.asarray(moved) >= 128)
 
 
@@ -158,9 +163,11 @@ def _similarity(mask: NDArray[np.bool_], previous: Gray, current: Gray) -> NDArr
     if np.count_nonzero(consistent) < LEAST_CORNERS:
         return None
     motion, _ = cv2.estimateAffinePartial2D(
-        corners.reshape(-1, 2)[consistent], there.reshape(-1, 2)[consistent], method=cv2.RANSAC,
+        corners.reshape(-1, 2)[consistent],
+        there.reshape(-1, 2)[consistent],
+        method=cv2.RANSAC,
         ransacReprojThreshold=2.0,
-    )  # fmt: skip
+    )
     return None if motion is None else np.asarray(motion, np.float64)
 
 

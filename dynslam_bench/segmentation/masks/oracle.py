@@ -28,8 +28,10 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
     ids = [int(number) for number in np.unique(labels) if number != 0]
     nameless = [number for number in ids if number not in masks.class_names]
     if nameless:
-        raise SegmentationError(f"{where}: instance {nameless[0]} has no class name", "known ids: "
-                                + (", ".join(map(str, sorted(masks.class_names))) or "none"))  # fmt: skip
+        raise SegmentationError(
+            f"{where}: instance {nameless[0]} has no class name",
+            "known ids: " + (", ".join(map(str, sorted(masks.class_names))) or "none"),
+        )
     if not ids:
         empty = Instances.empty(labels.shape[0], labels.shape[1])
         return Instances(empty.masks, empty.boxes, (), empty.scores, np.zeros(0, bool))

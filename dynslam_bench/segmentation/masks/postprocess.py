@@ -130,8 +130,9 @@ def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], band: int
         return mask
     window = (4 * band + 1, 4 * band + 1)
     weight = cv2.boxFilter(core.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    total = cv2.boxFilter(np.where(core, depth, 0).astype(np.float32), -1, window, normalize=False,
-                          borderType=cv2.BORDER_CONSTANT)  # fmt: skip
+    total = cv2.boxFilter(
+        np.where(core, depth, 0).astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
     judged = valid & (weight >= 1) & (inside <= band) & (outside <= band) & ~core
     near = np.abs(depth - total / np.maximum(weight, 1)) <= step
     return np.asarray(np.where(judged, near, mask))

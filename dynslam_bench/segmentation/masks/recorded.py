@@ -43,17 +43,23 @@ class RecordedSegmenter:
         files = sorted(self.folder.glob("*.png")) if self.folder.is_dir() else []
         if not files:
             reason = "holds no PNG files" if self.folder.is_dir() else "does not exist"
-            raise SegmentationError(f"the folder of recorded masks {self.folder} {reason}",
-                                    "it needs one PNG a frame, named by stamp or index")  # fmt: skip
+            raise SegmentationError(
+                f"the folder of recorded masks {self.folder} {reason}",
+                "it needs one PNG a frame, named by stamp or index",
+            )
         stamped = [file for file in files if "." in file.stem]
         if stamped and len(stamped) != len(files):
-            raise SegmentationError(f"{self.folder}: {len(stamped)} of {len(files)} mask files are named by stamp, "
-                                    "the others are not", "name all by stamp or all by index")  # fmt: skip
+            raise SegmentationError(
+                f"{self.folder}: {len(stamped)} of {len(files)} mask files are named by stamp, the others are not",
+                "name all by stamp or all by index",
+            )
         try:
             numbers = [float(file.stem) if stamped else int(file.stem) for file in files]
         except ValueError as error:
-            raise SegmentationError(f"{self.folder}: a mask file is named neither by stamp nor by index: {error}",
-                                    "for example 1311868164.363181.png or 000012.png") from error  # fmt: skip
+            raise SegmentationError(
+                f"{self.folder}: a mask file is named neither by stamp nor by index: {error}",
+                "for example 1311868164.363181.png or 000012.png",
+            ) from error
         self.by_stamp = bool(stamped)
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = np.asarray(numbers, np.float64)[order]
@@ -103,9 +109,10 @@ class RecordedSegmenter:
                 f"the nearest is {self._files[nearest].name}, {difference:.3f} s away",
             )
         if not self.by_stamp and difference > 0:
-            raise SegmentationError(f"no recorded mask of frame {frame.index} in {self.folder}",
-                                    f"there are {len(self._files)}, indices {self._keys[0]:.0f} to "
-                                    f"{self._keys[-1]:.0f}")  # fmt: skip
+            raise SegmentationError(
+                f"no recorded mask of frame {frame.index} in {self.folder}",
+                f"there are {len(self._files)}, indices {self._keys[0]:.0f} to {self._keys[-1]:.0f}",
+            )
         path: Path = self._files[nearest]
         return path
 
@@ -113,8 +120,10 @@ class RecordedSegmenter:
         if self._names is None:
             return "person"
         if value not in self._names:
-            raise SegmentationError(f"{path}: object {value} has no class in {CLASSES_FILE}",
-                                    "known: " + ", ".join(map(str, sorted(self._names))))  # fmt: skip
+            raise SegmentationError(
+                f"{path}: object {value} has no class in {CLASSES_FILE}",
+                "known: " + ", ".join(map(str, sorted(self._names))),
+            )
         return self._names[value]
 
 

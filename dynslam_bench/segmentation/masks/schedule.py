@@ -108,7 +108,6 @@ def build_mask_stage(
         SegmentationError: The source is not available here.
     """
     segmenter = build_segmenter(
-        settings, sequence_id=sequence_id, masks=masks, device=device, threads=threads, deferred=deferred,
-        also=also,
-    )  # fmt: skip
+        settings, sequence_id=sequence_id, masks=masks, device=device, threads=threads, deferred=deferred, also=also
+    )
     return None if segmenter is None else MaskScheduler(settings, segmenter)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
 
 COLOURS = ((180, 119, 31), (14, 127, 255), (44, 160, 44), (40, 39, 214), (189, 103, 148), (75, 86, 140))
 """BGR."""

@@ -13,12 +13,14 @@ from pydantic import ConfigDict
 from dynslam_bench.contracts.segmenter import Segmenter
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.core.records import Record, write_atomic
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.records import Record
 
 from ..build_segmenter import build_segmenter, resolve_source, weights_digest
 from ..settings import SegmentationSettings
-from .labelled import LabelledImages, open_labelled
+from .labelled import LabelledImages
 from .mask_metrics import MaskQuality, MaskTally
+from .open_labelled import open_labelled
 
 Progress = Callable[[int, int], None]
 
@@ -88,8 +90,11 @@ def evaluate_segmenter(
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
     quality, seconds = measure(segmenter, images, settings, min_area=min_area, limit=limit, progress=progress)
-    classes = {name: {key: _finite(value) for key, value in asdict(one).items()}
-               for name, one in quality.classes.items() if one.truths or one.detections}  # fmt: skip
+    classes = {
+        name: {key: _finite(value) for key, value in asdict(one).items()}
+        for name, one in quality.classes.items()
+        if one.truths or one.detections
+    }
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
         data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,

@@ -51,13 +51,16 @@ class CocoImages:
             for entry in content["annotations"]:
                 if not entry.get("iscrowd"):
                     shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
-            self._entries = [_Entry(folder / entry["file_name"], tuple(shapes[int(entry["id"])]))
-                             for entry in content["images"]]  # fmt: skip
+            self._entries = [
+                _Entry(folder / entry["file_name"], tuple(shapes[int(entry["id"])])) for entry in content["images"]
+            ]
         except OSError as error:
             raise SegmentationError(f"cannot read {self.path}: {error.strerror}") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise SegmentationError(f"{self.path} is not in COCO's annotation format: {type(error).__name__} {error}",
-                                    "it needs images, annotations and categories") from error  # fmt: skip
+            raise SegmentationError(
+                f"{self.path} is not in COCO's annotation format: {type(error).__name__} {error}",
+                "it needs images, annotations and categories",
+            ) from error
         if not self._entries:
             raise SegmentationError(f"{self.path} lists no images")
 
@@ -127,8 +130,9 @@ class YoloImages:
                 name = COCO_NAMES[int(kind)]
                 polygon = np.array(points, np.float64).reshape(-1, 2) * [rgb.shape[1], rgb.shape[0]]
             except (ValueError, IndexError) as error:
-                raise SegmentationError(f"{label} line {number} is no polygon label: {error}",
-                                        "expected class x1 y1 x2 y2 ...") from error  # fmt: skip
+                raise SegmentationError(
+                    f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
+                ) from error
             masks.append(_fill([polygon], rgb.shape[:2]))
             names.append(name)
         return _labelled(rgb, masks, names)
@@ -178,8 +182,9 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
         if (height, width) == tuple(shape) and flat.size == height * width:
             return np.ascontiguousarray(flat.reshape(width, height).T)
-        raise SegmentationError(f"{where}: a mask of {width}x{height} with {flat.size} pixels, the image is "
-                                f"{shape[1]}x{shape[0]}")  # fmt: skip
+        raise SegmentationError(
+            f"{where}: a mask of {width}x{height} with {flat.size} pixels, the image is {shape[1]}x{shape[0]}"
+        )
     raise SegmentationError(f"{where}: a segmentation is neither polygons nor run lengths")
 
 

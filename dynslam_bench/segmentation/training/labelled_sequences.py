@@ -109,8 +109,10 @@ class RenderedFrames:
         except ValueError as error:
             raise SegmentationError(f"synthetic: '{text}' is not understood: {error}") from error
         if not chosen or chosen[0] < 0 or chosen[-1] > 199 or result.frames < 1 or result.length < result.frames:
-            raise SegmentationError(f"synthetic: '{text}' asks for instances or frames that do not exist",
-                                    "instances 0-199, at least one frame")  # fmt: skip
+            raise SegmentationError(
+                f"synthetic: '{text}' asks for instances or frames that do not exist",
+                "instances 0-199, at least one frame",
+            )
         return result
 
     @property

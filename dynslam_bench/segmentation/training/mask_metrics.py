@@ -189,8 +189,9 @@ def _summary(tally: _ClassTally) -> ClassQuality:
     scores = np.array(tally.scores)
     hits = np.array(tally.hits, dtype=bool).reshape(-1, len(THRESHOLDS))
     ignored = np.array(tally.ignored, dtype=bool).reshape(-1, len(THRESHOLDS))
-    precisions = [average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], tally.truths)
-                  for k in range(len(THRESHOLDS))]  # fmt: skip
+    precisions = [
+        average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], tally.truths) for k in range(len(THRESHOLDS))
+    ]
     best = np.array(tally.best)
     iou = tally.counts.iou
     return ClassQuality(

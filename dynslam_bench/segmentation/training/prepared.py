@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.records import atomic_folder, digest
+from dynslam_bench.core.files import atomic_folder
+from dynslam_bench.core.records import digest
 
 from ..networks.images import boxes_of
 from .labelled import LabelledImage, LabelledImages

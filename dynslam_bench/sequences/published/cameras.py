@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from dynslam_bench.core.errors import SequenceError, SettingsError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera

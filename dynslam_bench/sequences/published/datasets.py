@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from dynslam_bench.core.plugins import Registry
+
+from ..synthetic import SYNTHETIC_IDS
+from .entries import catalogue
+
+OPENERS = "dynslam_bench.sequences.catalogue"
+"""The module that opens sequences of the built-in data sets; loaded when the first one is opened."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +36,14 @@ class DatasetSpec:
     citation: str = ""
 
 
-def _builtin() -> Iterable[DatasetSpec]:
-    from ..catalogue import builtin_datasets
-
-    return builtin_datasets()
+def _builtin() -> Iterator[DatasetSpec]:
+    """The data sets that come with the package."""
+    for name, summary in (("tum", "TUM RGB-D benchmark"), ("bonn", "Bonn RGB-D Dynamic Dataset")):
+        entries = [entry for entry in catalogue().values() if entry.dataset == name]
+        ids, (license, citation) = tuple(entry.id for entry in entries), (entries[0].license, entries[0].citation)
+        yield DatasetSpec(name, f"{OPENERS}:open_public", ids, summary, license, citation)
+    summary = "rendered rooms with exact poses, masks and flow"
+    yield DatasetSpec("synthetic", f"{OPENERS}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
 
 
 DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory

@@ -249,10 +249,12 @@ class Renderer:
         """Soft shadows of things outside the picture, sweeping over the room."""
         light = _LAMPS[1, :3] / _LAMPS[1, 2]
         sweep = 1.6 * math.sin(2 * math.pi * time / 6.3)
-        spots = np.array([
-            [sweep + light[0] * 1.2, 0.7 + 0.3 * math.sin(1.1 * time), 1.0, 0.5],
-            [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4],
-        ])  # fmt: skip
+        spots = np.array(
+            [
+                [sweep + light[0] * 1.2, 0.7 + 0.3 * math.sin(1.1 * time), 1.0, 0.5],
+                [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4],
+            ]
+        )
         pose = snap.T_world_cam
         self._rows(lambda a, b: sensors.dim(a, b, self._intrinsics, pose, depth, light, 2.2, spots, color))
 

@@ -10,8 +10,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.core.folders import user_cache
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.folders import vocabularies_folder
 
 from .settings import OrbSlam3Settings
 
@@ -61,7 +61,7 @@ def _prepared(path: Path, size: int, modified_ns: int) -> Path:
         _check(path.read_bytes(), path)
         return path
     packed = path.read_bytes()
-    target = user_cache() / "vocabularies" / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
+    target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
     if target.is_file():
         _check(target.read_bytes(), target)
         return target

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.files import replacing
 
 from .config import COCO_CLASSES, NetworkConfig
 from .network import MaskRCNN
@@ -123,18 +124,24 @@ def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
     Raises:
         SegmentationError: Weights that give the shape are missing, or the classes have no names.
     """
-    needed = ("backbone.body.conv1.weight", "roi_heads.box_predictor.cls_score.weight",
-              "backbone.fpn.inner_blocks.0.0.weight", "rpn.head.cls_logits.weight",
-              "roi_heads.mask_head.0.0.weight")  # fmt: skip
+    needed = (
+        "backbone.body.conv1.weight",
+        "roi_heads.box_predictor.cls_score.weight",
+        "backbone.fpn.inner_blocks.0.0.weight",
+        "rpn.head.cls_logits.weight",
+        "roi_heads.mask_head.0.0.weight",
+    )
     missing = [key for key in needed if key not in state or state[key].dim() not in (2, 4)]
     if missing:
         raise SegmentationError(
             f"{where} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
-        )  # fmt: skip
+        )
     bottleneck = "backbone.body.layer1.0.conv3.weight" in state
-    blocks = tuple(len({key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{stage}.")})
-                   for stage in range(1, 5))  # fmt: skip
+    blocks = tuple(
+        len({key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{stage}.")})
+        for stage in range(1, 5)
+    )
     classes = int(state["roi_heads.box_predictor.cls_score.weight"].shape[0]) - 1
     if classes == len(COCO_CLASSES):
         names = COCO_CLASSES
@@ -170,8 +177,11 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
     unknown = [key for key in state if key not in own]
-    shapes = [f"{key} {_shape(state[key])} instead of {_shape(own[key])}"
-              for key in own if key in state and state[key].shape != own[key].shape]  # fmt: skip
+    shapes = [
+        f"{key} {_shape(state[key])} instead of {_shape(own[key])}"
+        for key in own
+        if key in state and state[key].shape != own[key].shape
+    ]
     found = (("keys are missing", missing), ("keys are unknown", unknown), ("shapes differ", shapes))
     faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in found if keys]
     if faults:
@@ -184,12 +194,14 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
 
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     """Write a network with its shape, in our format; `half` stores float16."""
-    state = {key: value.detach().cpu().half() if half and value.is_floating_point() else value.detach().cpu()
-             for key, value in network.state_dict().items() if not key.endswith("num_batches_tracked")}  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    torch.save({"format": FORMAT, "config": network.config.model_dump_json(), "model": state}, temporary)
-    temporary.replace(path)
+    state: dict[str, Tensor] = {}
+    for key, value in network.state_dict().items():
+        if not key.endswith("num_batches_tracked"):
+            stored = value.detach().cpu()
+            state[key] = stored.half() if half and stored.is_floating_point() else stored
+    content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}
+    with replacing(path) as temporary, temporary.open("wb") as file:  # a file of no name: the bytes hold none either
+        torch.save(content, file)
 
 
 def _some(keys: Iterable[str]) -> str:

@@ -210,8 +210,9 @@ def crop_masks(masks: Tensor, boxes: Tensor, size: int) -> Tensor:
     step = (torch.arange(size, device=boxes.device, dtype=torch.float32) + 0.5) / size
     x = boxes[:, 0, None] + step * (boxes[:, 2] - boxes[:, 0])[:, None]
     y = boxes[:, 1, None] + step * (boxes[:, 3] - boxes[:, 1])[:, None]
-    grid = torch.stack([
-        (2 * x / width - 1)[:, None, :].expand(-1, size, -1), (2 * y / height - 1)[:, :, None].expand(-1, -1, size)
-    ], dim=3)  # fmt: skip
+    grid = torch.stack(
+        [(2 * x / width - 1)[:, None, :].expand(-1, size, -1), (2 * y / height - 1)[:, :, None].expand(-1, -1, size)],
+        dim=3,
+    )
     planes = functional.grid_sample(masks[:, None].float(), grid, align_corners=False)
     return (planes[:, 0] >= 0.5).float()

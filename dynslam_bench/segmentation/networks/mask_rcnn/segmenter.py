@@ -86,9 +86,13 @@ class MaskRCNNSegmenter:
             if name not in wanted:
                 continue
             mask = paste(
-                planes[index], boxes[index], height, width, self.settings.mask_threshold,
+                planes[index],
+                boxes[index],
+                height,
+                width,
+                self.settings.mask_threshold,
                 exact=self.network.config.exact_paste,
-            )  # fmt: skip
+            )
             if mask.any():
                 masks.append(mask)
                 kept.append(index)

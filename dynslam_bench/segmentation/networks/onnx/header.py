@@ -50,12 +50,15 @@ def read_header(path: Path) -> OnnxHeader:
     try:
         header = _decode(memoryview(data))
     except (ValueError, IndexError, UnicodeDecodeError) as error:
-        raise SegmentationError(f"{path} is not an ONNX model ({len(data)} bytes): {error}",
-                                "the file is truncated or of another format") from error  # fmt: skip
+        raise SegmentationError(
+            f"{path} is not an ONNX model ({len(data)} bytes): {error}", "the file is truncated or of another format"
+        ) from error
     if not header.inputs or not header.outputs:
-        raise SegmentationError(f"{path} is not an ONNX model ({len(data)} bytes): it declares "
-                                f"{len(header.inputs)} inputs and {len(header.outputs)} outputs",
-                                "the file is truncated or of another format")  # fmt: skip
+        raise SegmentationError(
+            f"{path} is not an ONNX model ({len(data)} bytes): it declares "
+            f"{len(header.inputs)} inputs and {len(header.outputs)} outputs",
+            "the file is truncated or of another format",
+        )
     return header
 
 
@@ -92,8 +95,10 @@ def _tensor(data: memoryview) -> TensorInfo:
             name = bytes(value).decode()
         elif number == 2 and isinstance(value, memoryview):
             shape = _only(_only(value, 1), 2)
-    return TensorInfo(name, tuple(_dimension(value) for number, value in _fields(shape)
-                                  if number == 1 and isinstance(value, memoryview)))  # fmt: skip
+    return TensorInfo(
+        name,
+        tuple(_dimension(value) for number, value in _fields(shape) if number == 1 and isinstance(value, memoryview)),
+    )
 
 
 def _dimension(data: memoryview) -> int | None:

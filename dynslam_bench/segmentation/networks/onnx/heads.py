@@ -1,20 +1,10 @@
-"""Recognise and decode the outputs of segmentation networks. Pure functions on arrays; nothing here runs a network.
-
-Three layouts are known:
-
-* ``yolo``: boxes with class scores and mask coefficients ``[1, 4 + C + M, N]`` (or transposed, or with an objectness
-  score as YOLOv5 has it) and mask prototypes ``[1, M, h, w]``;
-* ``semantic``: class logits ``[1, C, h, w]``;
-* ``instances``: ``boxes [K, 4]``, ``labels [K]``, ``scores [K]``, ``masks [K, 1, H, W]`` of a torchvision export.
-"""
+"""Decode the outputs of segmentation networks. Pure functions on arrays; nothing here runs a network."""
 
 from __future__ import annotations
 
-import ast
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,90 +13,36 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
 
-from ...classes import COCO_IDS, COCO_NAMES, VOC_NAMES
 from ...settings import SegmentationSettings
 from ..images import boxes_of
-from .header import TensorInfo
+from .layout import Layout
+from .placement import Float, Placement, assemble, paste_plane
 
-Float: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
-Kind = Literal["yolo", "semantic", "instances"]
 MIN_COMPONENT_PX = 64
 """Smaller connected parts of a semantic map are noise and become no object."""
 MAX_OBJECTS = 100
 
 
-@dataclass(frozen=True)
-class Layout:
-    """How to read a network's outputs.
+class _Asked(NamedTuple):
+    """What is wanted of the outputs; see `decode`."""
 
-    Attributes:
-        kind: Which decoder.
-        outputs: Names of the outputs that the decoder takes, in its order.
-        names: Class number to COCO name.
-        channels_first: ``yolo`` only: detections lie along the last axis.
-        objectness: ``yolo`` only: 1 if an objectness score precedes the class scores.
-        aligned: ``semantic`` only: the corners of the logits are the corners of the input.
-    """
-
-    kind: Kind
-    outputs: tuple[str, ...]
-    names: Mapping[int, str]
-    channels_first: bool = True
-    objectness: int = 0
-    aligned: bool = False
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where the frame lies in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y."""
-
-    scale_x: float
-    scale_y: float
-    offset_x: float
-    offset_y: float
-    input_width: int
-    input_height: int
-
-
-def detect_layout(
-    outputs: Sequence[TensorInfo], metadata: Mapping[str, str], size: tuple[int, int], where: str
-) -> Layout:
-    """Which layout these outputs have.
-
-    Args:
-        outputs: Names and shapes.
-        metadata: The file's metadata; ``names`` may map class numbers to names.
-        size: Height and width of the network's input.
-        where: The file, for the error.
-
-    Raises:
-        SegmentationError: No known layout fits, or the class names cannot be told; lists the outputs.
-    """
-    names = _metadata_names(metadata, where)
-    by_name = {output.name.lower(): output for output in outputs}
-    if {"boxes", "labels", "scores", "masks"} <= set(by_name):
-        order = tuple(by_name[key].name for key in ("boxes", "labels", "scores", "masks"))
-        return Layout("instances", order, names or COCO_IDS)
-    rank3 = [output for output in outputs if len(output.shape) == 3 and _known(output.shape)]
-    rank4 = [output for output in outputs if len(output.shape) == 4 and _known(output.shape[1:])]
-    if rank3 and rank4:
-        found = _yolo(rank3, rank4, names)
-        if found is not None:
-            return found
-    if rank4 and not rank3:
-        full = max(rank4, key=lambda output: (output is rank4[0], math.prod(s or 1 for s in output.shape[1:])))
-        classes = int(full.shape[1] or 0)
-        labels = names or _semantic_names(classes)
-        if labels is not None and classes >= 2:
-            return Layout("semantic", (full.name,), labels, aligned=_aligned(full.shape[2:], size))
-        raise _unknown(outputs, where, f"{classes} semantic classes without names in the file's metadata")
-    raise _unknown(outputs, where, "no known layout fits")
+    layout: Layout
+    place: Placement
+    height: int
+    width: int
+    settings: SegmentationSettings
+    floor: float
 
 
 def decode(
-    layout: Layout, values: Sequence[Float], place: Placement, height: int, width: int, settings: SegmentationSettings,
+    layout: Layout,
+    values: Sequence[Float],
+    place: Placement,
+    height: int,
+    width: int,
+    settings: SegmentationSettings,
     floor: float,
-) -> Instances:  # fmt: skip
+) -> Instances:
     """The objects of the dynamic classes in one frame.
 
     Args:
@@ -125,32 +61,11 @@ def decode(
         if not np.isfinite(value).all():
             raise SegmentationError(f"the network's output '{name}' holds NaN or infinite values")
     decoder = {"yolo": _decode_yolo, "semantic": _decode_semantic, "instances": _decode_instances}[layout.kind]
-    return decoder(layout, values, place, height, width, settings, floor)
+    return decoder(values, _Asked(layout, place, height, width, settings, floor))
 
 
-def _yolo(rank3: list[TensorInfo], rank4: list[TensorInfo], names: dict[int, str] | None) -> Layout | None:
-    detections, prototypes = rank3[0], rank4[-1]
-    coefficients = int(prototypes.shape[1] or 0)
-    sizes = [int(size or 0) for size in detections.shape[1:]]
-    for channels_first, channels in ((True, sizes[0]), (False, sizes[1])):
-        if channels >= max(sizes):
-            continue  # there are far more candidates than channels
-        for objectness in (0, 1):
-            classes = channels - 4 - objectness - coefficients
-            labels = names if names is not None and len(names) == classes else None
-            if labels is None and names is None and classes == len(COCO_NAMES):
-                labels = dict(enumerate(COCO_NAMES))
-            if labels is None and names is None and classes == 1:
-                labels = {0: "person"}
-            if labels is not None:
-                return Layout("yolo", (detections.name, prototypes.name), labels, channels_first, objectness)
-    return None
-
-
-def _decode_yolo(
-    layout: Layout, values: Sequence[Float], place: Placement, height: int, width: int, settings: SegmentationSettings,
-    floor: float,
-) -> Instances:  # fmt: skip
+def _decode_yolo(values: Sequence[Float], asked: _Asked) -> Instances:
+    layout, place, height, width, settings, floor = asked
     rows = values[0].reshape(values[0].shape[-2:])
     rows = rows.T if layout.channels_first else rows
     prototypes = values[1].reshape(values[1].shape[-3:])
@@ -175,29 +90,12 @@ def _decode_yolo(
     masks = np.zeros((len(keep), height, width), bool)
     level = _logit(settings.mask_threshold)
     for mask, plane, corner in zip(masks, logits, corners, strict=True):
-        _paste_prototype(mask, plane, corner, place, level)
-    return _assemble(masks, corners, [layout.names[int(k)] for k in label[keep]], best[keep], place)
+        paste_plane(mask, plane, corner, place, level)
+    return assemble(masks, corners, [layout.names[int(k)] for k in label[keep]], best[keep], place)
 
 
-def _paste_prototype(mask: NDArray[np.bool_], plane: Float, corner: Float, place: Placement, level: float) -> None:
-    """Sample a prototype mask (a plane over the whole input) at the frame's pixels inside the box."""
-    x0, y0, x1, y1 = _frame_box(corner, place, mask.shape[1], mask.shape[0])
-    if x1 <= x0 or y1 <= y0:
-        return
-    ratio_x, ratio_y = plane.shape[1] / place.input_width, plane.shape[0] / place.input_height
-    to_plane = np.array(  # pixel centres of the frame's patch -> pixel centres of the plane
-        [[place.scale_x * ratio_x, 0, ((x0 + 0.5) * place.scale_x + place.offset_x) * ratio_x - 0.5],
-         [0, place.scale_y * ratio_y, ((y0 + 0.5) * place.scale_y + place.offset_y) * ratio_y - 0.5]]
-    )  # fmt: skip
-    patch = cv2.warpAffine(plane, to_plane, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                           borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
-    mask[y0:y1, x0:x1] = patch > level
-
-
-def _decode_semantic(
-    layout: Layout, values: Sequence[Float], place: Placement, height: int, width: int, settings: SegmentationSettings,
-    floor: float,
-) -> Instances:  # fmt: skip
+def _decode_semantic(values: Sequence[Float], asked: _Asked) -> Instances:
+    layout, place, height, width, settings, floor = asked
     logits = values[0].reshape(values[0].shape[-3:])
     if logits.shape[0] < len(layout.names):
         raise SegmentationError(f"the network gives {logits.shape[0]} classes, its layout says {len(layout.names)}")
@@ -227,6 +125,34 @@ def _decode_semantic(
     return Instances(stack, boxes_of(stack), tuple(names), np.array(scores, np.float32))
 
 
+def _decode_instances(values: Sequence[Float], asked: _Asked) -> Instances:
+    layout, place, height, width, settings, floor = asked
+    boxes = values[0].reshape(-1, 4)
+    labels, scores = np.rint(values[1].reshape(-1)).astype(int), values[2].reshape(-1)
+    nothing = np.zeros((0, height, width), np.float32)
+    planes = values[3].reshape(-1, *values[3].shape[-2:]) if values[3].size else nothing
+    counts = {len(boxes), len(labels), len(scores), len(planes)}
+    if len(counts) != 1:
+        found = f"{len(boxes)} boxes, {len(labels)} labels, {len(scores)} scores, {len(planes)} masks"
+        raise SegmentationError(f"the network's outputs disagree: {found}")
+    if len(planes) and planes.shape[1:] != (place.input_height, place.input_width):
+        raise SegmentationError(
+            f"the network's masks are {planes.shape[2]}x{planes.shape[1]}, its input {place.input_width}x"
+            f"{place.input_height}",
+            "masks must be pasted into the whole image, as torchvision's export does",
+        )
+    wanted = _wanted(layout.names, settings.class_names())
+    keep = np.flatnonzero((scores >= floor) & np.isin(labels, list(wanted)))
+    keep = keep[_nms(boxes[keep], scores[keep], labels[keep], settings.nms_iou)][:MAX_OBJECTS]
+    if not keep.size:
+        return Instances.empty(height, width)
+    masks = np.zeros((len(keep), height, width), bool)
+    whole = np.array([0, 0, place.input_width, place.input_height], np.float32)
+    for mask, plane in zip(masks, planes[keep].astype(np.float32), strict=True):
+        paste_plane(mask, plane, whole, place, settings.mask_threshold)
+    return assemble(masks, boxes[keep], [layout.names[int(k)] for k in labels[keep]], scores[keep], place)
+
+
 def _interpolation(cells: int, length: int, scale: float, offset: float, count: int, aligned: bool) -> Float:
     """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis."""
     at_input = (np.arange(count) + 0.5) * scale + offset - 0.5
@@ -237,46 +163,6 @@ def _interpolation(cells: int, length: int, scale: float, offset: float, count: 
     matrix[np.arange(count), low] = 1 - (at - low)
     matrix[np.arange(count), np.minimum(low + 1, cells - 1)] += (at - low).astype(np.float32)
     return matrix
-
-
-def _decode_instances(
-    layout: Layout, values: Sequence[Float], place: Placement, height: int, width: int, settings: SegmentationSettings,
-    floor: float,
-) -> Instances:  # fmt: skip
-    boxes = values[0].reshape(-1, 4)
-    labels, scores = np.rint(values[1].reshape(-1)).astype(int), values[2].reshape(-1)
-    planes = (
-        values[3].reshape(-1, *values[3].shape[-2:]) if values[3].size else np.zeros((0, height, width), np.float32)
-    )
-    counts = {len(boxes), len(labels), len(scores), len(planes)}
-    if len(counts) != 1:
-        raise SegmentationError(f"the network's outputs disagree: {len(boxes)} boxes, {len(labels)} labels, "
-                                f"{len(scores)} scores, {len(planes)} masks")  # fmt: skip
-    if len(planes) and planes.shape[1:] != (place.input_height, place.input_width):
-        raise SegmentationError(
-            f"the network's masks are {planes.shape[2]}x{planes.shape[1]}, its input {place.input_width}x"
-            f"{place.input_height}", "masks must be pasted into the whole image, as torchvision's export does"
-        )  # fmt: skip
-    wanted = _wanted(layout.names, settings.class_names())
-    keep = np.flatnonzero((scores >= floor) & np.isin(labels, list(wanted)))
-    keep = keep[_nms(boxes[keep], scores[keep], labels[keep], settings.nms_iou)][:MAX_OBJECTS]
-    if not keep.size:
-        return Instances.empty(height, width)
-    masks = np.zeros((len(keep), height, width), bool)
-    whole = np.array([0, 0, place.input_width, place.input_height], np.float32)
-    for mask, plane in zip(masks, planes[keep].astype(np.float32), strict=True):
-        _paste_prototype(mask, plane, whole, place, settings.mask_threshold)
-    return _assemble(masks, boxes[keep], [layout.names[int(k)] for k in labels[keep]], scores[keep], place)
-
-
-def _assemble(masks: NDArray[np.bool_], corners: Float, names: list[str], scores: Float, place: Placement) -> Instances:
-    """Instances in frame coordinates, without the objects whose mask came out empty."""
-    full = np.asarray(masks.any(axis=(1, 2)))
-    shift = np.array([place.offset_x, place.offset_y] * 2, np.float32)
-    scale = np.array([place.scale_x, place.scale_y] * 2, np.float32)
-    boxes = np.clip((corners - shift) / scale, 0, np.array([masks.shape[2], masks.shape[1]] * 2)).astype(np.float32)
-    kept = tuple(name for name, there in zip(names, full.tolist(), strict=True) if there)
-    return Instances(masks[full], boxes[full], kept, scores[full].astype(np.float32))
 
 
 def _nms(corners: Float, scores: Float, labels: NDArray[np.intp], iou: float) -> NDArray[np.intp]:
@@ -290,59 +176,9 @@ def _nms(corners: Float, scores: Float, labels: NDArray[np.intp], iou: float) ->
     return np.asarray(kept, np.intp).reshape(-1)
 
 
-def _frame_box(corner: Float, place: Placement, width: int, height: int) -> tuple[int, int, int, int]:
-    x0 = (float(corner[0]) - place.offset_x) / place.scale_x
-    y0 = (float(corner[1]) - place.offset_y) / place.scale_y
-    x1 = (float(corner[2]) - place.offset_x) / place.scale_x
-    y1 = (float(corner[3]) - place.offset_y) / place.scale_y
-    return (max(0, math.floor(x0)), max(0, math.floor(y0)), min(width, math.ceil(x1)), min(height, math.ceil(y1)))
-
-
 def _wanted(names: Mapping[int, str], classes: Collection[str]) -> set[int]:
     return {number for number, name in names.items() if name in classes}
 
 
 def _logit(probability: float) -> float:
     return math.log(probability / (1 - probability))
-
-
-def _known(shape: Sequence[int | None]) -> bool:
-    return all(size is not None for size in shape)
-
-
-def _aligned(cells: Sequence[int | None], size: tuple[int, int]) -> bool:
-    return all(
-        c is not None and 1 < c < length and (length - 1) % (c - 1) == 0 for c, length in zip(cells, size, strict=True)
-    )
-
-
-def _semantic_names(classes: int) -> dict[int, str] | None:
-    if classes == len(VOC_NAMES):
-        return dict(enumerate(VOC_NAMES))
-    if classes == len(COCO_NAMES) + 1:
-        return {0: "background", **{number + 1: name for number, name in enumerate(COCO_NAMES)}}
-    if classes == 91:
-        return {0: "background", **COCO_IDS}
-    return {0: "background", 1: "person"} if classes == 2 else None
-
-
-def _metadata_names(metadata: Mapping[str, str], where: str) -> dict[int, str] | None:
-    if "names" not in metadata:
-        return None
-    try:
-        value = ast.literal_eval(metadata["names"])
-        pairs = value.items() if isinstance(value, dict) else enumerate(value)
-        return {int(number): str(name) for number, name in pairs}
-    except (ValueError, SyntaxError, TypeError) as error:
-        raise SegmentationError(
-            f"{where}: the metadata entry 'names' is not a table of class names: {error}"
-        ) from error
-
-
-def _unknown(outputs: Sequence[TensorInfo], where: str, reason: str) -> SegmentationError:
-    found = "; ".join(map(str, outputs)) or "none"
-    return SegmentationError(
-        f"{where}: the network's outputs are not understood ({reason}): {found}",
-        "known: YOLO-seg [1, 4+C+M, N] with [1, M, h, w], semantic logits [1, C, h, w], "
-        "or boxes, labels, scores, masks as torchvision exports them",
-    )

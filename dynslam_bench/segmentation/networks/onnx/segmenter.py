@@ -18,7 +18,9 @@ from dynslam_bench.core.errors import SegmentationError
 from ...settings import SegmentationSettings
 from ..images import as_rgb
 from .header import OnnxHeader, TensorInfo, read_header
-from .heads import Layout, Placement, decode, detect_layout
+from .heads import decode
+from .layout import Layout, detect_layout
+from .placement import Placement
 
 Scaling = Literal["unit", "symmetric", "imagenet"]
 _SCALINGS: dict[Scaling, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -55,8 +57,10 @@ class OnnxSegmenter:
         try:
             self._net = cv2.dnn.readNetFromONNX(str(self.path))
         except (cv2.error, RuntimeError) as error:
-            raise SegmentationError(f"OpenCV {cv2.__version__} cannot load {self.path}: {_first_line(error)}",
-                                    "export it with static shapes and plain operators") from error  # fmt: skip
+            raise SegmentationError(
+                f"OpenCV {cv2.__version__} cannot load {self.path}: {_first_line(error)}",
+                "export it with static shapes and plain operators",
+            ) from error
         self._input = header.inputs[0].name
         self._layout = self._find_layout(header)
 
@@ -159,8 +163,10 @@ def opencv_threads(threads: int) -> Iterator[None]:
 
 def _input_size(header: OnnxHeader, path: Path) -> tuple[int, int] | None:
     if len(header.inputs) != 1:
-        raise SegmentationError(f"{path} has {len(header.inputs)} inputs: {'; '.join(map(str, header.inputs))}",
-                                "a segmentation network takes one image")  # fmt: skip
+        raise SegmentationError(
+            f"{path} has {len(header.inputs)} inputs: {'; '.join(map(str, header.inputs))}",
+            "a segmentation network takes one image",
+        )
     shape = header.inputs[0].shape
     if len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
         raise SegmentationError(f"{path}: the input {header.inputs[0]} is no image", "expected 1x3xHxW")

@@ -1,8 +1,6 @@
-"""The enhanced moth-flame optimiser over a box, batched over many independent problems (numpy).
+"""The moth-flame equations (`flow.searches.moth_flame`) over any box, for functions with known optima.
 
-The same algorithm as the label search (Eq. 4-22, corrected Algorithm 1), for any function, and the same equations
-(`searches.rules`); `searches.moth_flame` is its compiled form for matching costs. Fitness is evaluated for whole
-populations of all problems at once.
+The algorithm of the label search (Eq. 4-22, corrected Algorithm 1); whole populations of B problems at once.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .rules import EMFOA, MothFlameRules, flame_counts, flight, flown, opposites
+from dynslam_bench.flow.searches.moth_flame import EMFOA, MothFlameRules, landed, opposites
 
 Floats = NDArray[np.float64]
 CAUCHY_SHARE = 0.01
@@ -108,10 +106,8 @@ def emfoa_minimise(
         evaluate(opposites(np, moths, least, greatest, low, high, rng.random))
         moths = flames.copy()  # the best N of X and its opposites
     iterations = -(-(budget - spent) // population)
-    counts = flame_counts(population, iterations, rules)
     for iteration in range(1, iterations + 1):
-        around = flames[:, np.minimum(np.arange(population), counts[iteration - 1] - 1)]  # Eq. 8, 11
-        now = flight(iteration / iterations, rules)
-        moths = np.clip(flown(np, moths, flames, around, flames[:, :1], now, scale, rng.random), low, high)
+        position = landed(np, moths, flames, iteration, iterations, rules, scale, rng.random)
+        moths = np.clip(position, low, high)
         evaluate(moths)
     return Minimum(flames[:, 0], values[:, 0], spent, np.asarray(history))
