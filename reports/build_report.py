@@ -24,7 +24,8 @@ from .model.board import DEFAULT_REFERENCE, Board, On, make_board
 from .model.common import common_errors, representatives
 from .model.missing import missing_commands, missing_note
 from .model.published import is_excerpt, reported_for
-from .model.rows import Loaded, RunRow, load_runs, open_stores
+from .model.row import RunRow
+from .model.rows import Loaded, load_runs, open_stores
 from .model.statistics import FEWEST, power_note
 from .tables import fairness as fairness_tables
 from .tables import leaderboard as tables

@@ -18,7 +18,8 @@ from .build_report import ReportData
 from .model.cell import make_cell
 from .model.columns import name_columns
 from .model.labels import make_labels
-from .model.rows import RunRow, check_one_protocol, load_runs, open_stores
+from .model.row import RunRow
+from .model.rows import check_one_protocol, load_runs, open_stores
 from .model.statistics import FEWEST, Interval, ratio_interval
 from .tables.formats import mm
 from .tables.table import Column, Table, TableCell, to_csv, to_markdown

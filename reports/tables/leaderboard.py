@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
 from ..model.cell import Cell, mean_skipped
-from ..model.rows import RunRow
+from ..model.row import RunRow
 from ..model.statistics import FEWEST, Interval, Standing
 from .formats import percent
 from .table import Column, Emphasis, Table, TableCell

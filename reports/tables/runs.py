@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 
 from ..model.board import Board
-from ..model.rows import RunRow
+from ..model.row import RunRow
 from .table import Column, Table, TableCell
 
 

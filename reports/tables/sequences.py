@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import NEVER_MOVE, Board
 from ..model.cell import Cell
-from ..model.rows import RunRow
+from ..model.row import RunRow
 from .formats import mm, significant_text
 from .leaderboard import sequence_columns, skipped_words
 from .table import Column, Emphasis, Table, TableCell, emphasise
