@@ -14,17 +14,16 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.storage.store import RunStore
 
-from .build_report import ReportData
 from .model.cell import make_cell
 from .model.columns import name_columns
 from .model.labels import make_labels
+from .model.report_data import REPORT_FILE, ReportData
 from .model.row import RunRow
 from .model.rows import check_one_protocol, load_runs, open_stores
 from .model.statistics import FEWEST, Interval, ratio_interval
 from .tables.formats import mm
 from .tables.table import Column, Table, TableCell, to_csv, to_markdown
 
-REPORT_FILE = "report.json"
 Side = dict[str, dict[str, list[RunRow]]]
 """Variant key to column id to the runs."""
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.storage.store import RunStore
 
+from .board import DEFAULT_REFERENCE, Board, On, make_board
 from .columns import name_columns
 from .labels import make_labels
 from .row import RunRow
@@ -42,6 +43,28 @@ def load_frame(
     """
     rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
     return rows_frame(rows, name_columns(rows), make_labels(rows))
+
+
+def load_board(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    reference: str = DEFAULT_REFERENCE,
+    on: On = "common",
+) -> Board:
+    """The board of some results folders: all runs, ordered and ranked as in a report.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+        reference: As in `make_board`.
+        on: As in `make_board`.
+
+    Raises:
+        ReportError: As `make_board`.
+    """
+    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
+    return make_board(rows, reference, on)
 
 
 def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:

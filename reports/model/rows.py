@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.storage.record import RunRecord
+from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
 
@@ -24,6 +24,7 @@ from .row_values import (
     part_words,
     variant_of,
 )
+
 
 @dataclass(frozen=True)
 class LoadedRun:
@@ -149,7 +150,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     )
 
 
-def _judge(record: RunRecord, scored: RunMetrics, protocol: Protocol) -> tuple[Which, bool, str]:
+def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple[Which, bool, str]:
     """Whose errors a row holds, whether it counts as a failure, and why it is not ``ok``."""
     only_final = record.kind == "imported" and scored.online is None and scored.final is not None
     which: Which = "final" if only_final else protocol.trajectory
