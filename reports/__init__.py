@@ -1,8 +1,25 @@
-"""Leaderboards and study reports: one offline HTML page, with Markdown, CSV and LaTeX beside it."""
+"""Leaderboards: one offline HTML page with Markdown, CSV and LaTeX beside it, and pandas frames to go on with.
 
-from .build_report import ReportData, ReportPaths, build_report
+`build_report` writes the page, `compare` holds two results folders against each other, `load_frame` gives every run as
+a row of a pandas frame, and `make_board` orders rows into the board that tables and figures are made of.
+"""
+
+from .build_report import ReportPaths, build_report
 from .compare_runs import Comparison, compare
-from .model.frame import load_frame
-from .model.rows import RunRow
+from .model.board import Board, make_board
+from .model.frame import load_board, load_frame
+from .model.report_data import ReportData
+from .model.row import RunRow
 
-__all__ = ["Comparison", "ReportData", "ReportPaths", "RunRow", "build_report", "compare", "load_frame"]
+__all__ = [
+    "Board",
+    "Comparison",
+    "ReportData",
+    "ReportPaths",
+    "RunRow",
+    "build_report",
+    "compare",
+    "load_board",
+    "load_frame",
+    "make_board",
+]

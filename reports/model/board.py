@@ -12,7 +12,8 @@ from dynslam_bench.core.errors import ReportError, did_you_mean
 from .cell import Cell, make_cell
 from .columns import name_columns, shortened
 from .labels import make_labels
-from .rows import RunRow, check_one_protocol
+from .row import RunRow
+from .rows import check_one_protocol
 from .statistics import Standing, standings
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from .rows import RunRow
+from .row import RunRow
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from .rows import RunRow
+from .row import RunRow
 
 
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:

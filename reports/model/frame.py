@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Any
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.storage.store import RunStore
 
+from .board import DEFAULT_REFERENCE, Board, On, make_board
 from .columns import name_columns
 from .labels import make_labels
-from .rows import RunRow, load_runs, open_stores
+from .row import RunRow
+from .rows import load_runs, open_stores
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_TEXT = ("run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split",
-         "repeat", "status", "ending", "protocol_id", "protocol_digest", "trajectory", "segmentation")  # fmt: skip
-_WHOLE = ("seed", "offset", "n_frames", "n_processed", "n_tracked")
-_FLAGS = ("ranked", "failed", "cached")
-_NUMBERS = ("coverage", "score_m", "held_ate_m", "final_ate_m", "never_move_m", "frame_ms", "real_time_factor",
-            "peak_memory_mb", "mask_iou", "epipolar_skipped")  # fmt: skip
+_TEXT = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
+_TEXT += ["repeat", "status", "ending", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
+_WHOLE = ["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"]
+_FLAGS = ["ranked", "failed", "cached"]
+_NUMBERS = ["coverage", "score_m", "held_ate_m", "final_ate_m", "never_move_m", "frame_ms", "real_time_factor"]
+_NUMBERS += ["peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
 
 
 def load_frame(
@@ -43,6 +45,28 @@ def load_frame(
     return rows_frame(rows, name_columns(rows), make_labels(rows))
 
 
+def load_board(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    reference: str = DEFAULT_REFERENCE,
+    on: On = "common",
+) -> Board:
+    """The board of some results folders: all runs, ordered and ranked as in a report.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+        reference: As in `make_board`.
+        on: As in `make_board`.
+
+    Raises:
+        ReportError: As `make_board`.
+    """
+    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
+    return make_board(rows, reference, on)
+
+
 def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
     """Rows as a frame.
 
@@ -60,13 +84,17 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
         ranked, failed, cached (whether stage times come from the stage cache). ``float64``, nan where unknown:
         coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
         failures as never moving or worse), held_ate_m, final_ate_m and never_move_m (metres), frame_ms (median,
-        milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), and every metric of the protocol under
+        milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
+        rotation_uncertainty_deg (standard error in degrees of the alignment's rotation; above 10 the metrics
+        ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under
         its own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
     """
     import pandas as pd
 
     ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
     metrics = sorted({name for row in rows for name in row.metrics})
+    kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
+    kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "float64")
     lines = []
     for row in ordered:
         own: dict[str, Any] = {
@@ -74,10 +102,6 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
             "sequence": columns[row.column_id],
             "settings": "; ".join(f"{name}={value}" for name, value in row.variant.items()),
         }
-        names = (*_TEXT, *_WHOLE, "noise", *_FLAGS, *_NUMBERS)
-        lines.append(
-            {n: own[n] if n in own else getattr(row, n) for n in names} | {m: row.metrics.get(m) for m in metrics}
-        )
-    kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys((*_WHOLE, "noise"), "Int64")
-    kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "float64")
+        values = {name: own[name] if name in own else getattr(row, name) for name in kinds if name not in metrics}
+        lines.append(values | {name: row.metrics.get(name) for name in metrics})
     return pd.DataFrame(lines, columns=list(kinds)).astype(kinds)

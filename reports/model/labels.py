@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .rows import RunRow
+from .row import RunRow
 
 
 def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:

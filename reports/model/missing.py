@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable
 
 from .board import Board
-from .rows import RunRow
+from .row import RunRow
 
 _MOST = 8
 

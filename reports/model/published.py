@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
-from ..tables.sequences import ReportedCell
-
 CLAIMED = "claimed by the paper"
-_TUM_S = {
-    "tum/fr3/sitting_static": 23.63, "tum/fr3/sitting_xyz": 42.50, "tum/fr3/sitting_halfsphere": 37.15,
-    "tum/fr3/sitting_rpy": 27.48, "tum/fr3/walking_static": 24.83, "tum/fr3/walking_xyz": 28.83,
-    "tum/fr3/walking_halfsphere": 35.81, "tum/fr3/walking_rpy": 30.61,
-}  # fmt: skip
+_SITTING_S = {"static": 23.63, "xyz": 42.50, "halfsphere": 37.15, "rpy": 27.48}
+_WALKING_S = {"static": 24.83, "xyz": 28.83, "halfsphere": 35.81, "rpy": 30.61}
+_TUM_S = {f"tum/fr3/sitting_{name}": seconds for name, seconds in _SITTING_S.items()}
+_TUM_S |= {f"tum/fr3/walking_{name}": seconds for name, seconds in _WALKING_S.items()}
 _BONN_S = 10.0
 
 
@@ -67,28 +64,39 @@ class Claimed:
     digits: int
 
 
+@dataclass(frozen=True)
+class ReportedCell:
+    """A published number.
+
+    Attributes:
+        system: Its name.
+        sequence: Sequence of the board.
+        value: ATE in metres.
+        source: Where it was read.
+        tag: What kind of number it is.
+    """
+
+    system: str
+    sequence: str
+    value: float
+    source: str
+    tag: str = "reported"
+
+
 @cache
 def published() -> tuple[Published, ...]:
     """All published numbers."""
-    return tuple(
-        Published(
-            system=line["system"], sequence=line["sequence"], metric=line["metric"], value=float(line["value"]),
-            unit=line["unit"], alignment=line["alignment"], source=line["source"], remarks=line["remarks"],
-        )
-        for line in _lines("published.csv")
-    )  # fmt: skip
+    return tuple(Published(**{**line, "value": float(line["value"])}) for line in _lines("published.csv"))
 
 
 @cache
 def claimed() -> tuple[Claimed, ...]:
     """Tables 1 to 3 of the paper, as printed."""
-    return tuple(
-        Claimed(
-            table=int(line["table"]), system=line["system"], sequence=line["sequence"], quantity=line["quantity"],
-            kind=line["kind"], value=float(line["value"]), digits=len(line["value"].partition(".")[2]),
-        )
-        for line in _lines("claimed.csv")
-    )  # fmt: skip
+    return tuple(_claimed(**line) for line in _lines("claimed.csv"))
+
+
+def _claimed(*, table: str, value: str, **words: str) -> Claimed:
+    return Claimed(table=int(table), value=float(value), digits=len(value.partition(".")[2]), **words)
 
 
 def is_excerpt(sequence: str, duration_s: float) -> bool:

@@ -1,22 +1,18 @@
-"""One row a run: what the report knows of it, whether it was made here, imported or only reported."""
+"""From results folders to rows: which runs count, scored under one protocol."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import Field
 
 from dynslam_bench.core.errors import ReportError
-from dynslam_bench.core.records import Record
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.storage.record import RunRecord
+from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
 
+from .row import RunRow, Which
 from .row_values import (
     camera_words,
     column_of,
@@ -28,156 +24,6 @@ from .row_values import (
     part_words,
     variant_of,
 )
-
-Kind = Literal["run here", "imported"]
-
-
-class RunRow(Record):
-    """A run as the report shows it.
-
-    Attributes:
-        run_id: Its id in the store.
-        kind: Made by this toolkit, or a trajectory from elsewhere.
-        tracker: Tracker id.
-        label: Tracker's label.
-        variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
-        provenance: How closely the tracker follows its source.
-        ranked: Whether its spec lets it be ranked.
-        sequence: Sequence id.
-        frames: Part of the sequence in words, empty for all of it.
-        part_options: The same as command-line options.
-        block: What one column of a table is: content, camera, frames and stride.
-        content: Digest of the content.
-        camera: Camera in words.
-        place: Folder of the sequence where it was named by its path.
-        duration_s: Time between its first and last frame.
-        tags: Tags of the sequence.
-        split: ``tune``, ``held-out`` or empty.
-        seed: Seed.
-        offset: Leading frames that were left out: another repeat.
-        noise: Seed of the sensors' noise: another repeat.
-        status: Status of the run.
-        reason: Why it is not ``ok``.
-        failed: Whether it counts as a failure: it did not end, could not track, or cannot be evaluated.
-        protocol_id: Id of the protocol of `metrics`.
-        protocol_digest: Its digest.
-        trajectory: Which trajectory the metrics are of; an import may hold the final one only.
-        metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
-        final_ate_m: ATE of the final trajectory; None if there is none.
-        held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
-        never_move_m: What a camera that does not move scores there; None without ground truth.
-        n_frames: Input frames.
-        n_processed: Frames that the tracker saw before it ended.
-        n_tracked: Frames that were tracked.
-        coverage: Share of the input frames that was tracked.
-        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
-            without an epipolar test.
-        cached: Whether stage times come from the stage cache and were not taken in this run.
-        frame_ms: Median frame time in milliseconds, None if unknown.
-        real_time_factor: Frame interval over mean frame time, None if unknown.
-        peak_memory_mb: Largest resident memory, None if unknown.
-        mask_iou: Overlap of the dynamic mask with the exact one, None if unknown.
-        segmentation: Source of the masks.
-        started: UTC, ISO 8601.
-        log: Path of the run's log.
-        command: Command line that made it.
-        machine: Computer and versions in words.
-        notes: Diagnostics of the evaluation and of the run.
-    """
-
-    run_id: str
-    kind: Kind
-    tracker: str
-    label: str
-    variant: dict[str, Any] = Field(default_factory=dict)
-    provenance: str = ""
-    ranked: bool = True
-    sequence: str
-    frames: str = ""
-    part_options: list[str] = Field(default_factory=list)
-    block: str = ""
-    content: str = ""
-    camera: str = ""
-    place: str = ""
-    duration_s: float = 0.0
-    tags: list[str] = Field(default_factory=list)
-    split: str = ""
-    seed: int = 0
-    offset: int = 0
-    noise: int | None = None
-    status: str = "ok"
-    reason: str = ""
-    failed: bool = False
-    protocol_id: str
-    protocol_digest: str
-    trajectory: Literal["online", "final"] = "online"
-    metrics: dict[str, float] = Field(default_factory=dict)
-    final_ate_m: float | None = None
-    held_ate_m: float | None = None
-    never_move_m: float | None = None
-    n_frames: int = 0
-    n_processed: int = 0
-    n_tracked: int = 0
-    coverage: float = 0.0
-    epipolar_skipped: float | None = None
-    cached: bool = False
-    frame_ms: float | None = None
-    real_time_factor: float | None = None
-    peak_memory_mb: float | None = None
-    mask_iou: float | None = None
-    segmentation: str = ""
-    started: str = ""
-    log: str = ""
-    command: str = ""
-    machine: str = ""
-    notes: list[str] = Field(default_factory=list)
-
-    @property
-    def column_id(self) -> str:
-        """What one column of a table is; equal for all repeats and for every spelling of the same frames."""
-        return self.block or f"{self.sequence} [{self.frames}]"
-
-    @property
-    def repeat_key(self) -> tuple[int, int, int, str]:
-        """Which repeat of its cell it is; every imported file is one of its own."""
-        return self.offset, -1 if self.noise is None else self.noise, self.seed, self.run_id if self.imported else ""
-
-    @property
-    def repeat(self) -> str:
-        """The same in words, e.g. ``seed 0, offset 2``."""
-        if self.imported:
-            return f"import {self.run_id[:6]}"
-        words = [f"seed {self.seed}"] + [f"offset {self.offset}"] * bool(self.offset)
-        return ", ".join(words + ([] if self.noise is None else [f"noise {self.noise}"]))
-
-    @property
-    def imported(self) -> bool:
-        """Whether the trajectory comes from elsewhere."""
-        return self.kind == "imported"
-
-    @property
-    def variant_key(self) -> str:
-        """Tracker and everything that sets its runs apart besides sequence and repeat."""
-        return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)
-
-    @property
-    def score_m(self) -> float | None:
-        """The ATE that ranks: lost frames held; a failure counts as never moving or worse; None without ground truth.
-
-        A failure whose held trajectory is even further off than a camera that never moves keeps that error.
-        """
-        if self.failed:
-            return None if self.never_move_m is None else max(self.never_move_m, self.held_ate_m or 0.0)
-        return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
-
-    @property
-    def ending(self) -> str:
-        """How a failed run ended, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
-        if not self.failed:
-            return ""
-        if self.status == "lost":
-            return f"lost, {self.n_tracked}/{self.n_frames} tracked"
-        return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
 
 
 @dataclass(frozen=True)
@@ -248,37 +94,32 @@ def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     """The row of one stored run."""
     scored = score(store, record, protocol)
-    which = protocol.trajectory
-    if record.kind == "imported" and scored.online is None and scored.final is not None:
-        which = "final"
+    which, failed, reason = _judge(record, scored, protocol)
     evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    reason = record.reason
-    failed = record.failed or record.status == "lost"
-    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
-        failed = True
-        reason = reason or scored.reasons.get(which, "it cannot be evaluated")
+    alignment = None if evaluation is None else evaluation.alignment
+    tracker, sequence = record.tracker, record.sequence
     still = never_move_error(store, record, protocol, evaluation)
     return RunRow(
         run_id=record.run_id,
         kind="run here" if record.kind == "run" else "imported",
-        tracker=record.tracker.id,
-        label=record.tracker.label or record.tracker.id,
+        tracker=tracker.id,
+        label=tracker.label or tracker.id,
         variant=variant_of(record),
-        provenance=record.tracker.provenance,
-        ranked=record.tracker.ranked,
-        sequence=record.sequence.id,
+        provenance=tracker.provenance,
+        ranked=tracker.ranked,
+        sequence=sequence.id,
         frames=part_words(record),
         part_options=part_options(record),
         block=column_of(record),
-        content=record.sequence.content,
+        content=sequence.content,
         camera=camera_words(record),
         place=record.place,
-        duration_s=record.sequence.duration_s,
-        tags=record.sequence.tags,
-        split=record.sequence.split,
+        duration_s=sequence.duration_s,
+        tags=sequence.tags,
+        split=sequence.split,
         seed=record.seed,
         offset=record.offset,
-        noise=record.sequence.noise,
+        noise=sequence.noise,
         status=record.status,
         reason=reason,
         failed=failed,
@@ -287,6 +128,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         trajectory=which,
         metrics={} if evaluation is None else dict(evaluation.metrics),
         final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
+        rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         held_ate_m=held_error(store, record, protocol, evaluation, still),
         never_move_m=still,
         n_frames=record.n_frames,
@@ -306,6 +148,17 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         machine=machine_words(record),
         notes=[*record.notes, *(evaluation.diagnostics if evaluation is not None else [])],
     )
+
+
+def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple[Which, bool, str]:
+    """Whose errors a row holds, whether it counts as a failure, and why it is not ``ok``."""
+    only_final = record.kind == "imported" and scored.online is None and scored.final is not None
+    which: Which = "final" if only_final else protocol.trajectory
+    evaluation = scored.online if protocol.trajectory == "online" else scored.final
+    failed = record.failed or record.status == "lost"
+    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
+        return which, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
+    return which, failed, record.reason
 
 
 def check_one_protocol(rows: Sequence[RunRow]) -> None:

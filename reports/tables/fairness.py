@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from ..model.board import Board, rank
-from ..model.rows import RunRow
+from ..model.row import RunRow
 from .formats import mm
 from .leaderboard import interval_cell, rank_cell, sequence_columns, skipped_words
 from .table import Column, Emphasis, Table, TableCell, emphasise

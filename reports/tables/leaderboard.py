@@ -13,10 +13,10 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
 from ..model.cell import Cell, mean_skipped
-from ..model.rows import RunRow
+from ..model.row import RunRow
 from ..model.statistics import FEWEST, Interval, Standing
 from .formats import percent
-from .table import Column, Emphasis, Table, TableCell
+from .table import Column, Emphasis, Table, TableCell, number
 
 _PROVENANCE = {
     "own": "parts of it are in no paper",
@@ -50,34 +50,33 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators())
 
 
+_MEANINGS = {
+    "#": "ranks that the data leave open; several: not separable from the others with that rank",
+    "success": "runs that ended and could be evaluated, of all",
+    "tracker": "",
+    "ATE ratio": "geometric mean over sequences of the median ATE over that of {reference}",
+    "mean rank": "mean over sequences of the rank there",
+    "wins": "sequences with a smaller median ATE than the reference; behind it the probability that a run has a "
+    "smaller error than one of the reference",
+    "p": "paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it could never be "
+    "below 0.05",
+    "coverage": "tracked frames over associated input frames",
+    "× real time": "frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
+    "segmentation included, decoding excluded",
+    "MB": "peak resident memory",
+    "F skipped": "share of the tracked frames on which the epipolar test had no say, since F was not used",
+    "rows": "",
+    "provenance": "",
+}
+_WORDS = ("tracker", "rows", "provenance")
+
+
 def _columns(board: Board, epipolar: bool) -> list[Column]:
-    skipped = Column(
-        "F skipped",
-        meaning="share of the tracked frames on which the epipolar test had no say, since F was not used",
-    )
     return [
-        Column("#", meaning="ranks that the data leave open; several: not separable from the others with that rank"),
-        Column("success", meaning="runs that ended and could be evaluated, of all"),
-        Column("tracker", numeric=False),
-        Column(
-            "ATE ratio", meaning=f"geometric mean over sequences of the median ATE over that of {board.reference_name}"
-        ),
-        Column("mean rank", meaning="mean over sequences of the rank there"),
-        Column("wins", meaning="sequences with a smaller median ATE than the reference; behind it the probability that "
-               "a run has a smaller error than one of the reference"),
-        Column("p", meaning="paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it "
-               "could never be below 0.05"),
-        Column("coverage", meaning="tracked frames over associated input frames"),
-        Column(
-            "× real time",
-            meaning="frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
-            "segmentation included, decoding excluded",
-        ),
-        Column("MB", meaning="peak resident memory"),
-        *([skipped] if epipolar else []),
-        Column("rows", numeric=False),
-        Column("provenance", numeric=False),
-    ]  # fmt: skip
+        Column(name, numeric=name not in _WORDS, meaning=meaning.replace("{reference}", board.reference_name))
+        for name, meaning in _MEANINGS.items()
+        if epipolar or name != "F skipped"
+    ]
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
@@ -117,8 +116,8 @@ def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[T
         text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
         ratio = TableCell(ratio.text, text, ratio.value)
     wins = TableCell("reference") if key == board.reference else wins_cell(standing)
-    return [rank_cell(standing), success, name, ratio, number_cell(standing.mean_rank, ".2f"), wins,
-            number_cell(standing.p_value, ".3f")]  # fmt: skip
+    mean_rank, p = number(standing.mean_rank, ".2f"), number(standing.p_value, ".3f")
+    return [rank_cell(standing), success, name, ratio, mean_rank, wins, p]
 
 
 def _mark(board: Board, standing: Standing) -> Emphasis:
@@ -133,14 +132,14 @@ def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
     kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
     provenance = runs[0].provenance
     masks = " + ".join(sorted({row.segmentation for row in runs if row.segmentation not in ("", "none")}))
+    masks_words = f"{masks} masks" if masks else ""
     return [
         TableCell(f"{100 * coverage:.1f} %", value=coverage),
         speed_cell(ended),
-        number_cell(middle(row.peak_memory_mb for row in ended), ".0f"),
+        number(middle(row.peak_memory_mb for row in ended), ".0f"),
         TableCell(tag=kinds),
-        TableCell(_NAMES.get(provenance, provenance), f"{masks} masks" if masks else "",
-                  tip=_PROVENANCE.get(provenance, "")),
-    ]  # fmt: skip
+        TableCell(_NAMES.get(provenance, provenance), masks_words, tip=_PROVENANCE.get(provenance, "")),
+    ]
 
 
 def timed(runs: Sequence[RunRow]) -> list[RunRow]:
@@ -204,10 +203,5 @@ def middle(values: Iterable[float | None]) -> float | None:
     return median(present) if present else None
 
 
-def number_cell(value: float | None, digits: str = "") -> TableCell:
-    """A number, written with a format specification or with all its digits; an empty cell for None."""
-    return TableCell() if value is None else TableCell(format(value, digits) if digits else repr(value), value=value)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' if number != 1 else ''}"
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' if count != 1 else ''}"

@@ -9,8 +9,9 @@ from pathlib import Path
 from statistics import median
 
 from ..model.board import Board
-from ..model.rows import RunRow
-from .table import Column, Table, TableCell
+from ..model.row import RunRow
+from ..model.statistics import FLOOR_M
+from .table import Column, Table, TableCell, number, texts
 
 
 def failures(board: Board, output: Path) -> Table | None:
@@ -18,11 +19,7 @@ def failures(board: Board, output: Path) -> Table | None:
     failed = [row for row in board.rows if row.failed]
     if not failed:
         return None
-    columns = [
-        Column("tracker", numeric=False), Column("sequence", numeric=False), Column("repeat", numeric=False),
-        Column("ended", numeric=False), Column("coverage"), Column("reason", numeric=False),
-        Column("log", numeric=False),
-    ]  # fmt: skip
+    columns = [*texts("tracker", "sequence", "repeat", "ended"), Column("coverage"), *texts("reason", "log")]
     rows = [
         [
             TableCell(board.labels[row.variant_key]),
@@ -42,38 +39,15 @@ def failures(board: Board, output: Path) -> Table | None:
 def repeatability(board: Board) -> Table | None:
     """Spread of the runs of a cell; None if no cell has several."""
     columns = [
-        Column("tracker", numeric=False), Column("cells", meaning="sequences with several runs that differ"),
+        Column("tracker", numeric=False),
+        Column("cells", meaning="sequences with several runs that differ"),
         Column("deterministic", meaning="sequences on which several seeds gave one result to the last digit"),
         Column("runs a cell"),
         Column("worst / best", meaning="median over cells of the largest over the smallest ATE"),
-        Column("largest worst / best"), Column("where", numeric=False),
-    ]  # fmt: skip
-    rows = []
-    for key in board.trackers:
-        spreads = []
-        for sequence in board.sequences:
-            cell = board.cells[key].get(sequence)
-            if cell and len(cell.scores) > 1:
-                spreads.append((max(cell.scores) / max(min(cell.scores), 1e-6), sequence, len(cell.scores)))
-        copies = sum(board.cells[key][name].deterministic for name in board.sequences if name in board.cells[key])
-        if copies and not spreads:
-            rows.append([TableCell(board.labels[key]), TableCell("0", value=0), TableCell(str(copies), value=copies),
-                         *[TableCell()] * 4])  # fmt: skip
-        if not spreads:
-            continue
-        worst = max(spreads)
-        middle = median(spread for spread, _, _ in spreads)
-        rows.append(
-            [
-                TableCell(board.labels[key]),
-                TableCell(str(len(spreads)), value=len(spreads)),
-                TableCell(str(copies), value=copies),
-                TableCell(f"{median(n for _, _, n in spreads):g}"),
-                TableCell(f"{middle:.2f}", value=middle),
-                TableCell(f"{worst[0]:.2f}", value=worst[0]),
-                TableCell(worst[1]),
-            ]
-        )
+        Column("largest worst / best"),
+        Column("where", numeric=False),
+    ]
+    rows = [cells for key in board.trackers if (cells := _spread_cells(board, key))]
     if not rows:
         return None
     caption = (
@@ -84,11 +58,26 @@ def repeatability(board: Board) -> Table | None:
     return Table("repeatability", "Repeatability", caption, columns, rows)
 
 
+def _spread_cells(board: Board, key: str) -> list[TableCell]:
+    """How far the runs of a tracker lie apart; empty if it has no cell with several."""
+    cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
+    several = {name: cell.scores for name, cell in cells.items() if len(cell.scores) > 1}
+    copies = sum(cell.deterministic for cell in cells.values())
+    counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
+    if not several:
+        return [*counts, *[TableCell()] * 4] if copies else []
+    spreads = {name: max(scores) / max(min(scores), FLOOR_M) for name, scores in several.items()}
+    where, worst = max(spreads.items(), key=lambda item: (item[1], item[0]))
+    size = f"{median(len(scores) for scores in several.values()):g}"
+    middle = median(spreads.values())
+    return [*counts, TableCell(size), number(middle, ".2f"), number(worst, ".2f"), TableCell(where)]
+
+
 def machines(board: Board) -> Table:
     """Computers and versions behind the runs."""
     counts = Counter(row.machine or "not recorded" for row in board.rows)
     columns = [Column("runs"), Column("machine and versions", numeric=False)]
-    rows = [[TableCell(str(count), value=count), TableCell(name)] for name, count in counts.most_common()]
+    rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
     caption = "Times of different machines are not comparable."
     return Table("machines", "Machines and versions", caption, columns, rows)
 

@@ -3,46 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from statistics import median
+from collections.abc import Sequence
 
 import numpy as np
 
+from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import NEVER_MOVE, Board
 from ..model.cell import Cell
-from ..model.rows import RunRow
+from ..model.published import ReportedCell
 from .formats import mm, significant_text
 from .leaderboard import sequence_columns, skipped_words
-from .table import Column, Emphasis, Table, TableCell, emphasise
-
-
-@dataclass(frozen=True)
-class ReportedCell:
-    """A published number.
-
-    Attributes:
-        system: Its name.
-        sequence: Sequence of the board.
-        value: ATE in metres.
-        source: Where it was read.
-        tag: What kind of number it is.
-    """
-
-    system: str
-    sequence: str
-    value: float
-    source: str
-    tag: str = "reported"
+from .metric import DOUBT, column_marks, metric_table
+from .table import Column, Emphasis, Table, TableCell
 
 
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
     """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
     sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
     usual = sizes.most_common(1)[0][0] if sizes else 1
-    marks = _marks(board, lambda cell: cell.median)
+    medians = {(key, name): cell.median for key in board.ranked for name, cell in board.cells[key].items()}
+    marks = column_marks(board, {place: value for place, value in medians.items() if value is not None})
     rows, muted = [], {at for at, key in enumerate(board.trackers) if key not in board.ranked}
     for key in board.trackers:
         cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
@@ -76,6 +58,31 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     return Table("per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators)
 
 
+def final_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the final trajectories, of the trackers that have one."""
+    return metric_table(
+        board,
+        lambda row: row.final_ate_m,
+        "final_trajectory",
+        "Error of the final trajectory",
+        "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
+        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+        trackers=[*board.trackers, *board.final_only],
+    )
+
+
+def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the tracked frames only."""
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ate_rmse_m"),
+        "lost_frames_excluded",
+        "Error without the lost frames",
+        "Median ATE (RMSE, millimetres) of the tracked frames only, of the runs that succeeded: the sensitivity to "
+        f"lost frames, not what ranks. {protocol.describe()}.",
+    )
+
+
 def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
     """One table for each relative error of the protocol and each of its parts."""
     tables = []
@@ -83,14 +90,13 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
         for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
             metric = f"rpe_{spec.key}_{part}_rmse_{unit}"
             per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 else ""
-            unit_text = ("mm" if unit == "m" else "°") + per
             table = metric_table(
                 board,
                 lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]
                 f"rpe_{spec.key}_{part}",
                 f"Relative pose error over {spec.describe()}: {name}",
-                f"RMSE in {unit_text}, median over the runs that succeeded, on the frames that they tracked. "
-                f"{protocol.describe()}.",
+                f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
+                f"they tracked. {protocol.describe()}.",
                 text=mm if unit == "m" else significant_text,
             )
             if table is not None:
@@ -98,74 +104,33 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
     return tables
 
 
-def metric_table(
-    board: Board,
-    value: Callable[[RunRow], float | None],
-    name: str,
-    title: str,
-    caption: str,
-    *,
-    text: Callable[[float], str] = mm,
-    larger_is_better: bool = False,
-    trackers: Sequence[str] | None = None,
-) -> Table | None:
-    """Median of any number of the runs that succeeded, by tracker and sequence; None if no run has it.
-
-    Args:
-        board: The board.
-        value: The number of a run.
-        name: Id of the table.
-        title: Heading.
-        caption: How to read it.
-        text: How the number is written; metres become millimetres by default.
-        larger_is_better: Which end is bold.
-        trackers: Variant keys; the board's by default.
-    """
-    keys = board.trackers if trackers is None else trackers
-    found = {
-        (key, sequence): number
-        for key in keys
-        for sequence, cell in board.cells[key].items()
-        if (number := median_of(cell, value)) is not None
-    }
-    if not found:
-        return None
-    sign = -1.0 if larger_is_better else 1.0
-    marks = _marks(board, lambda cell: None if (n := median_of(cell, value)) is None else sign * n)
-    present = [key for key in keys if any((key, sequence) in found for sequence in board.sequences)]
-    rows, muted = [], {at for at, key in enumerate(present) if key not in board.ranked}
-    for key in present:
-        cells = [TableCell(board.labels[key])]
-        for sequence in board.sequences:
-            cell, number = board.cells[key].get(sequence), found.get((key, sequence))
-            if cell is not None and not cell.success:
-                cells.append(TableCell(emphasis="failed", tip=cell.ending))
-            elif cell is None or number is None:
-                cells.append(TableCell())
-            else:
-                mark = marks.get((key, sequence), "")
-                cells.append(TableCell(text(number), skipped_words(cell), number, mark, tip=cell.ending))
-        rows.append(cells)
-    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
-    competing = sum(key in board.ranked for key in present)
-    separators = {competing} if 0 < competing < len(rows) else set()
-    return Table(name, title, caption, columns, rows, muted, separators)
+def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Absolute rotational error, marked where it is an error of the alignment rather than of the tracker."""
+    caption = (
+        "Absolute rotational error (RMSE in °), median over the runs that succeeded, after the alignment of the "
+        f"positions, on the frames that they tracked. {protocol.describe()}."
+    )
+    if any(_rotation_doubt(cell) for cells in board.cells.values() for cell in cells.values()):
+        caption += (
+            f" {DOUBT} Unreliable: the path hardly determines the alignment's rotation (its standard error is above "
+            f"{RELIABLE_DEG:.0f}° in a run of the cell), so the number says nothing of the tracker and takes no part "
+            "in emphasis. Translational and relative errors are not affected."
+        )
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ape_rot_rmse_deg"),
+        "ape_rotation",
+        "Absolute rotational error",
+        caption,
+        text=significant_text,
+        doubt=_rotation_doubt,
+    )
 
 
-def median_of(cell: Cell, value: Callable[[RunRow], float | None]) -> float | None:
-    """Median of a number over the runs of a cell that count and succeeded."""
-    values = [number for row in cell.kept if not row.failed and (number := value(row)) is not None]
-    return median(values) if values else None
-
-
-def _marks(board: Board, value: Callable[[Cell], float | None]) -> dict[tuple[str, str], Emphasis]:
-    """Best and second best of every column among the ranked trackers whose runs there all succeeded."""
-    marks: dict[tuple[str, str], Emphasis] = {}
-    for name in board.sequences:
-        cells = {key: cell for key in board.ranked if (cell := board.cells[key].get(name)) and not cell.failed}
-        found = emphasise([value(cell) for cell in cells.values()])
-        marks |= {(key, name): mark for key, mark in zip(cells, found, strict=True)}
-    return marks
+def _rotation_doubt(cell: Cell) -> str:
+    """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
+    found = [row.rotation_uncertainty_deg or 0.0 for row in cell.kept if not row.failed and not row.rotation_reliable]
+    return f"unreliable: the alignment's rotation is known to ±{max(found):.0f}° only" if found else ""
 
 
 def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, usual: int) -> TableCell:

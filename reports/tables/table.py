@@ -1,14 +1,18 @@
-"""A table, independent of how it is written: HTML, Markdown, CSV and LaTeX are made of the same cells."""
+"""A table, independent of how it is written: HTML, Markdown, CSV and LaTeX are made of the same two frames."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
+import pandas as pd
+
 Emphasis = Literal["", "best", "second", "muted", "failed"]
+_LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
+_LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"}
+_LATEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"}
+_LATEX |= {"×": r"$\times$", "±": r"$\pm$", "≤": r"$\leq$", "≥": r"$\geq$", "°": r"$^\circ$", "²": r"$^2$"}
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,21 @@ class Column:
     numeric: bool = True
     meaning: str = ""
     full: str = ""
+
+    @property
+    def key(self) -> str:
+        """Name in frames and in CSV: the full one, with its group."""
+        return self.full or (f"{self.group}: {self.name}" if self.group else self.name)
+
+
+def texts(*names: str) -> list[Column]:
+    """Columns of text."""
+    return [Column(name, numeric=False) for name in names]
+
+
+def numbers(*names: str, group: str = "") -> list[Column]:
+    """Columns of numbers, below one heading."""
+    return [Column(name, group) for name in names]
 
 
 @dataclass(frozen=True)
@@ -55,27 +74,63 @@ class TableCell:
     link: str = ""
 
 
-@dataclass
+def number(value: float | None, digits: str = "", unit: str = "") -> TableCell:
+    """A number, written with a format specification or with all its digits; an empty cell for None."""
+    if value is None:
+        return TableCell()
+    return TableCell((format(value, digits) if digits else repr(value)) + unit, value=value)
+
+
 class Table:
-    """A table with a caption that says how to read it.
+    """A table with a caption that says how to read it: a frame of what is shown and a frame of what is behind it.
 
     Attributes:
         id: Short name, also the CSV file's.
         title: Heading.
         caption: Everything a reader needs, including the protocol.
         columns: The columns.
-        rows: One cell for every column.
+        shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
+        values: The numbers behind it with all their digits, in the units that the caption and the headings name
+            (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
+            ``Int64`` if all their numbers are whole, else ``float64``; missing where the cell has no number. Columns
+            of text are ``string``.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
     """
 
-    id: str
-    title: str
-    caption: str
-    columns: list[Column]
-    rows: list[list[TableCell]]
-    muted_rows: set[int] = field(default_factory=set)
-    separators: set[int] = field(default_factory=set)
+    def __init__(
+        self,
+        id: str,
+        title: str,
+        caption: str,
+        columns: Sequence[Column],
+        rows: Sequence[Sequence[TableCell]],
+        muted_rows: Collection[int] = (),
+        separators: Collection[int] = (),
+    ) -> None:
+        """A table of rows with one cell for every column.
+
+        Raises:
+            ValueError: A row has another number of cells than there are columns.
+        """
+        self.id, self.title, self.caption = id, title, caption
+        self.columns = list(columns)
+        self.muted_rows, self.separators = set(muted_rows), set(separators)
+        self.shown = pd.DataFrame([list(row) for row in rows], columns=range(len(self.columns)), dtype=object)
+        series = [_values(column, self.shown[at]) for at, column in enumerate(self.columns)]
+        self.values = pd.concat(series, axis=1)
+        self.shown.columns = self.values.columns = pd.Index([column.key for column in self.columns])
+
+    @property
+    def rows(self) -> list[list[TableCell]]:
+        """What is displayed, by row."""
+        return [list(row) for row in self.shown.itertuples(index=False, name=None)]
+
+    def frame(self) -> pd.DataFrame:
+        """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
+        pairs = zip(self.values.items(), self.shown.items(), strict=True)
+        columns = [values.astype(object).where(values.notna(), shown.map(_words)) for (_, values), (_, shown) in pairs]
+        return pd.concat(columns, axis=1)
 
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
@@ -104,12 +159,7 @@ def to_markdown(table: Table) -> str:
 
 def to_csv(table: Table) -> str:
     """The table as CSV; numbers stand with all their digits."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([_csv_name(column) for column in table.columns])
-    for row in table.rows:
-        writer.writerow([_csv_cell(cell) for cell in row])
-    return out.getvalue()
+    return str(table.frame().to_csv(index=False, lineterminator="\n"))
 
 
 def to_latex(table: Table) -> str:
@@ -148,13 +198,7 @@ def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
 
 def escape_latex(text: str) -> str:
     """Text with LaTeX's special characters made harmless."""
-    replaced = {
-        "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "·": r"\textperiodcentered{}", "×": r"$\times$",
-        "±": r"$\pm$", "≤": r"$\leq$", "≥": r"$\geq$", "—": "---", "<": r"\textless{}", ">": r"\textgreater{}",
-        "|": r"\textbar{}", "°": r"$^\circ$", "–": "--", "²": r"$^2$",
-    }  # fmt: skip
-    return "".join(replaced.get(character, character) for character in text)
+    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def _escape_markdown(text: str) -> str:
@@ -171,13 +215,17 @@ def _markdown_cell(cell: TableCell) -> str:
     return " ".join(part for part in parts if part)
 
 
-def _csv_name(column: Column) -> str:
-    return column.full or (f"{column.group}: {column.name}" if column.group else column.name)
+def _values(column: Column, shown: pd.Series) -> pd.Series:
+    """The numbers behind the cells of a column, or its words."""
+    if not column.numeric and all(cell.value is None for cell in shown):
+        return shown.map(_words).astype("string").rename(column.key)
+    found = [cell.value for cell in shown]
+    present = [value for value in found if value is not None]
+    whole = bool(present) and all(isinstance(value, int) for value in present)
+    return pd.Series(found, dtype="Int64" if whole else "float64", name=column.key)
 
 
-def _csv_cell(cell: TableCell) -> str | float:
-    if cell.value is not None:
-        return cell.value
+def _words(cell: TableCell) -> str:
     return " ".join(part for part in (cell.text, cell.small, cell.tag) if part)
 
 

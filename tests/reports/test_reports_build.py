@@ -17,7 +17,8 @@ from dynslam_bench.reports import compare_runs as compare
 from dynslam_bench.reports.figures.sequence import broken
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import shortened
-from dynslam_bench.reports.model.rows import RunRow, check_one_protocol, load_runs
+from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.reports.model.rows import check_one_protocol, load_runs
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.reports.tables.sequences import per_sequence
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown

@@ -13,7 +13,8 @@ from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import name_columns
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
-from dynslam_bench.reports.model.rows import RunRow, load_runs
+from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.formats import mm, percent
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.reports.tables.sequences import per_sequence, relative_errors

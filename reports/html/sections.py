@@ -1,0 +1,200 @@
+"""The sections of a report, one function each: what they show, in which order, below which words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from ..figures import leaderboard as figures
+from ..figures.sequence import sequence_figures
+from ..model.board import Board
+from ..model.common import common_errors, representatives
+from ..model.missing import missing_commands, missing_note
+from ..model.published import is_excerpt, reported_for
+from ..model.rows import Loaded
+from ..model.statistics import FEWEST, power_note
+from ..tables import fairness as fairness_tables
+from ..tables import leaderboard as tables
+from ..tables import runs as run_tables
+from ..tables import sequences as sequence_tables
+from ..tables.formats import significant_text
+from ..tables.metric import metric_table
+from .draft import Draft
+from .page import Block, Section
+
+_MOST_NOTES = 60
+
+
+def add_leaderboard(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+    """The ranking, what is missing for more of it, and the commands that fill the gaps."""
+    section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=_leaderboard_notes(board, loaded))
+    section.blocks.append(draft.table(tables.leaderboard(board, protocol)))
+    ratio = figures.ratio_figure(board)
+    if ratio is not None:
+        caption = (
+            f"Points: geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} sequences on. Open "
+            "points are not ranked."
+        )
+        section.blocks.append(draft.figure("ratio", ratio, caption))
+    commands = missing_commands(board)
+    if commands:
+        section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(commands)))
+    draft.add(section)
+
+
+def _leaderboard_notes(board: Board, loaded: Loaded) -> list[str]:
+    cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
+    notes = [power_note(board.standings, len(board.common), min((len(c.scores) for c in cells if c.scores), default=0))]
+    missing = missing_note(board)
+    if missing:
+        notes.insert(0, missing)
+    if board.final_only:
+        named = ", ".join(board.labels[key] for key in board.final_only)
+        notes.append(f"Only in the table of final trajectories, as nothing else is known of them: {named}.")
+    if board.unscored:
+        notes.append(f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}.")
+    left = [
+        (loaded.superseded, "older runs of the same tracker, settings, frames and repeat"),
+        (loaded.stopped, "runs that were stopped on request"),
+        (len(loaded.unreadable), "folders without a valid record"),
+    ]
+    if any(count for count, _ in left):
+        notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
+    return notes
+
+
+def add_speed(draft: Draft, board: Board) -> None:
+    """Accuracy against speed."""
+    figure = figures.speed_figure(board)
+    if figure is None:
+        return
+    caption = (
+        "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
+        "include segmentation and exclude decoding; they hold for the machine named below."
+    )
+    if any(row.cached for row in board.rows):
+        caption += f" {tables.CACHED_NOTE}"
+    section = Section("speed", "Accuracy against speed", "Speed")
+    section.blocks.append(draft.figure("speed", figure, caption))
+    draft.add(section)
+
+
+def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+    """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
+    if not board.sequences:
+        return
+    section = Section("errors", "Errors by sequence", "Errors")
+    excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence, row.duration_s)}
+    recorded = [row for row in board.rows if not row.sequence.startswith("synthetic/")]
+    parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frames})
+    if parts:
+        section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
+    published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)
+    table_of_errors = sequence_tables.per_sequence(board, protocol, published)
+    section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
+    common, frames = common_errors(board, protocol, loaded)
+    section.blocks += draft.titled(fairness_tables.common_frames_table(board, common, frames))
+    if protocol.trajectory == "online":
+        section.blocks += draft.titled(sequence_tables.final_errors(board, protocol))
+    if any(row.coverage < 1 and not row.failed for row in board.rows):
+        section.blocks += draft.titled(sequence_tables.tracked_errors(board, protocol))
+    section.blocks += draft.titled(fairness_tables.failure_rule_table(board))
+    for table in sequence_tables.relative_errors(board, protocol):
+        section.blocks += draft.titled(table)
+    section.blocks += draft.titled(sequence_tables.rotation_errors(board, protocol))
+    draft.add(section)
+
+
+def add_trajectories(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+    """Paths and errors over time of one run a tracker, by sequence."""
+    section = Section("trajectories", "Trajectories and error over time", "Trajectories")
+    for position, sequence in enumerate(board.sequences):
+        chosen = representatives(board, sequence, loaded)
+        estimates: dict[str, Trajectory] = {}
+        truth = None
+        for key, run in chosen.items():
+            trajectory = run.store.trajectory(run.row.run_id, protocol.trajectory)
+            truth = truth or run.store.ground_truth(run.record.sequence.part)
+            if trajectory is not None and run.row.metrics:
+                estimates[key] = trajectory
+        if truth is None or not estimates:
+            continue
+        paths, errors = sequence_figures(board, truth, estimates, protocol)
+        draft.figures |= {f"path-{position}": paths, f"error-{position}": errors}
+        caption = (
+            f"The run with the median error of each tracker, aligned ({protocol.alignment}), seen along the three "
+            "axes. Lines are broken where a gap exceeds twice the median interval. Click a name to show or hide it."
+        )
+        over_time = "Absolute translational error of the same runs, frame by frame."
+        section.blocks.append(
+            Block(
+                kind="details",
+                summary=sequence,
+                small=", ".join(filter(None, (board.groups[sequence], f"{len(estimates)} trackers"))),
+                open=position == 0,
+                figures=[(f"path-{position}", caption), (f"error-{position}", over_time)],
+            )
+        )
+    draft.add(section)
+
+
+def add_repeatability(draft: Draft, board: Board) -> None:
+    """How far the runs of a cell lie apart."""
+    table = run_tables.repeatability(board)
+    if table is None:
+        return
+    section = Section("repeatability", "Repeatability", "Repeatability")
+    figure = figures.repeat_figure(board)
+    if figure is not None:
+        caption = "One point a run: its error over the median of the same tracker on the same sequence."
+        section.blocks.append(draft.figure("repeat", figure, caption))
+    section.blocks.append(draft.table(table))
+    draft.add(section)
+
+
+def add_masks(draft: Draft, board: Board) -> None:
+    """Quality of the masks, and the pose error against it."""
+    section = Section("masks", "Mask quality and pose error", "Masks")
+    figure = figures.mask_figure(board)
+    if figure is not None:
+        section.blocks.append(draft.figure("masks", figure, "One point a run."))
+    table = metric_table(
+        board,
+        lambda row: row.mask_iou,
+        "mask_iou",
+        "Mask quality",
+        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        text=significant_text,
+        larger_is_better=True,
+    )
+    if table is not None:
+        section.blocks.append(draft.table(table))
+    draft.add(section)
+
+
+def add_failures(draft: Draft, board: Board, output: Path) -> None:
+    """Every run that failed, or that none did."""
+    table = run_tables.failures(board, output)
+    nothing = Block(kind="list", entries=[f"None of {len(board.rows)} runs failed."])
+    draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
+
+
+def add_provenance(draft: Draft, board: Board, again: str) -> None:
+    """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
+    section = Section("provenance", "Machines, versions, commands", "Reproduce")
+    section.blocks.append(draft.table(run_tables.machines(board)))
+    commands = list(dict.fromkeys(row.command for row in board.rows if row.command))
+    section.blocks.append(
+        Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
+    )
+    notes = [
+        f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
+    ]
+    if notes:
+        shown = notes[:_MOST_NOTES]
+        if len(notes) > len(shown):
+            shown.append(f"... and {len(notes) - len(shown)} more in report.json")
+        section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown))
+    draft.add(section)

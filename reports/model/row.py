@@ -1,0 +1,171 @@
+"""One row a run: what the report knows of it, whether it was made here, imported or only reported."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Literal
+
+from pydantic import Field
+
+from dynslam_bench.core.records import Record
+from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
+
+Kind = Literal["run here", "imported"]
+Which = Literal["online", "final"]
+"""Which of a run's two trajectories."""
+
+
+class RunRow(Record):
+    """A run as the report shows it.
+
+    Attributes:
+        run_id: Its id in the store.
+        kind: Made by this toolkit, or a trajectory from elsewhere.
+        tracker: Tracker id.
+        label: Tracker's label.
+        variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
+        provenance: How closely the tracker follows its source.
+        ranked: Whether its spec lets it be ranked.
+        sequence: Sequence id.
+        frames: Part of the sequence in words, empty for all of it.
+        part_options: The same as command-line options.
+        block: What one column of a table is: content, camera, frames and stride.
+        content: Digest of the content.
+        camera: Camera in words.
+        place: Folder of the sequence where it was named by its path.
+        duration_s: Time between its first and last frame.
+        tags: Tags of the sequence.
+        split: ``tune``, ``held-out`` or empty.
+        seed: Seed.
+        offset: Leading frames that were left out: another repeat.
+        noise: Seed of the sensors' noise: another repeat.
+        status: Status of the run.
+        reason: Why it is not ``ok``.
+        failed: Whether it counts as a failure: it did not end, could not track, or cannot be evaluated.
+        protocol_id: Id of the protocol of `metrics`.
+        protocol_digest: Its digest.
+        trajectory: Which trajectory the metrics are of; an import may hold the final one only.
+        metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
+        final_ate_m: ATE of the final trajectory; None if there is none.
+        rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
+            `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
+        held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
+        never_move_m: What a camera that does not move scores there; None without ground truth.
+        n_frames: Input frames.
+        n_processed: Frames that the tracker saw before it ended.
+        n_tracked: Frames that were tracked.
+        coverage: Share of the input frames that was tracked.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
+        cached: Whether stage times come from the stage cache and were not taken in this run.
+        frame_ms: Median frame time in milliseconds, None if unknown.
+        real_time_factor: Frame interval over mean frame time, None if unknown.
+        peak_memory_mb: Largest resident memory, None if unknown.
+        mask_iou: Overlap of the dynamic mask with the exact one, None if unknown.
+        segmentation: Source of the masks.
+        started: UTC, ISO 8601.
+        log: Path of the run's log.
+        command: Command line that made it.
+        machine: Computer and versions in words.
+        notes: Diagnostics of the evaluation and of the run.
+    """
+
+    run_id: str
+    kind: Kind
+    tracker: str
+    label: str
+    variant: dict[str, Any] = Field(default_factory=dict)
+    provenance: str = ""
+    ranked: bool = True
+    sequence: str
+    frames: str = ""
+    part_options: list[str] = Field(default_factory=list)
+    block: str = ""
+    content: str = ""
+    camera: str = ""
+    place: str = ""
+    duration_s: float = 0.0
+    tags: list[str] = Field(default_factory=list)
+    split: str = ""
+    seed: int = 0
+    offset: int = 0
+    noise: int | None = None
+    status: str = "ok"
+    reason: str = ""
+    failed: bool = False
+    protocol_id: str
+    protocol_digest: str
+    trajectory: Which = "online"
+    metrics: dict[str, float] = Field(default_factory=dict)
+    final_ate_m: float | None = None
+    rotation_uncertainty_deg: float | None = None
+    held_ate_m: float | None = None
+    never_move_m: float | None = None
+    n_frames: int = 0
+    n_processed: int = 0
+    n_tracked: int = 0
+    coverage: float = 0.0
+    epipolar_skipped: float | None = None
+    cached: bool = False
+    frame_ms: float | None = None
+    real_time_factor: float | None = None
+    peak_memory_mb: float | None = None
+    mask_iou: float | None = None
+    segmentation: str = ""
+    started: str = ""
+    log: str = ""
+    command: str = ""
+    machine: str = ""
+    notes: list[str] = Field(default_factory=list)
+
+    @property
+    def column_id(self) -> str:
+        """What one column of a table is; equal for all repeats and for every spelling of the same frames."""
+        return self.block or f"{self.sequence} [{self.frames}]"
+
+    @property
+    def repeat_key(self) -> tuple[int, int, int, str]:
+        """Which repeat of its cell it is; every imported file is one of its own."""
+        return self.offset, -1 if self.noise is None else self.noise, self.seed, self.run_id if self.imported else ""
+
+    @property
+    def repeat(self) -> str:
+        """The same in words, e.g. ``seed 0, offset 2``."""
+        if self.imported:
+            return f"import {self.run_id[:6]}"
+        words = [f"seed {self.seed}"] + [f"offset {self.offset}"] * bool(self.offset)
+        return ", ".join(words + ([] if self.noise is None else [f"noise {self.noise}"]))
+
+    @property
+    def imported(self) -> bool:
+        """Whether the trajectory comes from elsewhere."""
+        return self.kind == "imported"
+
+    @property
+    def variant_key(self) -> str:
+        """Tracker and everything that sets its runs apart besides sequence and repeat."""
+        return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)
+
+    @property
+    def score_m(self) -> float | None:
+        """The ATE that ranks: lost frames held; a failure counts as never moving or worse; None without ground truth.
+
+        A failure whose held trajectory is even further off than a camera that never moves keeps that error.
+        """
+        if self.failed:
+            return None if self.never_move_m is None else max(self.never_move_m, self.held_ate_m or 0.0)
+        return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
+
+    @property
+    def rotation_reliable(self) -> bool:
+        """Whether the metrics ``ape_rot_*`` are errors of the estimate rather than of its alignment."""
+        return self.rotation_uncertainty_deg is None or self.rotation_uncertainty_deg <= RELIABLE_DEG
+
+    @property
+    def ending(self) -> str:
+        """How a failed run ended, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
+        if not self.failed:
+            return ""
+        if self.status == "lost":
+            return f"lost, {self.n_tracked}/{self.n_frames} tracked"
+        return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
