@@ -24,6 +24,7 @@ from . import (
     studies,
     trackers,
 )
+from .output import for_scripts
 
 app = typer.Typer(
     name="dynslam-bench",
@@ -72,6 +73,7 @@ def start(arguments: list[str] | None = None) -> None:
     Args:
         arguments: What follows the program's name; by default the command line's.
     """
+    for_scripts(False)
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
         app(args=arguments, prog_name="dynslam-bench")

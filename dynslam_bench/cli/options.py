@@ -7,12 +7,14 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from .output import for_scripts
+
 DataRoot = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
     typer.Option("--data-root", help="Folder of the sequences; default DYNSLAM_BENCH_DATA, else the user's cache."),
 ]
 Results = Annotated[Path, typer.Option("--results", help="Results folder.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Write JSON for scripts.")]
+AsJson = Annotated[bool, typer.Option("--json", callback=for_scripts, help="Write JSON for scripts, and nothing else.")]
 Camera = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml."),
@@ -57,10 +59,11 @@ TimeLimit = Annotated[
 MemoryLimit = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option(
-        "--memory-limit", min=0,
+        "--memory-limit",
+        min=0,
         help="MB that a run may take; default is 80 % of the machine's memory, shared by --jobs; 0 is no limit.",
     ),
-]  # fmt: skip
+]
 
 
 def gather_settings(assignments: list[str] | None, file: Path | None, preset: dict[str, Any]) -> dict[str, Any]:
