@@ -158,9 +158,7 @@ class _Teller:
         self._send({"type": "progress", "check": asdict(check)})
 
 
-def work(
-    job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]
-) -> dict[str, Any]:  # fmt: skip
+def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
     """What the child does: the checks whose outcome is not known yet."""
     from .tracker import tracker_report
 

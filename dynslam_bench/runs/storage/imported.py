@@ -72,7 +72,6 @@ def import_trajectory(
     file = Path(path).expanduser()
     loaded = load_tum(file)
     opened = open_frames(sequence, data_root, camera, frames, stride)
-    store = results if isinstance(results, RunStore) else RunStore(results)
     covered, odd = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
     notes = loaded.notes.describe()
     if odd:
@@ -86,10 +85,7 @@ def import_trajectory(
         sequence=sequence_info(opened, identity["content"], part_digest(identity)),
         frames=_pair(frames),
         stride=stride,
-        n_frames=len(opened),
-        n_tracked=covered,
-        n_lost=len(opened) - covered,
-        coverage=covered / len(opened),
+        **_counts(covered, len(opened)),
         stamps_match=not odd,
         started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(),
@@ -98,13 +94,22 @@ def import_trajectory(
         notes=notes,
         place=place_of(sequence),
     ).normalised()
+    store = results if isinstance(results, RunStore) else RunStore(results)
+    _keep(store, record, opened, loaded.trajectory, which)
+    return record
+
+
+def _keep(store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Trajectory, which: str) -> None:
     store.prepare()
     with store.work_folder(record.run_id) as work:
-        comment = f"imported: {tracker} on {opened.id}"
-        write_tum(work / f"trajectory_{which}.txt", loaded.trajectory, comment=comment)
-        store.add_sequence(record.sequence.part, opened.timestamps, opened.ground_truth)
+        comment = f"imported: {record.tracker.id} on {sequence.id}"
+        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
+        store.add_sequence(record.sequence.part, sequence.timestamps, sequence.ground_truth)
         store.publish(work, record)
-    return record
+
+
+def _counts(covered: int, total: int) -> dict[str, Any]:
+    return {"n_frames": total, "n_tracked": covered, "n_lost": total - covered, "coverage": covered / total}
 
 
 def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int]:
