@@ -25,7 +25,7 @@ from . import (
     studies,
     trackers,
 )
-from .output import drawn_download
+from .output import drawn_download, for_scripts
 
 app = typer.Typer(
     name="dynslam-bench",
@@ -75,6 +75,7 @@ def start(arguments: list[str] | None = None) -> None:
     Args:
         arguments: What follows the program's name; by default the command line's.
     """
+    for_scripts(False)
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
         app(args=arguments, prog_name="dynslam-bench")

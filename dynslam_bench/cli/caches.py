@@ -22,10 +22,13 @@ def info(as_json: AsJson = False) -> None:
     if as_json:
         write_json(
             {
-                "folder": found.folder, "max_bytes": found.max_bytes, "bytes": total,
-                "bytes_by_stage": found.bytes_by_stage, "entries_by_stage": found.entries_by_stage,
+                "folder": found.folder,
+                "max_bytes": found.max_bytes,
+                "bytes": total,
+                "bytes_by_stage": found.bytes_by_stage,
+                "entries_by_stage": found.entries_by_stage,
             }
-        )  # fmt: skip
+        )
         return
     write(f"{found.folder}: {total / 1e6:.1f} of {found.max_bytes / 1e6:.0f} MB")
     if found.bytes_by_stage:

@@ -50,9 +50,7 @@ def list_(as_json: AsJson = False) -> None:
     if as_json:
         write_json([{"digest": each.digest(), **each.model_dump(mode="json")} for each in PROTOCOLS.values()])
         return
-    write_table(
-        ("id", "digest", "meaning"), [(each.id, each.digest(), each.describe()) for each in PROTOCOLS.values()]
-    )  # fmt: skip
+    write_table(("id", "digest", "meaning"), [(each.id, each.digest(), each.describe()) for each in PROTOCOLS.values()])
 
 
 @protocols.command()

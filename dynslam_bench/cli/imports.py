@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from .options import AsJson, Camera, DataRoot, Frames, ProtocolId, Results, Stride
-from .running import show_runs
+from .run_rows import show_runs
 
 
 def add(app: typer.Typer) -> None:
@@ -38,8 +38,16 @@ def import_(
 
     store = RunStore(results)
     record = import_trajectory(
-        trajectory, tracker, sequence, results=store, label=label, provenance=provenance,
-        which="online" if online else "final", frames=frames, stride=stride,
-        data_root=data_root, camera=camera,
-    )  # fmt: skip
+        trajectory,
+        tracker,
+        sequence,
+        results=store,
+        label=label,
+        provenance=provenance,
+        which="online" if online else "final",
+        frames=frames,
+        stride=stride,
+        data_root=data_root,
+        camera=camera,
+    )
     show_runs([record], store, protocol, as_json=as_json)

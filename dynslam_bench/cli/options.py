@@ -7,12 +7,14 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from .output import for_scripts
+
 DataRoot = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
     typer.Option("--data-root", help="Folder of the sequences; default DYNSLAM_BENCH_DATA, else the user's cache."),
 ]
 Results = Annotated[Path, typer.Option("--results", help="Results folder.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Write JSON for scripts.")]
+AsJson = Annotated[bool, typer.Option("--json", callback=for_scripts, help="Write JSON for scripts, and nothing else.")]
 Camera = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml."),
@@ -48,8 +50,33 @@ Retry = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--retry", help="Run again what ended so: failed, or a status."),
 ]
-
-
+Preset = Annotated[Optional[str], typer.Option("--preset", help="A preset of the tracker.")]  # noqa: UP045
+Realtime = Annotated[bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.")]
+Drop = Annotated[float, typer.Option("--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.")]
+Degrade = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        "--degrade",
+        metavar="KIND=STRENGTH",
+        help="Spoil the images: lighting, glare, shadow, blur, noise; repeatable.",
+    ),
+]
+Cache = Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")]
+Video = Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")]
+Sheet = Annotated[
+    bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
+]
+Label = Annotated[str, typer.Option("--label", help="Name in tables, in place of the tracker's.")]
+Trackers = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--tracker", help="Only this tracker, or another one; repeatable."),
+]
+Scheduler = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs."
+    ),
+]
 TimeLimit = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option("--time-limit", help="Seconds that a run may take; default is no limit on the whole run."),
@@ -57,10 +84,11 @@ TimeLimit = Annotated[
 MemoryLimit = Annotated[
     Optional[float],  # noqa: UP045
     typer.Option(
-        "--memory-limit", min=0,
+        "--memory-limit",
+        min=0,
         help="MB that a run may take; default is 80 % of the machine's memory, shared by --jobs; 0 is no limit.",
     ),
-]  # fmt: skip
+]
 
 
 def gather_settings(assignments: list[str] | None, file: Path | None, preset: dict[str, Any]) -> dict[str, Any]:

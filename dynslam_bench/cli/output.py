@@ -17,6 +17,17 @@ SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
 
 
+_for_scripts = False
+"""Whether the command that runs was asked for JSON: then nothing but errors goes to standard error."""
+
+
+def for_scripts(asked: bool) -> bool:
+    """Say whether JSON is asked for; the callback of ``--json``, and reset where the program starts."""
+    global _for_scripts
+    _for_scripts = asked
+    return asked
+
+
 def write(text: str = "", *, now: bool = False) -> None:
     """Write a line to standard output; `now` also where nobody watches, ahead of what follows."""
     sys.stdout.write(text + "\n")
@@ -25,8 +36,8 @@ def write(text: str = "", *, now: bool = False) -> None:
 
 
 def note(text: str) -> None:
-    """Write a line for people to standard error, only if they watch."""
-    if sys.stderr.isatty():
+    """Write a line for people to standard error, only if they watch and nobody asked for JSON."""
+    if sys.stderr.isatty() and not _for_scripts:
         sys.stderr.write(text + "\n")
 
 
@@ -89,12 +100,12 @@ def write_fields(fields: Mapping[str, object]) -> None:
 
 
 HEARTBEAT_S = 10.0
-"""Off a terminal something that lasts says so this often."""
+"""Off a terminal something that lasts says so this often, unless JSON was asked for."""
 
 
 @contextmanager
 def heartbeat() -> Iterator[Callable[[str], None]]:
-    """A line on standard error every `HEARTBEAT_S` seconds while something lasts.
+    """A line on standard error every `HEARTBEAT_S` seconds while something lasts; none with ``--json``.
 
     Yields:
         Call it as often as you like with what is going on; threads may.
@@ -104,7 +115,7 @@ def heartbeat() -> Iterator[Callable[[str], None]]:
     def beat(text: str) -> None:
         nonlocal told
         now = time.monotonic()
-        if now - told >= HEARTBEAT_S:
+        if now - told >= HEARTBEAT_S and not _for_scripts:
             told = now
             sys.stderr.write(f"{text}, {now - began:.0f} s\n")
             sys.stderr.flush()
@@ -140,9 +151,14 @@ Advance = Callable[..., None]
 def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     """A progress bar on standard error where that is a terminal; elsewhere a line every `HEARTBEAT_S` seconds.
 
+    With ``--json`` there is neither: a script that keeps standard error finds nothing but errors there.
+
     Yields:
         See `Advance`.
     """
+    if _for_scripts:
+        yield lambda *_: None
+        return
     if not sys.stderr.isatty():
         lines = _Lines(label)
         try:

@@ -49,9 +49,13 @@ def make(
         raise ReportError(f"--on is 'common' or 'all', got '{on}'")
     folders = results or [Path("results")]
     paths = build_report(
-        folders, output or folders[0] / "report", protocol=protocol, reference=reference, title=title,
+        folders,
+        output or folders[0] / "report",
+        protocol=protocol,
+        reference=reference,
+        title=title,
         on="all" if on == "all" else "common",
-    )  # fmt: skip
+    )
     if as_json:
         write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -11,24 +11,35 @@ import typer
 from .options import (
     AsJson,
     Assignments,
+    Cache,
     Camera,
     DataRoot,
+    Degrade,
     Device,
+    Drop,
     Frames,
     Jobs,
+    Label,
     MemoryLimit,
     Offsets,
+    Preset,
     ProtocolId,
+    Realtime,
     Results,
     Retry,
+    Scheduler,
     Seeds,
     SettingsFile,
+    Sheet,
     Stride,
     Threads,
     TimeLimit,
+    Trackers,
+    Video,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, note, progress, write_json, write_table
+from .output import SOME_RUNS_FAILED, note, progress
+from .run_rows import show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunSpec
@@ -47,7 +58,7 @@ def run(
     offset: Offsets = None,
     assignments: Assignments = None,
     settings: SettingsFile = None,
-    preset: Annotated[Optional[str], typer.Option(help="A preset of the tracker.")] = None,  # noqa: UP045
+    preset: Preset = None,
     results: Results = Path("results"),
     data_root: DataRoot = None,
     camera: Camera = None,
@@ -56,54 +67,53 @@ def run(
     device: Device = "auto",
     threads: Threads = 1,
     jobs: Jobs = 1,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.")] = False,
-    drop: Annotated[float, typer.Option(min=0.0, max=0.99, help="Drop this share of the frames at random.")] = 0.0,
-    degrade: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(
-            metavar="KIND=STRENGTH", help="Spoil the images: lighting, glare, shadow, blur, noise; repeatable."
-        ),
-    ] = None,
-    cache: Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")] = False,
-    video: Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")] = False,
-    sheet: Annotated[
-        bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
-    ] = False,
+    realtime: Realtime = False,
+    drop: Drop = 0.0,
+    degrade: Degrade = None,
+    cache: Cache = False,
+    video: Video = False,
+    sheet: Sheet = False,
     retry: Retry = None,
-    label: Annotated[str, typer.Option(help="Name in tables, in place of the tracker's.")] = "",
+    label: Label = "",
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
-    from dynslam_bench.core.errors import SettingsError, did_you_mean
     from dynslam_bench.runs import Limits, RunSpec
     from dynslam_bench.sequences.catalogue import parse_frames
-    from dynslam_bench.trackers import TRACKERS
 
-    chosen: dict[str, Any] = {}
-    if preset is not None:
-        presets = TRACKERS.get(tracker).presets
-        if preset not in presets:
-            raise SettingsError(f"tracker '{tracker}' has no preset '{preset}'", did_you_mean(preset, presets))
-        chosen = dict(presets[preset])
-    overrides = gather_settings(assignments, settings, chosen)
-    part = None if frames is None else parse_frames(frames)
-    strengths = parse_strengths(degrade or ())
+    chosen = {} if preset is None else preset_of(tracker, preset)
+    asked: dict[str, Any] = {"tracker": tracker, "settings": gather_settings(assignments, settings, chosen)}
+    asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
+    asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
+    asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
+    asked |= {"video": video, "sheet": sheet, "label": label}
+    asked |= {"limits": Limits(time_s=time_limit, memory_mb=memory_limit)}
     specs = [
-        RunSpec(
-            tracker=tracker, sequence=sequence, settings=overrides, frames=part, offset=skipped, stride=stride,
-            seed=number, device=device, threads=threads, realtime=realtime, video=video, sheet=sheet, camera=camera,
-            cache=cache, label=label, drop_share=drop, degrade=strengths,
-            data_root=None if data_root is None else str(data_root),
-            limits=Limits(time_s=time_limit, memory_mb=memory_limit),
-        )
+        RunSpec(sequence=sequence, seed=number, offset=skipped, **asked)
         for sequence in sequences
         for number in (seed or [0])
         for skipped in (offset or [0])
-    ]  # fmt: skip
+    ]
     finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json)
+
+
+def preset_of(tracker: str, preset: str) -> dict[str, Any]:
+    """The settings of a tracker's preset.
+
+    Raises:
+        SettingsError: There is no such preset.
+        PluginError: There is no such tracker.
+    """
+    from dynslam_bench.core.errors import SettingsError, did_you_mean
+    from dynslam_bench.trackers import TRACKERS
+
+    presets = TRACKERS.get(tracker).presets
+    if preset not in presets:
+        raise SettingsError(f"tracker '{tracker}' has no preset '{preset}'", did_you_mean(preset, presets))
+    return dict(presets[preset])
 
 
 def parse_strengths(assignments: Sequence[str]) -> dict[str, float]:
@@ -130,20 +140,14 @@ def bench(
     suite: Annotated[str, typer.Argument(help="dynamic, dynamic-full, real, robustness, or a TOML file.")],
     results: Results = Path("results"),
     data_root: DataRoot = None,
-    tracker: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option("--tracker", help="Only this tracker, or another one; repeatable."),
-    ] = None,
+    tracker: Trackers = None,
     seed: Seeds = None,
     offset: Offsets = None,
     frames: Frames = None,
     device: Device = "auto",
     threads: Annotated[Optional[int], typer.Option(min=1, help="Threads of a run.")] = None,  # noqa: UP045
     jobs: Jobs = 1,
-    scheduler: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs."),
-    ] = None,
+    scheduler: Scheduler = None,
     retry: Retry = None,
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
@@ -155,9 +159,14 @@ def bench(
     from dynslam_bench.suites import load_suite
 
     specs = load_suite(suite).specs(
-        data_root=data_root, device=device, threads=threads, trackers=tuple(tracker or ()), seeds=tuple(seed or ()),
-        offsets=tuple(offset or ()), frames=None if frames is None else parse_frames(frames),
-    )  # fmt: skip
+        data_root=data_root,
+        device=device,
+        threads=threads,
+        trackers=tuple(tracker or ()),
+        seeds=tuple(seed or ()),
+        offsets=tuple(offset or ()),
+        frames=None if frames is None else parse_frames(frames),
+    )
     own = {"time_s": time_limit, "memory_mb": memory_limit}
     changes = {name: value for name, value in own.items() if value is not None}
     specs = [spec.model_copy(update={"limits": spec.limits.model_copy(update=changes)}) for spec in specs]
@@ -242,61 +251,3 @@ def dask_executor(address: str) -> Any:
         return Client(address, timeout="10s").get_executor()
     except (OSError, ValueError) as error:
         raise RunError(f"no Dask scheduler answers at {address}: {error}", "for example tcp://host:8786") from error
-
-
-def show_runs(
-    records: Sequence[RunRecord], store: Any, protocol: str, *, as_json: bool, reused: Collection[str] = ()
-) -> None:  # fmt: skip
-    """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are said to be from the store."""
-    from dynslam_bench.runs import score
-
-    rows = []
-    for record in records:
-        metrics = {} if record.status == "stopped" else score(store, record, protocol).metrics
-        rows.append(
-            {
-                "run": record.run_id,
-                "tracker": record.tracker.id,
-                "sequence": record.sequence.id,
-                "seed": record.seed,
-                "part": part_words(record),
-                "settings": ", ".join(f"{name}={value}" for name, value in record.overrides.items()),
-                "from_store": record.run_id in reused,
-                "status": record.status,
-                "ate_rmse_m": metrics.get("ate_rmse_m"),
-                "never_move_m": metrics.get("never_move_ate_rmse_m"),
-                "coverage": record.coverage,
-                "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
-                "masks": record.segmentation,
-                "reason": record.reason,
-                "protocol": protocol,
-                "folder": str(store.folder(record.run_id)),
-            }
-        )
-    if as_json:
-        write_json(rows)
-        return
-    names = {
-        "run": "run", "tracker": "tracker", "sequence": "sequence", "part": "part", "seed": "seed", "status": "status",
-        "ate_rmse_m": "ATE (m)", "never_move_m": "not moving (m)", "coverage": "coverage", "frame_ms": "ms/frame",
-    }  # fmt: skip
-    if not any(row["part"] for row in rows):
-        del names["part"]
-    more = {"masks": "masks", "from_store": "from the store", "settings": "settings", "reason": "reason"}
-    names |= {name: title for name, title in more.items() if any(row[name] for row in rows)}
-    cells = [[row[name] for name in names] for row in rows]
-    write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
-
-
-def part_words(record: RunRecord) -> str:
-    """Which frames of its sequence a run saw, e.g. ``0:60, every 2nd, offset 1``; empty for all of them."""
-    offset = getattr(record, "offset", 0)
-    words = []
-    if record.frames is not None:
-        start, stop = record.frames
-        words.append(f"{start}:{'' if stop is None else stop}")
-    if record.stride > 1:
-        words.append(f"every {record.stride}{ {2: 'nd', 3: 'rd'}.get(record.stride, 'th') }")
-    if offset:
-        words.append(f"offset {offset}")
-    return ", ".join(words)

@@ -38,9 +38,14 @@ def train(
             advance(state.done, state.total)
 
         result = train_network(
-            chosen, output, data_cache=data_cache, device=resolve_device(device), threads=threads, resume=resume,
+            chosen,
+            output,
+            data_cache=data_cache,
+            device=resolve_device(device),
+            threads=threads,
+            resume=resume,
             progress=told,
-        )  # fmt: skip
+        )
     facts = {"weights": str(result.best), "step": result.step, "iou": result.iou, "ended": result.stopped}
     if as_json:
         write_json(facts)
@@ -66,18 +71,22 @@ def evaluate(
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
-    settings = apply_overrides(
-        SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})}
-    )  # fmt: skip
+    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})})
     with progress(data) as advance:
 
         def told(done: int, total: int) -> None:
             advance(done, total)
 
         score = evaluate_segmenter(
-            settings, data, output=output, device=resolve_device(device), threads=threads, min_area=min_area,
-            limit=limit, progress=told,
-        )  # fmt: skip
+            settings,
+            data,
+            output=output,
+            device=resolve_device(device),
+            threads=threads,
+            min_area=min_area,
+            limit=limit,
+            progress=told,
+        )
     if as_json:
         write_json(score)
         return

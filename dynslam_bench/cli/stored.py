@@ -10,7 +10,7 @@ import typer
 
 from .options import AsJson, ProtocolId, Results
 from .output import write, write_fields, write_json, write_table
-from .running import part_words, show_runs
+from .run_rows import part_words, show_runs
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
@@ -35,9 +35,7 @@ def list_(
     if not store.runs.is_dir():
         raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     records, unreadable = store.all()
-    show_runs(
-        [record for record in records if status in (None, record.status)], store, protocol, as_json=as_json
-    )  # fmt: skip
+    show_runs([record for record in records if status in (None, record.status)], store, protocol, as_json=as_json)
     for bad in unreadable:
         sys.stderr.write(f"unreadable: {bad.path}: {bad.reason}\n")
 
@@ -59,16 +57,30 @@ def show(
         write_json({"record": record, "metrics": metrics, "folder": store.folder(record.run_id)})
         return
     facts: dict[str, Any] = {
-        "run": record.run_id, "folder": store.folder(record.run_id), "status": record.status, "reason": record.reason,
+        "run": record.run_id,
+        "folder": store.folder(record.run_id),
+        "status": record.status,
+        "reason": record.reason,
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
-        "sequence": record.sequence.id, "part": part_words(record), "frames": record.n_frames,
-        "tracked": record.n_tracked, "lost": record.n_lost, "coverage": record.coverage, "seed": record.seed,
+        "sequence": record.sequence.id,
+        "part": part_words(record),
+        "frames": record.n_frames,
+        "tracked": record.n_tracked,
+        "lost": record.n_lost,
+        "coverage": record.coverage,
+        "repeat": record.repeat,
         "masks": record.segmentation,
-        "device": record.device, "threads": record.threads, "started": record.started, "wall_s": record.wall_s,
-        "peak_memory_mb": record.peak_memory_mb, "keyframes": record.keyframes, "map_points": record.map_points,
-        "overrides": [f"{name}={value}" for name, value in record.overrides.items()], "notes": record.notes,
+        "device": record.device,
+        "threads": record.threads,
+        "started": record.started,
+        "wall_s": record.wall_s,
+        "peak_memory_mb": record.peak_memory_mb,
+        "keyframes": record.keyframes,
+        "map_points": record.map_points,
+        "overrides": [f"{name}={value}" for name, value in record.overrides.items()],
+        "notes": record.notes,
         "command": " ".join(record.command),
-    }  # fmt: skip
+    }
     write_fields(facts)
     if record.timings:
         write()

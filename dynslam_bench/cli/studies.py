@@ -87,9 +87,11 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
 
     tuner = Tuner(read_study(study), results, reading=True)
     facts: dict[str, Any] = {
-        "study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials,
+        "study": tuner.spec.name,
+        "folder": tuner.folder,
+        "asked_for": tuner.spec.trials,
         **count_states(tuner.study),
-    }  # fmt: skip
+    }
     best = best_trials(tuner.study, 1)
     if best:
         facts |= {"best_trial": best[0].number, "best_values": list(best[0].values), "best_settings": best[0].params}

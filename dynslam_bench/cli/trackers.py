@@ -55,12 +55,22 @@ def info(
     spec = TRACKERS.get(tracker)
     numbers = _published(spec)
     facts: dict[str, Any] = {
-        "id": spec.id, "label": spec.label, "summary": spec.summary, "provenance": spec.provenance,
-        "ranked": spec.ranked, "sensors": spec.sensors, "deterministic": spec.deterministic, "version": spec.version,
-        "license": spec.license, "citation": spec.citation, "entry_point": spec.entry_point,
-        "install": spec.missing(), "presets": list(spec.presets), "assumptions": list(spec.assumptions),
+        "id": spec.id,
+        "label": spec.label,
+        "summary": spec.summary,
+        "provenance": spec.provenance,
+        "ranked": spec.ranked,
+        "sensors": spec.sensors,
+        "deterministic": spec.deterministic,
+        "version": spec.version,
+        "license": spec.license,
+        "citation": spec.citation,
+        "entry_point": spec.entry_point,
+        "install": spec.missing(),
+        "presets": list(spec.presets),
+        "assumptions": list(spec.assumptions),
         "remarks": spec.remarks,
-    }  # fmt: skip
+    }
     skipped = epipolar_skipped(spec.id)
     if as_json:
         described = parameter_facts(spec.settings)
@@ -149,10 +159,15 @@ def test(
 
     with heartbeat() as beat:
         report = isolated_tracker_report(
-            tracker, settings=gather_settings(assignments, settings, {}), frames=frames, frame_s=time_limit,
-            start_s=5 * time_limit, memory_mb=memory_limit, on_check=told,
+            tracker,
+            settings=gather_settings(assignments, settings, {}),
+            frames=frames,
+            frame_s=time_limit,
+            start_s=5 * time_limit,
+            memory_mb=memory_limit,
+            on_check=told,
             on_wait=lambda running: beat(f"checking: {running}"),
-        )  # fmt: skip
+        )
     if as_json:
         write_json({"subject": report.subject, "ok": report.ok, "checks": [check.__dict__ for check in report.checks]})
     else:

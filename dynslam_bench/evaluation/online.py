@@ -23,7 +23,8 @@ class OnlineSample:
         frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None where the frame
             before has no ground truth.
         frame_rot_deg: Frame-to-frame rotational error in degrees, likewise.
-        way_m: Length in metres of the true path since the first frame with ground truth; no tracker changes it.
+        way_m: Length in metres of the true path since the first frame with ground truth, straight across frames that
+            have none (it was at least that); no tracker changes it.
         tracked: Whether the frame was tracked.
     """
 

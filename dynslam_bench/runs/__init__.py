@@ -1,7 +1,7 @@
 """Runs: a child process that steps an environment; the run store; parallel execution.
 
-`run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol, and
-`import_trajectory` puts trajectories from elsewhere beside them.
+`run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol, `RunStore.frame` and
+`load_frames` give them as pandas frames, and `import_trajectory` puts trajectories from elsewhere beside them.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .many import RunEvent, run_many
     from .one import run_one
     from .spec import Limits, RunSpec
+    from .storage.frame_table import load_frames
     from .storage.imported import import_trajectory
     from .storage.record import FAILED, MetricRecord, RunRecord
     from .storage.scoring import DEFAULT_PROTOCOL, score
@@ -23,6 +24,7 @@ _HOMES = {
     "FAILED": "storage.record",
     "import_trajectory": "storage.imported",
     "Limits": "spec",
+    "load_frames": "storage.frame_table",
     "MetricRecord": "storage.record",
     "resolve": "identity",
     "ResolvedRun": "identity",
@@ -46,6 +48,7 @@ __all__ = [
     "RunSpec",
     "RunStore",
     "import_trajectory",
+    "load_frames",
     "resolve",
     "run_many",
     "run_one",

@@ -31,9 +31,9 @@ from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 from .spec import RunSpec
 
 _ROOMS = (
-    "core", "geometry", "contracts", "sequences", "features", "segmentation", "flow", "culling", "slam", "trackers",
-    "envs",
-)  # fmt: skip
+    *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
+    *("culling", "slam", "trackers", "envs"),
+)
 """The rooms whose source a trajectory may depend on."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,14 +13,12 @@ import numpy as np
 
 from dynslam_bench.envs.degrade_frames import DegradeFrames
 from dynslam_bench.envs.drop_frames import DropFrames
-from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.masks import compare_masks
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.tum_file import write_tum
 
-from .process.child import FRAMES_FILE
+from .frame_row import FRAMES_FILE, FrameRow
 from .process.failures import at
 from .sheet_collector import SheetWriter
 from .spec import RunSpec
@@ -45,32 +43,18 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     spec = RunSpec.model_validate(job["spec"])
     folder = Path(job["folder"])
     protocol = Protocol.model_validate(job["protocol"])
-    base = SlamEnv(
-        spec.sequence, spec.tracker, settings=spec.settings, frames=spec.frames_seen, stride=spec.stride,
-        device=spec.device, threads=spec.threads, cache=spec.cache, data_root=spec.data_root, camera=spec.camera,
-        protocol=protocol, render_mode="rgb_array" if spec.video else None,
-    )  # fmt: skip
-    env: gym.Env[Any, Any] = base
-    if any(spec.degrade.values()):
-        env = DegradeFrames(env, seed=0, **spec.degrade)
-    if spec.realtime or spec.drop_share:
-        env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
+    base = _environment(spec, protocol)
+    env = _spoiled(base, spec)
     send({"type": "started", "frames": len(base.sequence)})
-    video = _Video(folder / "video.mp4", base) if spec.video else None
-    sheet = SheetWriter(folder / "sheet.png", base) if spec.sheet else None
-    with (folder / FRAMES_FILE).open("w") as log:
-        writer = _FrameWriter(base, log)
-        position = _Position(base)
+    recorder = _Recorder(base, spec, folder)
+    position = _Position(base)
+    with contextlib.closing(recorder):
         with at(position):
             env.reset(seed=spec.seed)
         over = False
         reported = 0
         while True:
-            writer.write()
-            if video is not None:
-                video.add()
-            if sheet is not None:
-                sheet.add()
+            recorder.add()
             done = base.episode.next_index
             send({"type": "frame", "index": done - 1})
             if done - reported >= job["progress_every"] or over:
@@ -84,12 +68,57 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             with at(position):
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
-    if video is not None:
-        video.close()
     with at("after the last frame"):
-        outcome = _finish(base, folder, sheet)
+        outcome = _finish(base, folder, recorder.sheet)
         env.close()
     return {"type": "done", **outcome}
+
+
+def _environment(spec: RunSpec, protocol: Protocol) -> SlamEnv:
+    return SlamEnv(
+        spec.sequence,
+        spec.tracker,
+        settings=spec.settings,
+        frames=spec.frames_seen,
+        stride=spec.stride,
+        device=spec.device,
+        threads=spec.threads,
+        cache=spec.cache,
+        data_root=spec.data_root,
+        camera=spec.camera,
+        protocol=protocol,
+        render_mode="rgb_array" if spec.video else None,
+    )
+
+
+def _spoiled(env: gym.Env[Any, Any], spec: RunSpec) -> gym.Env[Any, Any]:
+    """The environment with the degradation and the frame drops that were asked for."""
+    if any(spec.degrade.values()):
+        env = DegradeFrames(env, seed=0, **spec.degrade)
+    if spec.realtime or spec.drop_share:
+        env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
+    return env
+
+
+class _Recorder:
+    """Everything that is kept of a run frame by frame: the log, and the video and the sheet if they were asked for."""
+
+    def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
+        self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
+        self._video = _Video(folder / "video.mp4", env) if spec.video else None
+        self.sheet = SheetWriter(folder / "sheet.png", env) if spec.sheet else None
+
+    def add(self) -> None:
+        self._frames.write()
+        if self._video is not None:
+            self._video.add()
+        if self.sheet is not None:
+            self.sheet.add()
+
+    def close(self) -> None:
+        self._frames.close()
+        if self._video is not None:
+            self._video.close()
 
 
 class _Position:
@@ -143,7 +172,7 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
 
 
 class _FrameWriter:
-    """Appends the frames that are new to `frames.jsonl`; each line is complete before the next frame begins."""
+    """Appends the frames that are new to the log; each line is complete before the next frame begins."""
 
     def __init__(self, env: SlamEnv, log: IO[str]) -> None:
         self._env, self._log = env, log
@@ -152,22 +181,22 @@ class _FrameWriter:
     def write(self) -> None:
         outcomes = self._env.episode.outcomes
         for outcome in outcomes[self._written :]:
-            row = _row(outcome)
-            if outcome is outcomes[-1]:
-                row["mask"] = self._mask_counts(outcome.index)
-            self._log.write(json.dumps(row) + "\n")
+            overlap = self._mask_iou(outcome.index) if outcome is outcomes[-1] else None
+            self._log.write(FrameRow.of(outcome, overlap).to_json())
         self._log.flush()
         self._written = len(outcomes)
 
-    def _mask_counts(self, index: int) -> list[int] | None:
-        """Pixels in both masks, in the tracker's only, in the exact one of people only; None where one is missing."""
+    def close(self) -> None:
+        self._log.close()
+
+    def _mask_iou(self, index: int) -> float | None:
+        """Overlap of the tracker's mask with the exact one of people; None where one is missing or both are empty."""
         predicted = self._env.result.dynamic_mask
         if predicted is None or self._env.sequence.masks is None:
             return None
         truth = self._env.sequence.masks[index]
         people = [number for number, name in truth.class_names.items() if name == "person"]
-        counts = compare_masks(np.asarray(predicted, dtype=bool), np.isin(truth.instances, people))
-        return [counts.true_positive, counts.false_positive, counts.false_negative]
+        return compare_masks(np.asarray(predicted, dtype=bool), np.isin(truth.instances, people)).iou
 
 
 class _Video:
@@ -189,22 +218,5 @@ class _Video:
         self._writer.write(np.ascontiguousarray(image[:, :, ::-1]))
 
     def close(self) -> None:
-        self._writer.release()
-
-
-def _row(outcome: FrameOutcome) -> dict[str, Any]:
-    error = outcome.error
-    pose = None
-    if outcome.T_world_cam is not None:
-        position, quaternion = se3.to_quaternion(outcome.T_world_cam)
-        pose = [*position.tolist(), *quaternion.tolist()]
-    return {
-        "index": outcome.index,
-        "timestamp": outcome.timestamp,
-        "state": outcome.state,
-        "pose": pose,
-        "error": None if error is None else [error.frame_trans_m, error.frame_rot_deg, error.trans_m, error.rot_deg],
-        "reward": outcome.reward,
-        "timings": dict(outcome.timings),
-        "stats": dict(outcome.stats),
-    }
+        if self._writer is not None:
+            self._writer.release()

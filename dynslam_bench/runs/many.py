@@ -163,10 +163,8 @@ class _Bench:
             self.tell("progress", run, partial=partial)
             return self.on_progress is None or self.on_progress(run_id, partial)
 
-        record = run_one(
-            run, self.store, on_progress=progress, protocol=self.protocol, cancelled=self._is_cancelled,
-            at_a_time=self.jobs,
-        )  # fmt: skip
+        watched: dict[str, Any] = {"on_progress": progress, "cancelled": self._is_cancelled}
+        record = run_one(run, self.store, protocol=self.protocol, at_a_time=self.jobs, **watched)
         if record.status != "stopped":
             score(self.store, record, self.protocol)
         self.tell("finished", run, record=record)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import RunError
@@ -17,11 +15,12 @@ from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.sequences.part import part_of
 
+from .frame_row import FRAMES_FILE
 from .identity import ResolvedRun, resolve
-from .process.child import FRAMES_FILE, LOG_FILE
+from .process.child import LOG_FILE
 from .process.handle import start_child
+from .process.job import make_job
 from .process.log_file import LogFile
-from .process.server import THREAD_VARIABLES
 from .process.supervise import Verdict, supervise
 from .spec import RunSpec, place_of
 from .storage.frames import FrameLog
@@ -29,6 +28,8 @@ from .storage.record import RunRecord, SequenceInfo, Status, TrackerInfo
 from .storage.scoring import DEFAULT_PROTOCOL
 from .storage.store import RunStore
 
+WORK = "dynslam_bench.runs.loop:run_loop"
+"""What the child does."""
 PROGRESS_EVERY = 50
 CACHED_TIMES = "times of features and masks are those of the stage cache's entries, not of this run"
 LOST_COVERAGE = 0.5
@@ -79,20 +80,17 @@ def run_one(
     started = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
     clock = time.perf_counter()
     with store.work_folder(run_id) as work:
-        job = {
-            "spec": resolved.spec.model_dump(mode="json"),
-            "folder": str(work),
-            "protocol": get_protocol(protocol).model_dump(mode="json"),
-            "progress_every": progress_every,
-            "environment": {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES},
-            "working_folder": str(Path.cwd()),
-            "path": list(sys.path),
-        }
+        job = make_job(
+            WORK,
+            work,
+            spec=resolved.spec.model_dump(mode="json"),
+            protocol=get_protocol(protocol).model_dump(mode="json"),
+            progress_every=progress_every,
+        )
         listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
         log = LogFile(work / LOG_FILE)
-        verdict = supervise(
-            start_child(), job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time
-        )  # fmt: skip
+        limits = resolved.spec.limits
+        verdict = supervise(start_child(), job, limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
         log.finish()
         if verdict.refused:
             raise RunError(f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}")
@@ -106,16 +104,24 @@ def run_one(
     return record
 
 
-def sequence_info(resolved_sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
+def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
     """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
-    sequence, seen = resolved_sequence, part_of(resolved_sequence, offset)
-    stamps = sequence.timestamps
+    seen, stamps = part_of(sequence, offset), sequence.timestamps
     return SequenceInfo(
-        id=sequence.id, content=content, part=part, block=seen.block, noise=seen.noise, frames=len(sequence),
-        duration_s=float(stamps[-1] - stamps[0]), fps=sequence.fps, ground_truth=sequence.ground_truth is not None,
-        license=sequence.license, citation=sequence.citation, tags=sorted(getattr(sequence, "tags", ())),
+        id=sequence.id,
+        content=content,
+        part=part,
+        block=seen.block,
+        noise=seen.noise,
+        frames=len(sequence),
+        duration_s=float(stamps[-1] - stamps[0]),
+        fps=sequence.fps,
+        ground_truth=sequence.ground_truth is not None,
+        license=sequence.license,
+        citation=sequence.citation,
+        tags=sorted(getattr(sequence, "tags", ())),
         split=getattr(sequence, "split", ""),
-    )  # fmt: skip
+    )
 
 
 def part_digest(identity: dict[str, Any]) -> str:
@@ -128,34 +134,68 @@ def _partial(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: str, wall_s: float) -> RunRecord:
-    spec, tracker, identity = resolved.spec, resolved.tracker, resolved.identity
-    final = verdict.final
-    tracked, total = frames.count("ok"), len(resolved.sequence)
-    dropped = frames.count("dropped")
+    spec, identity, final = resolved.spec, resolved.identity, verdict.final
+    total = len(resolved.sequence)
     status, reason = _judge(verdict, frames, total)
     return RunRecord(
-        run_id=resolved.run_id, status=status, reason=reason,
-        tracker=TrackerInfo(
-            id=tracker.id, label=spec.label or tracker.label, version=tracker.version,
-            distribution=identity["distribution"], provenance=tracker.provenance, ranked=tracker.ranked,
-            deterministic=tracker.deterministic, license=tracker.license, citation=tracker.citation,
-            remarks=tracker.remarks,
-        ),
-        overrides=spec.settings, settings=flatten(resolved.settings),
+        run_id=resolved.run_id,
+        status=status,
+        reason=reason,
+        tracker=_tracker_info(resolved),
+        overrides=spec.settings,
+        settings=flatten(resolved.settings),
         sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
-        frames=spec.frames, offset=spec.offset, stride=spec.stride, seed=spec.seed, device=resolved.device,
-        threads=spec.threads,
-        realtime=spec.realtime, drop_share=spec.drop_share, degrade=identity["degrade"],
-        segmentation=resolved.segmentation, n_frames=total, n_processed=len(frames.rows) - dropped, n_tracked=tracked,
-        n_lost=frames.count("lost"), n_initialising=frames.count("initialising"), n_dropped=dropped,
-        coverage=tracked / total, keyframes=final.get("keyframes"), map_points=final.get("map_points"),
+        **{name: getattr(spec, name) for name in _AS_ASKED},
+        device=resolved.device,
+        degrade=identity["degrade"],
+        segmentation=resolved.segmentation,
+        **_counts(frames, total),
+        keyframes=final.get("keyframes"),
+        map_points=final.get("map_points"),
         epipolar_skipped=frames.epipolar_skipped(),
-        mask_iou=frames.mask_iou(), timings=frames.timings(), finalize_s=final.get("finalize_s"), started=started,
-        wall_s=wall_s, peak_memory_mb=verdict.peak_memory_mb or None, peak_gpu_memory_mb=final.get("gpu_memory_mb"),
-        machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}), versions=versions(),
-        git=git_revision(), command=list(sys.argv), identity=identity,
-        notes=[*([CACHED_TIMES] if spec.cache else []), *final.get("notes", [])], place=place_of(spec.sequence),
-    )  # fmt: skip
+        mask_iou=frames.mask_iou(),
+        timings=frames.timings(),
+        finalize_s=final.get("finalize_s"),
+        started=started,
+        wall_s=wall_s,
+        peak_memory_mb=verdict.peak_memory_mb or None,
+        peak_gpu_memory_mb=final.get("gpu_memory_mb"),
+        machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}),
+        versions=versions(),
+        git=git_revision(),
+        command=list(sys.argv),
+        identity=identity,
+        notes=[*([CACHED_TIMES] if spec.cache else []), *final.get("notes", [])],
+        place=place_of(spec.sequence),
+    )
+
+
+_AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share")
+"""What a record takes from the request as it is."""
+
+
+def _tracker_info(resolved: ResolvedRun) -> TrackerInfo:
+    tracker = resolved.tracker
+    same = ("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks")
+    return TrackerInfo(
+        label=resolved.spec.label or tracker.label,
+        distribution=resolved.identity["distribution"],
+        **{name: getattr(tracker, name) for name in same},
+    )
+
+
+def _counts(frames: FrameLog, total: int) -> dict[str, Any]:
+    """A record's numbers of frames, `total` in all."""
+    tracked, dropped = frames.count("ok"), frames.count("dropped")
+    return {
+        "n_frames": total,
+        "n_processed": len(frames.rows) - dropped,
+        "n_tracked": tracked,
+        "n_lost": frames.count("lost"),
+        "n_initialising": frames.count("initialising"),
+        "n_dropped": dropped,
+        "coverage": tracked / total,
+    }
 
 
 def _judge(verdict: Verdict, frames: FrameLog, total: int) -> tuple[Status, str]:

@@ -50,9 +50,8 @@ class SheetWriter:
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth = _aligned_truth(sequence.ground_truth, track)
-        write_sheet(
-            self._path, draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth)
-        )  # fmt: skip
+        sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth)
+        write_sheet(self._path, sheet)
 
 
 def _spread(count: int) -> list[int]:

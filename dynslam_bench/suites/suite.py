@@ -125,6 +125,31 @@ class Suite(Record):
             PluginError: A tracker is not known (with a did-you-mean).
             RunError: A tracker is given settings but is no part of the suite.
         """
+        shared: dict[str, Any] = {"frames": frames or self.frames, "stride": self.stride, "device": device}
+        shared |= {"threads": threads or self.threads, "cache": self.cache, "limits": self.limits}
+        shared |= {"data_root": None if data_root is None else str(data_root)}
+        entries = self._entries(trackers)
+        return [
+            RunSpec(
+                tracker=tracker,
+                sequence=sequence,
+                seed=seed,
+                offset=offset,
+                settings=settings,
+                degrade=variant.degrade,
+                drop_share=variant.drop_share,
+                realtime=variant.realtime,
+                **shared,
+            )
+            for sequence in self.sequences
+            for variant in self.variants
+            for tracker, settings in entries
+            for seed in seeds or self.seeds
+            for offset in offsets or self.offsets
+        ]
+
+    def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
+        """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
         chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
         known = {name: set(field_names(TRACKERS.get(name).settings)) for name in chosen}
         named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
@@ -134,27 +159,14 @@ class Suite(Record):
                 f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
                 did_you_mean(strangers[0], {*self.trackers, *self.optional}),
             )
-        entries: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
-        entries += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
-        return [
-            RunSpec(
-                tracker=tracker, sequence=sequence, seed=seed, offset=offset, frames=frames or self.frames,
-                stride=self.stride,
-                settings={
-                    **{name: value for name, value in self.settings.items() if name in known[tracker]},
-                    **self.tracker_settings.get(tracker, {}),
-                    **own,
-                },
-                device=device, threads=threads or self.threads, cache=self.cache, limits=self.limits,
-                data_root=None if data_root is None else str(data_root), degrade=variant.degrade,
-                drop_share=variant.drop_share, realtime=variant.realtime,
-            )
-            for sequence in self.sequences
-            for variant in self.variants
-            for tracker, own in entries
-            for seed in seeds or self.seeds
-            for offset in offsets or self.offsets
-        ]  # fmt: skip
+        rows: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
+        rows += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
+        common = {
+            tracker: {name: value for name, value in self.settings.items() if name in known[tracker]}
+            | self.tracker_settings.get(tracker, {})
+            for tracker in chosen
+        }
+        return [(tracker, common[tracker] | own) for tracker, own in rows]
 
 
 def suite_names() -> list[str]:

@@ -131,19 +131,25 @@ def check_result(result: FilterResult, frame: FrameBundle) -> None:
     """
     at, count = f"frame {frame.index}", len(frame)
     require(isinstance(result, FilterResult), f"{at}: apply() gave a {type(result).__name__}, not a FilterResult")
-    require(result.keep.dtype == np.bool_ and result.keep.shape == (count,),
-            f"{at}: keep is {result.keep.dtype} {result.keep.shape}, expected bool {(count,)}",
-            "the verdict is on all keypoints, not only on those that earlier filters kept")  # fmt: skip
+    require(
+        result.keep.dtype == np.bool_ and result.keep.shape == (count,),
+        f"{at}: keep is {result.keep.dtype} {result.keep.shape}, expected bool {(count,)}",
+        "the verdict is on all keypoints, not only on those that earlier filters kept",
+    )
     weight = result.weight
-    require(weight.dtype == np.float32 and weight.shape == (count,),
-            f"{at}: weight is {weight.dtype} {weight.shape}, expected float32 {(count,)}")  # fmt: skip
+    require(
+        weight.dtype == np.float32 and weight.shape == (count,),
+        f"{at}: weight is {weight.dtype} {weight.shape}, expected float32 {(count,)}",
+    )
     require(((weight >= 0) & (weight <= 1)).all(), f"{at}: a weight lies outside [0, 1] or is no number")
     bad = {key: value for key, value in result.stats.items() if not np.isfinite(value)}
     require(not bad, f"{at}: stats hold values that are not finite: {bad}")
     mask = result.mask
     if mask is not None:
-        require(mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
-                f"{at}: the mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}")  # fmt: skip
+        require(
+            mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
+            f"{at}: the mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}",
+        )
 
 
 def _declaration(candidate: DynamicFilter) -> None:

@@ -6,8 +6,6 @@ for too long, the check that it was at has failed, and another child goes on wit
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -18,8 +16,8 @@ from dynslam_bench.core import errors
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.handle import start_child
+from dynslam_bench.runs.process.job import make_job
 from dynslam_bench.runs.process.log_file import LogFile
-from dynslam_bench.runs.process.server import THREAD_VARIABLES
 from dynslam_bench.runs.process.supervise import Verdict, supervise
 from dynslam_bench.runs.spec import Limits
 
@@ -77,7 +75,9 @@ def isolated_tracker_report(
         follow = _Follower(known, on_check, on_wait)
         with tempfile.TemporaryDirectory(prefix="dynslam-test-") as folder:
             log = LogFile(Path(folder) / LOG_FILE)
-            job = _job(tracker, settings, frames, seed, known, folder)
+            told = [asdict(check) for check in known]
+            wanted = {"tracker": tracker, "settings": dict(settings or {}), "frames": frames, "seed": seed}
+            job = make_job(_WORK, folder, spec={"threads": 1}, known=told, **wanted)
 
             def tick(log: LogFile = log, follow: _Follower = follow) -> None:
                 log.look()
@@ -93,17 +93,6 @@ def isolated_tracker_report(
             on_check(failure)
         if not follow.running:  # not at any check: another child would fare no better
             return ConformanceReport(subject, known)
-
-
-def _job(
-    tracker: str, settings: Mapping[str, Any] | None, frames: int, seed: int, known: list[Check], folder: str
-) -> dict[str, Any]:
-    return {
-        "work": _WORK, "tracker": tracker, "settings": dict(settings or {}), "frames": frames, "seed": seed,
-        "known": [asdict(check) for check in known], "folder": folder, "spec": {"threads": 1},
-        "environment": {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES},
-        "working_folder": str(Path.cwd()), "path": list(sys.path),
-    }  # fmt: skip
 
 
 class _Follower:
@@ -169,9 +158,7 @@ class _Teller:
         self._send({"type": "progress", "check": asdict(check)})
 
 
-def work(
-    job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]
-) -> dict[str, Any]:  # fmt: skip
+def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
     """What the child does: the checks whose outcome is not known yet."""
     from .tracker import tracker_report
 

@@ -133,8 +133,11 @@ def check_result(result: TrackResult, frame: Frame) -> None:
     """
     still_alive()
     at = f"frame {frame.index}"
-    require(isinstance(result, TrackResult), f"{at}: track() gave a {type(result).__name__}, not a TrackResult",
-            "a bare pose has to be wrapped: TrackResult(T_world_cam, 'ok')")  # fmt: skip
+    require(
+        isinstance(result, TrackResult),
+        f"{at}: track() gave a {type(result).__name__}, not a TrackResult",
+        "a bare pose has to be wrapped: TrackResult(T_world_cam, 'ok')",
+    )
     require(result.state in ("initialising", "ok", "lost"), f"{at}: the state is {result.state!r}")
     pose = result.T_world_cam
     require(pose is not None or result.state != "ok", f"{at}: state 'ok' without a pose", "a lost frame says 'lost'")
@@ -143,10 +146,16 @@ def check_result(result: TrackResult, frame: Frame) -> None:
         require(
             isinstance(pose, np.ndarray) and shape == (4, 4), f"{at}: the pose is {shape}, expected an array (4, 4)"
         )
-        require(np.isfinite(pose).all(), f"{at}: the pose holds values that are not finite",
-                "a solver diverged; say 'lost' instead")  # fmt: skip
-        require(is_pose(pose), f"{at}: the pose is no rigid transformation (det {np.linalg.det(pose[:3, :3]):.4f})",
-                "the rotation drifted from orthonormal, or world-to-camera scale is mixed in")  # fmt: skip
+        require(
+            np.isfinite(pose).all(),
+            f"{at}: the pose holds values that are not finite",
+            "a solver diverged; say 'lost' instead",
+        )
+        require(
+            is_pose(pose),
+            f"{at}: the pose is no rigid transformation (det {np.linalg.det(pose[:3, :3]):.4f})",
+            "the rotation drifted from orthonormal, or world-to-camera scale is mixed in",
+        )
     for name, values in (("stats", result.stats), ("timings", result.timings)):
         bad = {
             key: value for key, value in values.items() if not isinstance(value, (int, float)) or not np.isfinite(value)
@@ -155,8 +164,10 @@ def check_result(result: TrackResult, frame: Frame) -> None:
     require(all(value >= 0 for value in result.timings.values()), f"{at}: a timing is negative")
     mask = result.dynamic_mask
     if mask is not None:
-        require(mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
-                f"{at}: the dynamic mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}")  # fmt: skip
+        require(
+            mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
+            f"{at}: the dynamic mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}",
+        )
     xy, keep = result.keypoints_xy, result.keypoints_keep
     require(xy is None or (xy.ndim == 2 and xy.shape[1] == 2), f"{at}: keypoints_xy is no [N, 2] array")
     require(
@@ -168,8 +179,11 @@ def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> N
     require(spec.id and spec.label, "the spec has no id or label")
     default = spec.settings()
     copy = build(spec.settings, json.loads(default.model_dump_json()))
-    require(copy == default, "the default settings change when they are written as JSON and read again",
-            "a field's type does not survive JSON")  # fmt: skip
+    require(
+        copy == default,
+        "the default settings change when they are written as JSON and read again",
+        "a field's type does not survive JSON",
+    )
     for name, overrides in spec.presets.items():
         try:
             apply_overrides(default, overrides)
@@ -189,8 +203,11 @@ def _construct(construct: Callable[[], Tracker]) -> None:
 def _results(run: _Runner) -> None:
     results = run.track(run.frames)
     states = [result.state for result in results]
-    require("ok" in states, f"no frame of an easy scene was tracked: {states}",
-            "on this scene features abound and depth is exact")  # fmt: skip
+    require(
+        "ok" in states,
+        f"no frame of an easy scene was tracked: {states}",
+        "on this scene features abound and depth is exact",
+    )
     _direction(run, results)
 
 
@@ -199,8 +216,11 @@ def _same_keys(run: _Runner) -> None:
     keys = set(results[0].stats)
     for frame, result in zip(run.frames, results, strict=True):
         changed = keys ^ set(result.stats)
-        require(not changed, f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}",
-                "the keys must be the same on every frame; use 0 where there is nothing to say")  # fmt: skip
+        require(
+            not changed,
+            f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}",
+            "the keys must be the same on every frame; use 0 where there is nothing to say",
+        )
 
 
 def _direction(run: _Runner, results: list[TrackResult]) -> None:
@@ -221,8 +241,11 @@ def _direction(run: _Runner, results: list[TrackResult]) -> None:
     found = (
         f"the camera moved {distance:.3f} m; the poses are off by {error:.3f} m, their inverses by {error_inverse:.3f}"
     )
-    require(not (error > distance > 0 and error_inverse < 0.3 * error), found,
-            "the poses are world-to-camera; return their inverse")  # fmt: skip
+    require(
+        not (error > distance > 0 and error_inverse < 0.3 * error),
+        found,
+        "the poses are world-to-camera; return their inverse",
+    )
 
 
 def _frames_left_alone(run: _Runner) -> None:
@@ -230,8 +253,11 @@ def _frames_left_alone(run: _Runner) -> None:
     before = [(frame.rgb.copy(), frame.depth.copy()) for frame in frames]
     run.track(frames)
     for frame, (rgb, depth) in zip(frames, before, strict=True):
-        require(np.array_equal(frame.rgb, rgb) and np.array_equal(frame.depth, depth),
-                f"frame {frame.index} was changed by the tracker", "draw on a copy")  # fmt: skip
+        require(
+            np.array_equal(frame.rgb, rgb) and np.array_equal(frame.depth, depth),
+            f"frame {frame.index} was changed by the tracker",
+            "draw on a copy",
+        )
 
 
 def _results_are_kept(run: _Runner) -> None:
@@ -244,8 +270,11 @@ def _results_are_kept(run: _Runner) -> None:
         copies.append(None if pose is None else pose.copy())
     _close(tracker)
     for index, (pose, copy) in enumerate(zip(given, copies, strict=True)):
-        require(pose is None or copy is None or np.array_equal(pose, copy),
-                f"the pose of frame {index} changed later", "return a copy of the state, not the state")  # fmt: skip
+        require(
+            pose is None or copy is None or np.array_equal(pose, copy),
+            f"the pose of frame {index} changed later",
+            "return a copy of the state, not the state",
+        )
 
 
 def _determinism(run: _Runner, deterministic: bool) -> None:
@@ -264,8 +293,12 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
     again = run.track(run.frames, tracker)
     _close(tracker)
     if deterministic:
-        _same(first, again, "the same frames give other results after a second reset()",
-              "reset() leaves something of the sequence before: map, last pose, motion model, generator")  # fmt: skip
+        _same(
+            first,
+            again,
+            "the same frames give other results after a second reset()",
+            "reset() leaves something of the sequence before: map, last pose, motion model, generator",
+        )
 
 
 def _hard_frame(run: _Runner, name: str) -> None:
@@ -316,8 +349,11 @@ def _check_final(final: object, frames: list[Frame]) -> None:
     require(isinstance(final, Trajectory), f"finalize() gave a {type(final).__name__}, not a Trajectory")
     assert isinstance(final, Trajectory)
     foreign = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
-    require(not foreign, f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}",
-            "stamps have to be those of the frames, unrounded")  # fmt: skip
+    require(
+        not foreign,
+        f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}",
+        "stamps have to be those of the frames, unrounded",
+    )
     bad = [stamp for stamp, pose in zip(final.timestamps, final.T_world_cam, strict=True) if not is_pose(pose)]
     require(not bad, f"{len(bad)} poses of the final trajectory are no rigid transformations")
 

@@ -40,6 +40,7 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.published import published
 from dynslam_bench.reports.model.rows import LoadedRun, load_runs, open_stores
+from dynslam_bench.runs.frame_row import read_csv
 from dynslam_bench.runs.storage.scoring import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic.settings import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
@@ -190,10 +191,7 @@ def add(cell: Cell, run: LoadedRun) -> None:
 
 def culled(path: Path) -> list[float]:
     """How many features each frame of a run culled."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return [float(line["stat_culled"]) for line in csv.DictReader(file) if line.get("stat_culled")]
+    return [row.stats["culled"] for row in read_csv(path) if "culled" in row.stats] if path.is_file() else []
 
 
 def report(folder: Path, instances: range | None = None) -> str:

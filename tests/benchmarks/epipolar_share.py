@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from dynslam_bench.envs.slam_env import SlamEnv  # noqa: E402
+from dynslam_bench.runs.frame_row import FrameRow  # noqa: E402
 from dynslam_bench.runs.storage.frames import FrameLog  # noqa: E402
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
@@ -46,7 +47,7 @@ def measure(tracker: str, sequence: str, frames: tuple[int, int | None], masks: 
         *_, terminated, truncated, _ = env.step(0)
         over = terminated or truncated
     outcomes = env.episode.outcomes
-    log = FrameLog([{"state": each.state, "stats": dict(each.stats)} for each in outcomes])
+    log = FrameLog([FrameRow.of(each) for each in outcomes])
     share = log.epipolar_skipped()
     times = [(each.timings.get("flow", 0.0), each.timings["total"]) for each in outcomes[1:] if each.timings]
     metrics = env.episode_metrics()

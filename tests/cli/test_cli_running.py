@@ -81,8 +81,11 @@ def test_info_tells_a_program_what_it_may_set(cli):
     assert by_name["segmentation.schedule"]["choices"] == ["every", "every_nth", "keyframes"]
     assert by_name["segmentation.dilation_px"]["unit"] == "px"
     assert by_name["segmentation.source"] == {
-        "name": "segmentation.source", "default": "auto", "tunable": False, "online": False
-    }  # fmt: skip
+        "name": "segmentation.source",
+        "default": "auto",
+        "tunable": False,
+        "online": False,
+    }
 
 
 def test_long_columns_give_way(monkeypatch):

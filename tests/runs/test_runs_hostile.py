@@ -23,9 +23,12 @@ def attack(store: RunStore, toy_folder: str, tmp_path: Path):
     def run(mode: str, **limits: float) -> tuple[RunRecord, list[int]]:
         pids = tmp_path / "pids"
         spec = RunSpec(
-            tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings={"mode": mode, "pids": str(pids)},
+            tracker=hostile.TARGET,
+            sequence=toy_folder,
+            frames=(0, 6),
+            settings={"mode": mode, "pids": str(pids)},
             limits=Limits(**({"frame_s": 2.0} | limits)),
-        )  # fmt: skip
+        )
         record = run_one(spec, store)
         return record, [int(line) for line in pids.read_text().split()] if pids.is_file() else []
 
@@ -101,8 +104,9 @@ def test_memory_that_forks_share_counts_once(attack) -> None:
 def test_the_default_memory_limit_is_a_share_of_the_machine(attack, monkeypatch) -> None:
     monkeypatch.setattr(memory_module, "machine_memory_mb", lambda: 1000.0)
     assert memory_module.memory_limit(None, 2) == (
-        400.0, "by default 80 % of this machine's 1000 MB, shared by 2 runs at a time"
-    )  # fmt: skip
+        400.0,
+        "by default 80 % of this machine's 1000 MB, shared by 2 runs at a time",
+    )
     assert memory_module.memory_limit(0) == (None, "") and memory_module.memory_limit(70.0, 4) == (70.0, "")
     record, _ = attack("hog-child", frame_s=60)
     assert record.status == "out-of-memory"

@@ -30,8 +30,12 @@ def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
     assert (record.status, record.reason, record.n_frames, record.n_tracked, record.coverage) == ("ok", "", 60, 60, 1.0)
     folder = store.folder(record.run_id)
     assert sorted(path.name for path in folder.iterdir()) == [
-        "frames.csv", "log.txt", "run.json", "trajectory_final.txt", "trajectory_online.txt",
-    ]  # fmt: skip
+        "frames.csv",
+        "log.txt",
+        "run.json",
+        "trajectory_final.txt",
+        "trajectory_online.txt",
+    ]
     assert RunRecord.read(folder / "run.json") == record
     assert (store.root / "latest").resolve() == folder.resolve()
     assert leftovers(store) == []
@@ -299,9 +303,13 @@ def test_the_same_bits_on_one_thread_and_on_two(store: RunStore, tmp_path: Path)
     folders = []
     for threads in (1, 2):
         spec = RunSpec(
-            tracker="emfoa-oft", sequence="synthetic/walking_xyz?frames=12", data_root=str(tmp_path), seed=3,
-            settings={"segmentation.source": "oracle"}, threads=threads,
-        )  # fmt: skip
+            tracker="emfoa-oft",
+            sequence="synthetic/walking_xyz?frames=12",
+            data_root=str(tmp_path),
+            seed=3,
+            settings={"segmentation.source": "oracle"},
+            threads=threads,
+        )
         folders.append(store.folder(run_one(spec, store).run_id))
     assert folders[0] != folders[1]
     for name in ("trajectory_online.txt", "trajectory_final.txt", "keyframes.csv", "map.ply"):

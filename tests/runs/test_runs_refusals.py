@@ -38,8 +38,16 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple
 
 
 NAMES = (
-    "no onnx", "no network", "no weights", "no checkpoint", "no folder", "too few masks", "oracle", "auto", "plugin",
-)  # fmt: skip
+    "no onnx",
+    "no network",
+    "no weights",
+    "no checkpoint",
+    "no folder",
+    "too few masks",
+    "oracle",
+    "auto",
+    "plugin",
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -84,9 +92,14 @@ def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_fold
 def test_a_study_refuses_it_too(toy_folder: str, mistakes, tmp_path: Path) -> None:
     source, words = mistakes["no network"]
     spec = StudySpec.model_validate(
-        {"name": "s", "tracker": "mask-rcnn", "tune": (toy_folder,), "trials": 2,
-         "space": {"fixed": {"segmentation.source": source}}}
-    )  # fmt: skip
+        {
+            "name": "s",
+            "tracker": "mask-rcnn",
+            "tune": (toy_folder,),
+            "trials": 2,
+            "space": {"fixed": {"segmentation.source": source}},
+        }
+    )
     with pytest.raises(DynslamError, match=words):
         Tuner(spec, tmp_path / "results").run()
     assert RunStore(tmp_path / "results").ids() == []

@@ -25,16 +25,31 @@ def test_run_id_depends_on_what_matters_and_on_nothing_else(toy_folder: str, tmp
     first = resolve(RunSpec(**base)).run_id
     assert len(first) == 16 and resolve(RunSpec(**base)).run_id == first
     same = [
-        {"settings": {"noise.clip": "2.0"}}, {"settings": {"noise.clip": 2}}, {"limits": {"time_s": 5}},
-        {"video": True}, {"sheet": True}, {"degrade": {"blur": 0.0}}, {"data_root": str(tmp_path)},
-        {"frames": "0:60"}, {"frames": (0, 900)}, {"offset": 0},
-    ]  # fmt: skip
+        {"settings": {"noise.clip": "2.0"}},
+        {"settings": {"noise.clip": 2}},
+        {"limits": {"time_s": 5}},
+        {"video": True},
+        {"sheet": True},
+        {"degrade": {"blur": 0.0}},
+        {"data_root": str(tmp_path)},
+        {"frames": "0:60"},
+        {"frames": (0, 900)},
+        {"offset": 0},
+    ]
     assert {resolve(RunSpec(**(base | change))).run_id for change in same} == {first}
     other = [
-        {"seed": 1}, {"settings": {"noise.clip": 2.5}}, {"frames": (0, 30)}, {"stride": 2}, {"threads": 2},
-        {"degrade": {"blur": 0.1}}, {"drop_share": 0.1}, {"realtime": True}, {"offset": 3}, {"frames": (3, None)},
+        {"seed": 1},
+        {"settings": {"noise.clip": 2.5}},
+        {"frames": (0, 30)},
+        {"stride": 2},
+        {"threads": 2},
+        {"degrade": {"blur": 0.1}},
+        {"drop_share": 0.1},
+        {"realtime": True},
+        {"offset": 3},
+        {"frames": (3, None)},
         {"tracker": TARGET.replace(":SPEC", ":FIXED")},
-    ]  # fmt: skip
+    ]
     ids = [resolve(RunSpec(**(base | change))).run_id for change in other]
     assert len({first, *ids}) == len(ids) + 1
 

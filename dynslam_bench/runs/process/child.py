@@ -1,6 +1,7 @@
 """The process that makes a run: it steps an environment and tells the parent how it goes.
 
-Messages are JSON bytes over the connection, never pickles. The parent sends the job, then perhaps ``stop``. The child
+Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`), which names what is
+to be done, then perhaps ``stop``. The child
 sends ``started``, ``frame`` (one each, the sign of life), ``progress`` every so many frames, and ends with ``done``,
 ``stopped`` or ``failed``. What it found lies in files in the job's folder: `frames.jsonl`, written frame by frame so
 that a crash loses nothing, and at the end the final trajectory and the map.
@@ -27,10 +28,7 @@ from dynslam_bench.core.plugins import load_object
 from .failures import describe_failure
 from .family import adopt_orphans, die_with_parent, end_descendants
 
-FRAMES_FILE = "frames.jsonl"
 LOG_FILE = "log.txt"
-WORK = "dynslam_bench.runs.loop:run_loop"
-"""What a job does that does not say so itself."""
 
 
 def main(connection: Connection) -> int:
@@ -55,7 +53,7 @@ def main(connection: Connection) -> int:
     threading.Thread(target=_listen, args=(connection, stop), daemon=True).start()
     try:
         _prepare(job)
-        work = load_object(job.get("work", WORK))
+        work = load_object(job["work"])
         message = work(job, lambda message: _send(connection, message), stop.is_set)
     except BaseException as error:
         traceback.print_exc()

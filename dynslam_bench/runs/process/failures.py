@@ -74,9 +74,7 @@ def source_line(error: BaseException) -> str:
     if not lines:
         return ""
     foreign = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    own = [
-        line for line in lines
-        if "site-packages" not in line.filename and not line.filename.startswith((*foreign, "<", sys.base_prefix))
-    ]  # fmt: skip
+    outside = (*foreign, "<", sys.base_prefix)
+    own = [line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(outside)]
     line = (own or lines)[-1]
     return f"{Path(line.filename).name}:{line.lineno}"

@@ -31,10 +31,11 @@ from dynslam_bench.core.errors import RunError
 from .family import adopt_orphans, children, end_descendants, end_family
 
 PRELOADED = (
-    "numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium", "dynslam_bench.envs",
-    "dynslam_bench.evaluation.evaluate", "dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend",
-    "dynslam_bench.flow.build_flow", "dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.child",
-)  # fmt: skip
+    *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
+    *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
+    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.build_flow"),
+    *("dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.child"),
+)
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
 

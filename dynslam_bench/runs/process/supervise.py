@@ -211,14 +211,19 @@ def _wait_exit(child: Child) -> int:
     return -signal.SIGKILL
 
 
+_SIGNALS = {
+    "SIGSEGV": "segmentation fault",
+    "SIGABRT": "aborted by a library",
+    "SIGFPE": "arithmetic error",
+    "SIGILL": "illegal instruction",
+    "SIGBUS": "bus error",
+    "SIGKILL": "killed from outside; on Linux often because memory ran out",
+}
+
+
 def _reason_of_exit(code: int, where: str) -> tuple[Status, str]:
     if code >= 0:
         return "crashed", f"the process left with exit code {code}{where}"
     name = signal.Signals(-code).name if -code in {s.value for s in signal.Signals} else f"signal {-code}"
-    meaning = {
-        "SIGSEGV": "segmentation fault", "SIGABRT": "aborted by a library", "SIGFPE": "arithmetic error",
-        "SIGILL": "illegal instruction", "SIGBUS": "bus error",
-    }.get(name, "")  # fmt: skip
-    if name == "SIGKILL":
-        meaning = "killed from outside; on Linux often because memory ran out"
+    meaning = _SIGNALS.get(name, "")
     return "crashed", f"{name}{f' ({meaning})' if meaning else ''}{where}"

@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.machine import versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.envs.source import Frames, open_frames
 from dynslam_bench.evaluation.frames import STAMP_TOLERANCE
 from dynslam_bench.geometry.association import associate, nearest_gap
+from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import load_tum, write_tum
 from dynslam_bench.sequences.catalogue import parse_frames
 from dynslam_bench.sequences.part import part_of
@@ -68,43 +71,81 @@ def import_trajectory(
         raise RunError("an imported trajectory needs the name of its tracker")
     file = Path(path).expanduser()
     loaded = load_tum(file)
-    trajectory = loaded.trajectory
     opened = open_frames(sequence, data_root, camera, frames, stride)
+    covered, odd = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
+    notes = loaded.notes.describe()
+    if odd:
+        notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
+    identity = _identity(file, tracker, which, opened)
+    record = RunRecord(
+        kind="imported",
+        run_id=digest(identity, 16),
+        status="ok",
+        tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
+        sequence=sequence_info(opened, identity["content"], part_digest(identity)),
+        frames=_pair(frames),
+        stride=stride,
+        **_counts(covered, len(opened)),
+        stamps_match=not odd,
+        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
+        versions=versions(),
+        identity=identity,
+        provenance=provenance or str(file),
+        notes=notes,
+        place=place_of(sequence),
+    ).normalised()
     store = results if isinstance(results, RunStore) else RunStore(results)
-    stamps = opened.timestamps
+    _keep(store, record, opened, loaded.trajectory, which)
+    return record
+
+
+def _keep(store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Trajectory, which: str) -> None:
+    store.prepare()
+    with store.work_folder(record.run_id) as work:
+        comment = f"imported: {record.tracker.id} on {sequence.id}"
+        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
+        store.add_sequence(record.sequence.part, sequence.timestamps, sequence.ground_truth)
+        store.publish(work, record)
+
+
+def _counts(covered: int, total: int) -> dict[str, Any]:
+    return {"n_frames": total, "n_tracked": covered, "n_lost": total - covered, "coverage": covered / total}
+
+
+def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int]:
+    """How many frames a trajectory covers, and how many of its poses carry stamps that are no frame's.
+
+    Raises:
+        RunError: Fewer than two of them are near a frame; `shares` and `name` say whose they are.
+    """
     exact, _ = associate(stamps, trajectory.timestamps, STAMP_TOLERANCE, strict=False)
     near, _ = associate(stamps, trajectory.timestamps, _TOLERANCE_S)
     if len(near) < 2:
         gap = float(np.min(nearest_gap(trajectory.timestamps, stamps)))
         raise RunError(
-            f"{file} shares {len(near)} stamps with '{opened.id}', at least 2 are needed",
+            f"{shares} {len(near)} stamps with {name}, at least 2 are needed",
             f"the nearest is {gap:.3f} s off; frames last from {stamps[0]:.6f} to {stamps[-1]:.6f}",
         )
-    notes = loaded.notes.describe()
-    matching = len(exact) == len(trajectory)
-    if not matching:
-        odd = len(trajectory) - len(exact)
-        notes.append(f"{odd} of {len(trajectory)} poses carry stamps that are no input frame's")
-    covered = len(exact) if matching else len(near)
-    part = None if frames is None else parse_frames(frames if isinstance(frames, str) else (frames[0] or 0, frames[1]))
-    seen = part_of(opened)
-    identity: dict[str, Any] = {
-        "kind": "imported", "tracker": tracker, "which": which, "file": sha256(file.read_bytes()).hexdigest(),
-        "sequence": seen.id, "content": seen.content, "frames": [seen.start, seen.stop], "offset": 0,
+    odd = len(trajectory) - len(exact)
+    return (len(near) if odd else len(exact)), odd
+
+
+def _identity(file: Path, tracker: str, which: str, sequence: Sequence) -> dict[str, Any]:
+    seen = part_of(sequence)
+    return {
+        "kind": "imported",
+        "tracker": tracker,
+        "which": which,
+        "file": sha256(file.read_bytes()).hexdigest(),
+        "sequence": seen.id,
+        "content": seen.content,
+        "frames": [seen.start, seen.stop],
+        "offset": 0,
         "stride": seen.stride,
-    }  # fmt: skip
-    record = RunRecord(
-        kind="imported", run_id=digest(identity, 16), status="ok",
-        tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        sequence=sequence_info(opened, seen.content, part_digest(identity)), frames=part, stride=stride,
-        n_frames=len(opened), n_tracked=covered, n_lost=len(opened) - covered, coverage=covered / len(opened),
-        stamps_match=matching, started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
-        versions=versions(), identity=identity, provenance=provenance or str(file), notes=notes,
-        place=place_of(sequence),
-    ).normalised()  # fmt: skip
-    store.prepare()
-    with store.work_folder(record.run_id) as work:
-        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=f"imported: {tracker} on {opened.id}")
-        store.add_sequence(record.sequence.part, stamps, opened.ground_truth)
-        store.publish(work, record)
-    return record
+    }
+
+
+def _pair(frames: Frames) -> tuple[int, int | None] | None:
+    if frames is None:
+        return None
+    return parse_frames(frames if isinstance(frames, str) else (frames[0] or 0, frames[1]))

@@ -114,8 +114,6 @@ class RunRecord(Record):
             without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
             where either is missing.
-        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
-            without an epipolar test.
         timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
@@ -163,7 +161,6 @@ class RunRecord(Record):
     map_points: int | None = None
     epipolar_skipped: float | None = None
     mask_iou: float | None = None
-    epipolar_skipped: float | None = None
     timings: dict[str, StageTime] = Field(default_factory=dict)
     finalize_s: float | None = None
     started: str = ""

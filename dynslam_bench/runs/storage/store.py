@@ -12,17 +12,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
 from dynslam_bench.core.records import write_atomic
-from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
+from .evaluating import DEFAULT_PROTOCOL, Which, evaluate_run
 from .record import MetricRecord, RunRecord
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RUN_FILE = "run.json"
 _RUN_ID = re.compile(r"[0-9a-f]{16}")
@@ -218,6 +223,41 @@ class RunStore:
         """A run's stored metrics under a protocol; None if it was not scored under it."""
         path = self._metric_file(run_id, protocol.digest())
         return MetricRecord.read(path) if path.is_file() else None
+
+    def score(
+        self, record: RunRecord, protocol: Protocol | str = DEFAULT_PROTOCOL, *, again: bool = False
+    ) -> MetricRecord:
+        """A stored run's metrics under a protocol; see `scoring.score`."""
+        protocol = get_protocol(protocol)
+        stored = None if again else self.metrics(record.run_id, protocol)
+        if stored is not None:
+            return stored
+        part = record.sequence.part
+        found: dict[Which, Trajectory | None] = {
+            "online": self.trajectory(record.run_id, "online"),
+            "final": self.trajectory(record.run_id, "final"),
+        }
+        truth = self.ground_truth(part)
+        metrics = evaluate_run(record, found, truth, lambda: self.timestamps(part), protocol)
+        if record.kind == "imported":  # it has only one trajectory
+            online = (self.folder(record.run_id) / "trajectory_online.txt").is_file()
+            metrics = metrics.model_copy(update={"trajectory": "online" if online else "final"})
+        self.add_metrics(metrics)
+        return metrics
+
+    def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL) -> pd.DataFrame:
+        """All runs, scored under one protocol, as a pandas frame: one row a run, from the oldest to the newest.
+
+        Args:
+            protocol: How to evaluate; SLAM is never run again for it.
+
+        Returns:
+            The columns that `runs_frame` describes.
+        """
+        from .run_table import runs_frame
+
+        records, _ = self.all()
+        return runs_frame([(r, None if r.status == "stopped" else self.score(r, protocol)) for r in records])
 
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
         """The ``online`` or ``final`` trajectory of a run; None if there is none or no frame was tracked."""

@@ -1,0 +1,81 @@
+"""Runs as the rows of a table, or as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
+
+from .output import write_json, write_table
+
+if TYPE_CHECKING:
+    from dynslam_bench.runs import RunRecord, RunStore
+
+TITLES = {
+    "run": "run",
+    "tracker": "tracker",
+    "sequence": "sequence",
+    "part": "part",
+    "repeat": "repeat",
+    "status": "status",
+    "ate_rmse_m": "ATE (m)",
+    "never_move_m": "not moving (m)",
+    "coverage": "coverage",
+    "frame_ms": "ms/frame",
+}
+"""Columns of the table."""
+WHERE_SAID = {
+    "masks": "masks",
+    "from_store": "from the store",
+    "settings": "settings",
+    "reason": "reason",
+}
+"""Columns that are there only if a run has something to say in them."""
+
+
+def show_runs(
+    records: Sequence[RunRecord], store: RunStore, protocol: str, *, as_json: bool, reused: Collection[str] = ()
+) -> None:
+    """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are said to be from the store."""
+    rows = [_row(record, store, protocol) | {"from_store": record.run_id in reused} for record in records]
+    if as_json:
+        write_json(rows)
+        return
+    names = {name: title for name, title in TITLES.items() if name != "part" or any(row["part"] for row in rows)}
+    names |= {name: title for name, title in WHERE_SAID.items() if any(row[name] for row in rows)}
+    cells = [[row[name] for name in names] for row in rows]
+    write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
+
+
+def _row(record: RunRecord, store: RunStore, protocol: str) -> dict[str, Any]:
+    metrics = {} if record.status == "stopped" else store.score(record, protocol).metrics
+    return {
+        "run": record.run_id,
+        "tracker": record.tracker.id,
+        "sequence": record.sequence.id,
+        "part": part_words(record),
+        "seed": record.seed,
+        "offset": record.offset,
+        "noise": record.sequence.noise,
+        "repeat": record.repeat,
+        "settings": ", ".join(f"{name}={value}" for name, value in record.overrides.items()),
+        "status": record.status,
+        "ate_rmse_m": metrics.get("ate_rmse_m"),
+        "never_move_m": metrics.get("never_move_ate_rmse_m"),
+        "coverage": record.coverage,
+        "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
+        "masks": record.segmentation,
+        "reason": record.reason,
+        "protocol": protocol,
+        "folder": str(store.folder(record.run_id)),
+    }
+
+
+def part_words(record: RunRecord) -> str:
+    """Which frames of its sequence a run was asked for, e.g. ``0:60, every 2nd``; empty for all of them."""
+    words = []
+    if record.frames is not None:
+        start, stop = record.frames
+        words.append(f"{start}:{'' if stop is None else stop}")
+    if record.stride > 1:
+        words.append(f"every {record.stride}{ {2: 'nd', 3: 'rd'}.get(record.stride, 'th') }")
+    return ", ".join(words)

@@ -1,0 +1,170 @@
+"""One frame of a run: a line of the child's log and a row of ``frames.csv``, written and read by the same code."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.geometry import se3
+
+if TYPE_CHECKING:
+    from dynslam_bench.envs.episode import FrameOutcome, FrameState
+
+FRAMES_FILE = "frames.jsonl"
+"""The child's log: one line a frame, complete before the next frame begins; gone when the run is stored."""
+CSV_FILE = "frames.csv"
+"""The stored table: one row a frame."""
+STATES: tuple[FrameState, ...] = ("initialising", "ok", "lost", "dropped")
+FIXED = (
+    *("index", "timestamp", "state"),
+    *("frame_error_trans_m", "frame_error_rot_deg", "pose_error_trans_m", "pose_error_rot_deg"),
+    *("reward_m", "mask_iou"),
+)
+"""Columns of every ``frames.csv``; after them come ``<stage>_s``, seconds of every stage, and ``stat_<name>``."""
+_STAT = "stat_"
+_SECONDS = "_s"
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """What is kept of one frame.
+
+    Attributes:
+        index: Index of the frame in the run's part of the sequence.
+        timestamp: Seconds; ``frames.csv`` keeps six decimals.
+        state: ``initialising``, ``ok``, ``lost``, or ``dropped`` if the frame never reached the tracker.
+        frame_error_trans_m: Frame-to-frame translational error in metres; None without ground truth at both frames.
+        frame_error_rot_deg: Frame-to-frame rotational error in degrees, likewise.
+        pose_error_trans_m: Cumulative translational error in metres, see `OnlineError`; None without ground truth.
+        pose_error_rot_deg: Cumulative rotational error in degrees, likewise.
+        reward_m: What the frame earned.
+        mask_iou: Overlap of the dynamic mask with the exact masks of people, 0 to 1; None where either is missing or
+            neither has a pixel.
+        timings: Seconds by stage; empty for a frame that was dropped.
+        stats: The tracker's diagnostics by name.
+        pose: Tracked camera-to-world pose ``tx ty tz qx qy qz qw``; None unless the state is ``ok``. Not in
+            ``frames.csv``: ``trajectory_online.txt`` holds it.
+    """
+
+    index: int
+    timestamp: float
+    state: FrameState
+    frame_error_trans_m: float | None = None
+    frame_error_rot_deg: float | None = None
+    pose_error_trans_m: float | None = None
+    pose_error_rot_deg: float | None = None
+    reward_m: float = 0.0
+    mask_iou: float | None = None
+    timings: Mapping[str, float] = field(default_factory=dict)
+    stats: Mapping[str, float] = field(default_factory=dict)
+    pose: Sequence[float] | None = None
+
+    @classmethod
+    def of(cls, outcome: FrameOutcome, mask_iou: float | None = None) -> FrameRow:
+        """The row of a frame that an environment has tracked."""
+        error = outcome.error
+        pose = None
+        if outcome.T_world_cam is not None:
+            position, quaternion = se3.to_quaternion(outcome.T_world_cam)
+            pose = [*position.tolist(), *quaternion.tolist()]
+        return cls(
+            index=outcome.index,
+            timestamp=outcome.timestamp,
+            state=outcome.state,
+            frame_error_trans_m=None if error is None else error.frame_trans_m,
+            frame_error_rot_deg=None if error is None else error.frame_rot_deg,
+            pose_error_trans_m=None if error is None else error.trans_m,
+            pose_error_rot_deg=None if error is None else error.rot_deg,
+            reward_m=outcome.reward,
+            mask_iou=mask_iou,
+            timings=dict(outcome.timings),
+            stats=dict(outcome.stats),
+            pose=pose,
+        )
+
+    def cells(self) -> dict[str, Any]:
+        """The row by the columns of ``frames.csv``: `FIXED`, ``<stage>_s`` and ``stat_<name>``."""
+        times = {stage + _SECONDS: value for stage, value in self.timings.items()}
+        stats = {_STAT + name: value for name, value in self.stats.items()}
+        return {name: getattr(self, name) for name in FIXED} | times | stats
+
+    def to_json(self) -> str:
+        """The row as one line of the child's log, with its newline."""
+        return json.dumps(vars(self)) + "\n"
+
+
+def read_log(path: Path) -> list[FrameRow]:
+    """Read the child's log; a line that a dying process left unfinished is not taken, and no file is no frames."""
+    if not path.is_file():
+        return []
+    return [FrameRow(**json.loads(line)) for line in path.read_text().split("\n")[:-1]]
+
+
+def column_names(rows: Iterable[FrameRow]) -> list[str]:
+    """The columns of a table of frames: `FIXED`, the stages' times, the stats, in the order they appeared in."""
+    seen = dict.fromkeys(name for row in rows for name in row.cells())
+    others = [name for name in seen if name not in FIXED]
+    return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT))]
+
+
+def write_csv(path: Path, rows: Sequence[FrameRow]) -> None:
+    """Write ``frames.csv``."""
+    columns = column_names(rows)
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(columns)
+        for row in rows:
+            cells = row.cells() | {"timestamp": f"{row.timestamp:.6f}"}
+            table.writerow([cells.get(name) for name in columns])
+
+
+def read_csv(path: Path) -> list[FrameRow]:
+    """Read a ``frames.csv``, of today or of an older version; columns of another kind are left out.
+
+    Raises:
+        RunError: There is no such file, or it holds something else.
+    """
+    rows: list[FrameRow] = []
+    try:
+        with path.open(newline="") as file:
+            rows.extend(_parse(line) for line in csv.DictReader(file))
+    except OSError as error:
+        raise RunError(f"cannot read {path}: {error.strerror}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({error!r})") from error
+    return rows
+
+
+def _parse(line: Mapping[str, str]) -> FrameRow:
+    cells = {name: float(text) for name, text in line.items() if text and name not in FIXED[:3]}
+    stats = {name[len(_STAT) :]: value for name, value in cells.items() if name.startswith(_STAT)}
+    timings = {
+        name[: -len(_SECONDS)]: value
+        for name, value in cells.items()
+        if name.endswith(_SECONDS) and not name.startswith(_STAT)
+    }
+    return FrameRow(
+        index=int(line["index"]),
+        timestamp=float(line["timestamp"]),
+        state=_state(line["state"]),
+        frame_error_trans_m=cells.get("frame_error_trans_m"),
+        frame_error_rot_deg=cells.get("frame_error_rot_deg"),
+        pose_error_trans_m=cells.get("pose_error_trans_m"),
+        pose_error_rot_deg=cells.get("pose_error_rot_deg"),
+        reward_m=cells["reward_m"],
+        mask_iou=cells.get("mask_iou"),
+        timings=timings,
+        stats=stats,
+    )
+
+
+def _state(text: str) -> FrameState:
+    for known in STATES:
+        if text == known:
+            return known
+    raise ValueError(f"unknown state '{text}'")

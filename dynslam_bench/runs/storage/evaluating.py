@@ -1,0 +1,61 @@
+"""A run's metrics under a protocol, from what is stored of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import EvaluationError, TrajectoryError
+from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .record import MetricRecord, RunRecord
+
+DEFAULT_PROTOCOL = "tum-rgbd/v1"
+Which = Literal["online", "final"]
+
+
+def evaluate_run(
+    record: RunRecord,
+    trajectories: Mapping[Which, Trajectory | None],
+    truth: Trajectory | None,
+    stamps: Callable[[], NDArray[np.float64]],
+    protocol: Protocol,
+) -> MetricRecord:
+    """The metrics of a run under a protocol.
+
+    Args:
+        record: The run.
+        trajectories: Its ``online`` and ``final`` trajectory; None for one that does not exist or holds no pose.
+        truth: The ground truth of its part of the sequence; None if there is none.
+        stamps: Reads the stamps of the part's input frames; asked only where they are needed.
+        protocol: How to evaluate.
+
+    Returns:
+        The metrics; evaluations that are not possible are None, with the reason.
+    """
+    found: dict[Which, Evaluation | None] = {}
+    reasons: dict[str, str] = {}
+    for which, trajectory in trajectories.items():
+        try:
+            if truth is None:
+                raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
+            if trajectory is None:
+                raise EvaluationError("there is no such trajectory, or it holds no tracked frame")
+            inputs = stamps() if record.stamps_match else None
+            found[which] = evaluate(trajectory, truth, protocol, input_timestamps=inputs)
+        except (EvaluationError, TrajectoryError) as error:
+            found[which], reasons[which] = None, str(error)
+    return MetricRecord(
+        run_id=record.run_id,
+        protocol_id=protocol.id,
+        protocol_digest=protocol.digest(),
+        trajectory=protocol.trajectory,
+        online=found.get("online"),
+        final=found.get("final"),
+        reasons=reasons,
+    )
