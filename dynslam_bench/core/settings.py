@@ -115,9 +115,15 @@ def tunable(
         when: Conditions on sibling fields (names relative to the model that holds this field).
         choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
-    annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online,
-                  "when": {key: list(values) for key, values in (when or {}).items()},
-                  "choices": list(choices or ())}  # fmt: skip
+    annotation: dict[str, Any] = {
+        "low": low,
+        "high": high,
+        "scale": scale,
+        "unit": unit,
+        "online": online,
+        "when": {key: list(values) for key, values in (when or {}).items()},
+        "choices": list(choices or ()),
+    }
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")
     accepted = limits if limits is not None else (low, high)
@@ -291,9 +297,13 @@ def _describe(name: str, field: FieldInfo) -> Parameter:
     prefix = name.rpartition(".")[0]
     when = tuple((f"{prefix}.{key}" if prefix else key, tuple(values)) for key, values in note["when"].items())
     common: dict[str, Any] = {
-        "name": name, "default": field.default, "unit": note["unit"], "online": note["online"],
-        "meaning": field.description or "", "when": when,
-    }  # fmt: skip
+        "name": name,
+        "default": field.default,
+        "unit": note["unit"],
+        "online": note["online"],
+        "meaning": field.description or "",
+        "when": when,
+    }
     base = _strip_optional(field.annotation)
     if note["choices"]:
         return Parameter(kind="categorical", choices=tuple(note["choices"]), **common)

@@ -99,11 +99,18 @@ def _job(
     tracker: str, settings: Mapping[str, Any] | None, frames: int, seed: int, known: list[Check], folder: str
 ) -> dict[str, Any]:
     return {
-        "work": _WORK, "tracker": tracker, "settings": dict(settings or {}), "frames": frames, "seed": seed,
-        "known": [asdict(check) for check in known], "folder": folder, "spec": {"threads": 1},
+        "work": _WORK,
+        "tracker": tracker,
+        "settings": dict(settings or {}),
+        "frames": frames,
+        "seed": seed,
+        "known": [asdict(check) for check in known],
+        "folder": folder,
+        "spec": {"threads": 1},
         "environment": {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES},
-        "working_folder": str(Path.cwd()), "path": list(sys.path),
-    }  # fmt: skip
+        "working_folder": str(Path.cwd()),
+        "path": list(sys.path),
+    }
 
 
 class _Follower:
@@ -169,9 +176,7 @@ class _Teller:
         self._send({"type": "progress", "check": asdict(check)})
 
 
-def work(
-    job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]
-) -> dict[str, Any]:  # fmt: skip
+def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
     """What the child does: the checks whose outcome is not known yet."""
     from .tracker import tracker_report
 

@@ -52,16 +52,25 @@ def check_instances(found: Instances, frame: Frame) -> None:
         ConformanceError: Something in it breaks the contract.
     """
     at, shape = f"frame {frame.index}", frame.depth.shape
-    require(isinstance(found, Instances), f"{at}: segment() gave a {type(found).__name__}, not Instances",
-            "nothing found is Instances.empty(height, width)")  # fmt: skip
+    require(
+        isinstance(found, Instances),
+        f"{at}: segment() gave a {type(found).__name__}, not Instances",
+        "nothing found is Instances.empty(height, width)",
+    )
     count = len(found.class_names)
-    require(found.masks.dtype == np.bool_ and found.masks.shape == (count, *shape),
-            f"{at}: masks are {found.masks.dtype} {found.masks.shape}, expected bool {(count, *shape)}",
-            "masks have to be at the frame's resolution and thresholded")  # fmt: skip
-    require(found.boxes.dtype == np.float32 and found.boxes.shape == (count, 4),
-            f"{at}: boxes are {found.boxes.dtype} {found.boxes.shape}, expected float32 {(count, 4)}")  # fmt: skip
-    require(found.scores.dtype == np.float32 and found.scores.shape == (count,),
-            f"{at}: scores are {found.scores.dtype} {found.scores.shape}, expected float32 {(count,)}")  # fmt: skip
+    require(
+        found.masks.dtype == np.bool_ and found.masks.shape == (count, *shape),
+        f"{at}: masks are {found.masks.dtype} {found.masks.shape}, expected bool {(count, *shape)}",
+        "masks have to be at the frame's resolution and thresholded",
+    )
+    require(
+        found.boxes.dtype == np.float32 and found.boxes.shape == (count, 4),
+        f"{at}: boxes are {found.boxes.dtype} {found.boxes.shape}, expected float32 {(count, 4)}",
+    )
+    require(
+        found.scores.dtype == np.float32 and found.scores.shape == (count,),
+        f"{at}: scores are {found.scores.dtype} {found.scores.shape}, expected float32 {(count,)}",
+    )
     require(
         ((found.scores >= 0) & (found.scores <= 1)).all(), f"{at}: a score lies outside [0, 1]", "logits, not scores"
     )
@@ -75,8 +84,11 @@ def check_instances(found: Instances, frame: Frame) -> None:
             continue
         inside = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
         outside = 100 * (1 - float(inside.mean()))
-        require(outside < 10, f"{at}: {outside:.0f} % of the mask of a {name} lie outside its box",
-                "boxes of another resolution, or y before x")  # fmt: skip
+        require(
+            outside < 10,
+            f"{at}: {outside:.0f} % of the mask of a {name} lie outside its box",
+            "boxes of another resolution, or y before x",
+        )
     require(found.moving is None or found.moving.shape == (count,), f"{at}: moving does not fit the objects")
 
 
@@ -103,5 +115,8 @@ def _determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> Non
         same = (
             a.class_names == b.class_names and np.array_equal(a.masks, b.masks) and np.array_equal(a.scores, b.scores)
         )
-        require(same, f"frame {frame.index} gives other objects when it is segmented again",
-                "a network in training mode, or unseeded randomness")  # fmt: skip
+        require(
+            same,
+            f"frame {frame.index} gives other objects when it is segmented again",
+            "a network in training mode, or unseeded randomness",
+        )

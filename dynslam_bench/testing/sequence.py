@@ -48,8 +48,23 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
 
 
 def _protocol(sequence: Sequence) -> None:
-    missing = [name for name in ("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation",
-                                 "digest", "__len__", "__getitem__") if not hasattr(sequence, name)]  # fmt: skip
+    missing = [
+        name
+        for name in (
+            "id",
+            "camera",
+            "timestamps",
+            "ground_truth",
+            "masks",
+            "fps",
+            "license",
+            "citation",
+            "digest",
+            "__len__",
+            "__getitem__",
+        )
+        if not hasattr(sequence, name)
+    ]
     require(
         not missing, f"a {type(sequence).__name__} lacks {', '.join(missing)}", "see dynslam_bench.sequences.Sequence"
     )
@@ -61,8 +76,11 @@ def _protocol(sequence: Sequence) -> None:
 
 def _timestamps(sequence: Sequence) -> None:
     stamps = sequence.timestamps
-    require(isinstance(stamps, np.ndarray) and stamps.dtype == np.float64, "timestamps are no float64 array",
-            "float32 holds stamps of today to 100 s only")  # fmt: skip
+    require(
+        isinstance(stamps, np.ndarray) and stamps.dtype == np.float64,
+        "timestamps are no float64 array",
+        "float32 holds stamps of today to 100 s only",
+    )
     require(stamps.shape == (len(sequence),), f"{stamps.shape} timestamps for {len(sequence)} frames")
     require(np.isfinite(stamps).all(), "a timestamp is not finite")
     intervals = np.diff(stamps)
@@ -70,8 +88,11 @@ def _timestamps(sequence: Sequence) -> None:
     require(sequence.fps > 0, f"fps is {sequence.fps}")
     if len(intervals):
         rate = 1 / float(np.median(intervals))
-        require(1 / 3 < rate / sequence.fps < 3, f"fps is {sequence.fps:g}, but the median rate is {rate:g} Hz",
-                "timestamps have to be in seconds")  # fmt: skip
+        require(
+            1 / 3 < rate / sequence.fps < 3,
+            f"fps is {sequence.fps:g}, but the median rate is {rate:g} Hz",
+            "timestamps have to be in seconds",
+        )
 
 
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
@@ -84,14 +105,21 @@ def _frames(sequence: Sequence, chosen: list[int]) -> None:
         require(
             frame.timestamp == stamp, f"frame {index} is stamped {frame.timestamp!r}, but timestamps[{index}] {stamp}"
         )
-        require(frame.rgb.dtype == np.uint8 and frame.rgb.shape == (height, width, 3),
-                f"rgb of frame {index} is {frame.rgb.dtype} {frame.rgb.shape}, expected uint8 {(height, width, 3)}",
-                "the camera's size is not the image's, or the image is grey")  # fmt: skip
+        require(
+            frame.rgb.dtype == np.uint8 and frame.rgb.shape == (height, width, 3),
+            f"rgb of frame {index} is {frame.rgb.dtype} {frame.rgb.shape}, expected uint8 {(height, width, 3)}",
+            "the camera's size is not the image's, or the image is grey",
+        )
         depth = frame.depth
-        require(depth.dtype == np.float32 and depth.shape == (height, width),
-                f"depth of frame {index} is {depth.dtype} {depth.shape}, not float32 {(height, width)}")  # fmt: skip
-        require(np.isfinite(depth).all() and (depth >= 0).all(),
-                f"depth of frame {index} has values below 0 or not finite", "missing depth is 0")  # fmt: skip
+        require(
+            depth.dtype == np.float32 and depth.shape == (height, width),
+            f"depth of frame {index} is {depth.dtype} {depth.shape}, not float32 {(height, width)}",
+        )
+        require(
+            np.isfinite(depth).all() and (depth >= 0).all(),
+            f"depth of frame {index} has values below 0 or not finite",
+            "missing depth is 0",
+        )
         valid = depth[depth > 0]
         if len(valid):
             median = float(np.median(valid))
@@ -119,9 +147,12 @@ def _ground_truth(sequence: Sequence) -> None:
     require(isinstance(truth, Trajectory), f"the ground truth is a {type(truth).__name__}, not a Trajectory")
     stamps = sequence.timestamps
     overlap = (truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)
-    require(overlap.any(),
-            f"the ground truth spans {truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s, the frames "
-            f"{stamps[0]:.3f} to {stamps[-1]:.3f} s", "they use different clocks")  # fmt: skip
+    require(
+        overlap.any(),
+        f"the ground truth spans {truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s, the frames "
+        f"{stamps[0]:.3f} to {stamps[-1]:.3f} s",
+        "they use different clocks",
+    )
 
 
 def _masks(sequence: Sequence, chosen: list[int]) -> None:
@@ -132,8 +163,10 @@ def _masks(sequence: Sequence, chosen: list[int]) -> None:
     for index in chosen:
         masks = source[index]
         kind = masks.instances.dtype
-        require(masks.instances.shape == shape and np.issubdtype(kind, np.integer),
-                f"the mask of frame {index} is {kind} {masks.instances.shape}, expected integers {shape}")  # fmt: skip
+        require(
+            masks.instances.shape == shape and np.issubdtype(kind, np.integer),
+            f"the mask of frame {index} is {kind} {masks.instances.shape}, expected integers {shape}",
+        )
         unnamed = set(np.unique(masks.instances).tolist()) - {0} - set(masks.class_names)
         require(not unnamed, f"instances {sorted(unnamed)} of frame {index} have no class name", "0 is the background")
         require(set(masks.moving) <= set(masks.class_names), f"moving instances of frame {index} have no class name")

@@ -46,9 +46,11 @@ def check_steering(
         raise NotApplicable("the tracker has no online settings")
     tracker = build(settings)
     names = ", ".join(parameter.name for parameter in online[:4]) + (", ..." if len(online) > 4 else "")
-    require(isinstance(tracker, Steerable),
-            f"marked online: {names}; but a {type(tracker).__name__} has no configure(settings)",
-            "implement it (see core.steering), or take online=True away")  # fmt: skip
+    require(
+        isinstance(tracker, Steerable),
+        f"marked online: {names}; but a {type(tracker).__name__} has no configure(settings)",
+        "implement it (see core.steering), or take online=True away",
+    )
     fresh = _episode(tracker, camera, frames, seed)
     shown = False
     for ends in _ends(online):
@@ -61,11 +63,17 @@ def check_steering(
         again = _episode(tracker, camera, frames, seed)
         what = ", ".join(f"{name}={value}" for name, value in list(ends.items())[:4])
         at = first_difference(static, steered)
-        require(not at, f"configure() with {what} gives another result than building with it: {at}",
-                "configure() does not reach the part that uses the setting, or only later")  # fmt: skip
+        require(
+            not at,
+            f"configure() with {what} gives another result than building with it: {at}",
+            "configure() does not reach the part that uses the setting, or only later",
+        )
         at = first_difference(fresh, again)
-        require(not at, f"after an episode steered to {what}, reset() does not bring back the settings: {at}",
-                "remember the settings that it was built with, and put them into force in reset()")  # fmt: skip
+        require(
+            not at,
+            f"after an episode steered to {what}, reset() does not bring back the settings: {at}",
+            "remember the settings that it was built with, and put them into force in reset()",
+        )
         shown = shown or bool(first_difference(fresh, static))
     if not shown:
         raise NotApplicable(f"{names} change nothing on this scene, at either end of their ranges")
