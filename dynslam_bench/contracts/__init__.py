@@ -1,1 +1,72 @@
-"""What may be plugged in: trackers, segmenters, flows, features, filters, sequences, and what they exchange; light."""
+"""What may be plugged in, and what the plug-ins exchange; a plug-in imports from here, from settings and errors only.
+
+Importing this room loads neither torch nor OpenCV, numba, scipy, Gymnasium or Optuna.
+
+| plug-in | its spec | its heavy part | what it is given and gives |
+| --- | --- | --- | --- |
+| tracker | `TrackerSpec` | `Tracker` | `Frame`, `TrackerContext`; `TrackResult`, `Trajectory`, `MapOutputs` |
+| data set | `DatasetSpec` | `Sequence` | `Frame`, `FrameMasks`, `Camera` |
+| segmenter | `SegmenterSpec` | `Segmenter` | `Frame`, `SegmenterContext`; `Instances` |
+| flow | `FlowSpec` | `FlowEstimator` | grey images and points; `FlowResult` |
+| features | `FeatureSpec` | `FeatureExtractor` | a grey image; `Keypoints` |
+| filter | none: a tracker is composed of filters | `DynamicFilter` | `FrameBundle`, `FilterState`; `FilterResult` |
+
+`docs/plugins.md` shows one of each. The registries, which find plug-ins by id, lie in the rooms of their kind.
+
+Example:
+    >>> from dynslam_bench.contracts import TrackerSpec
+    >>> TrackerSpec("my-slam", "my_package.slam:MySlam", label="My SLAM").missing()
+    []
+"""
+
+from __future__ import annotations
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .checks import TrackerContractError
+from .features import FeatureExtractor, FeatureSpec, Keypoints
+from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need
+from .flow import FlowEstimator, FlowResult, FlowSpec
+from .map_outputs import KeyframeRecord, MapOutputs
+from .provenance import Provenance
+from .result import TrackingState, TrackResult
+from .segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
+from .sequence import DatasetSpec, Frame, FrameMasks, MaskSource, Sequence
+from .tracker import FinalizingTracker, Tracker, TrackerContext, TrackerSpec
+
+__all__ = [
+    "Camera",
+    "DatasetSpec",
+    "DynamicFilter",
+    "FeatureExtractor",
+    "FeatureSpec",
+    "FilterResult",
+    "FilterState",
+    "FinalizingTracker",
+    "FlowEstimator",
+    "FlowResult",
+    "FlowSpec",
+    "Frame",
+    "FrameBundle",
+    "FrameMasks",
+    "Instances",
+    "KeyframeRecord",
+    "KeyframeView",
+    "Keypoints",
+    "MapOutputs",
+    "MaskSource",
+    "Need",
+    "Provenance",
+    "Segmenter",
+    "SegmenterContext",
+    "SegmenterSpec",
+    "Sequence",
+    "TrackResult",
+    "Tracker",
+    "TrackerContext",
+    "TrackerContractError",
+    "TrackerSpec",
+    "TrackingState",
+    "Trajectory",
+]

@@ -1,9 +1,15 @@
-"""What the environment demands of a tracker's results, checked on every frame."""
+"""What is demanded of a tracker's results: written once, for the environment and for the conformance suite.
+
+A *fault* makes a run ``invalid``: the environment refuses the result. A *blemish* is refused by the conformance suite
+only: no number is wrong because of it.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
@@ -11,18 +17,77 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 
-from .result import TrackResult
+from .result import TrackingState, TrackResult
 from .sequence import Frame
 
-_STATES = ("initialising", "ok", "lost")
+STATES = get_args(TrackingState)
 
 
 class TrackerContractError(TrackerError):
     """A tracker returned something that is no valid result: its run counts as ``invalid``, not as crashed."""
 
 
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with something that was returned.
+
+    Attributes:
+        found: What was returned, to be read after "returned".
+        cause: The likely cause, or what to return instead.
+    """
+
+    found: str
+    cause: str = ""
+
+
+def faults(result: object, frame: Frame) -> Iterator[Fault]:
+    """What makes a result invalid: its type, its state, its pose, or a mask of another size than the image.
+
+    Lazily, the most basic first: what comes later takes for granted that the earlier is in order.
+    """
+    if not isinstance(result, TrackResult):
+        wrap = "track() returns a TrackResult; wrap a bare pose: TrackResult(T_world_cam, 'ok')"
+        yield Fault(f"a {type(result).__name__}, not a TrackResult", wrap)
+        return
+    if result.state not in STATES:
+        yield Fault(f"state {result.state!r}", f"expected one of {', '.join(STATES)}")
+    if result.T_world_cam is not None:
+        yield from _pose_faults(result.T_world_cam)
+    elif result.state == "ok":
+        yield Fault("state 'ok' without a pose", "a lost frame says 'lost'")
+    mask = result.dynamic_mask
+    if mask is not None and np.shape(mask) != frame.depth.shape:
+        yield Fault(f"a dynamic mask of shape {np.shape(mask)}, the image has {frame.depth.shape}")
+
+
+def blemishes(result: TrackResult) -> Iterator[Fault]:
+    """What is wrong with a result that has no faults, in values that no metric is made of."""
+    for name, values in (("stats", result.stats), ("timings", result.timings)):
+        bad = {key: value for key, value in values.items() if not _is_number(value)}
+        if bad:
+            yield Fault(f"{name} with values that are no finite numbers: {bad}")
+    if any(value < 0 for value in result.timings.values()):
+        yield Fault("a timing that is negative")
+    mask, xy, keep = result.dynamic_mask, result.keypoints_xy, result.keypoints_keep
+    if mask is not None and getattr(mask, "dtype", None) != np.bool_:
+        yield Fault(f"a dynamic mask of type {getattr(mask, 'dtype', type(mask).__name__)}, expected bool")
+    if xy is not None and (xy.ndim != 2 or xy.shape[1] != 2):
+        yield Fault(f"keypoints_xy of shape {xy.shape}, expected [N, 2]")
+    if keep is not None and (xy is None or keep.shape != (len(xy),)):
+        yield Fault("keypoints_keep that does not fit keypoints_xy")
+
+
+def trajectory_faults(trajectory: object) -> Iterator[Fault]:
+    """What makes a final trajectory invalid: its type, or a pose that is no rigid transformation."""
+    if not isinstance(trajectory, Trajectory):
+        yield Fault(f"a {type(trajectory).__name__}, not a Trajectory")
+        return
+    for pose in trajectory.T_world_cam:
+        yield from _pose_faults(pose)
+
+
 def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
-    """The result, if it keeps the contract; statistics that are not finite are left out.
+    """The result, if it has no faults; statistics that are not finite are left out.
 
     Args:
         result: What ``track`` returned.
@@ -30,52 +95,42 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
         tracker: The tracker's id, for the message.
 
     Raises:
-        TrackerContractError: Wrong type, unknown state, a pose that is not finite or no rigid transformation, state
-            ``ok`` without a pose, or a mask of another size than the image.
+        TrackerContractError: It has a fault.
     """
-    where = f"tracker '{tracker}' at frame {frame.index}"
-    if not isinstance(result, TrackResult):
-        raise TrackerContractError(f"{where} returned a {type(result).__name__}", "track() returns a TrackResult")
-    if result.state not in _STATES:
-        raise TrackerContractError(f"{where} returned state {result.state!r}", f"expected one of {', '.join(_STATES)}")
-    if result.T_world_cam is not None:
-        _check_pose(result.T_world_cam, where)
-    elif result.state == "ok":
-        raise TrackerContractError(f"{where} returned state 'ok' without a pose", "return 'lost' instead")
-    mask = result.dynamic_mask
-    if mask is not None and np.shape(mask) != frame.depth.shape:
-        raise TrackerContractError(
-            f"{where} returned a dynamic mask of shape {np.shape(mask)}, the image has {frame.depth.shape}"
-        )
+    for fault in faults(result, frame):
+        where = f"tracker '{tracker}' at frame {frame.index}"
+        raise TrackerContractError(f"{where} returned {fault.found}", fault.cause)
+    assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
     return replace(result, stats=stats)
 
 
 def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
-    """What ``finalize`` returned, if it is a trajectory of rigid transformations.
+    """What ``finalize`` returned, if it has no faults.
 
     Raises:
-        TrackerContractError: It is not.
+        TrackerContractError: It has one.
     """
-    where = f"tracker '{tracker}' in finalize()"
-    if not isinstance(trajectory, Trajectory):
-        raise TrackerContractError(f"{where} returned a {type(trajectory).__name__}, not a Trajectory")
-    for pose in trajectory.T_world_cam:
-        _check_pose(pose, where)
+    for fault in trajectory_faults(trajectory):
+        raise TrackerContractError(f"tracker '{tracker}' in finalize() returned {fault.found}", fault.cause)
+    assert isinstance(trajectory, Trajectory)
     return trajectory
 
 
-def _check_pose(pose: object, where: str) -> None:
+def _pose_faults(pose: object) -> Iterator[Fault]:
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
         found = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
-        raise TrackerContractError(f"{where} returned {found} as pose, expected a 4x4 matrix")
-    if not np.isfinite(pose).all():
+        yield Fault(f"{found} as pose, expected a 4x4 matrix")
+    elif not np.isfinite(pose).all():
         bad = int(np.count_nonzero(~np.isfinite(pose)))
-        raise TrackerContractError(f"{where} returned a pose with {bad} values that are not finite")
-    if not se3.is_pose(pose):
+        yield Fault(f"a pose with {bad} values that are not finite", "a solver diverged; say 'lost' instead")
+    elif not se3.is_pose(pose):
         rotation = pose[:3, :3]
         off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        raise TrackerContractError(
-            f"{where} returned a pose that is no rigid transformation: |R R^T - I| = {off:.2g}, "
-            f"det R = {float(np.linalg.det(rotation)):.4g}"
-        )
+        sizes = f"|R R^T - I| = {off:.2g}, det R = {float(np.linalg.det(rotation)):.4g}"
+        cause = "the rotation drifted from orthonormal, or world-to-camera scale is mixed in"
+        yield Fault(f"a pose that is no rigid transformation: {sizes}", cause)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)

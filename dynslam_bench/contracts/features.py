@@ -1,4 +1,4 @@
-"""Keypoints with binary descriptors, as arrays."""
+"""The contract of feature extractors: keypoints with binary descriptors, as arrays."""
 
 from __future__ import annotations
 
@@ -35,6 +35,26 @@ class Keypoints:
         return Keypoints(
             self.xy[index], self.octave[index], self.angle[index], self.response[index], self.descriptors[index]
         )
+
+
+@dataclass(frozen=True)
+class FeatureSpec:
+    """Announces a feature extractor; importable without torch or OpenCV.
+
+    Attributes:
+        id: Name that `FeatureSettings.extractor` takes.
+        entry_point: ``"module:factory"``; called as ``factory(settings: FeatureSettings)``, returns a
+            `FeatureExtractor`.
+        summary: One line.
+        descriptor_bytes: Length of a descriptor, packed bits compared by Hamming distance.
+        license: SPDX id or remark.
+    """
+
+    id: str
+    entry_point: str
+    summary: str = ""
+    descriptor_bytes: int = 32
+    license: str = ""
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""The contract of all dynamic feature filters, and the guard that they share."""
+"""The contract of all dynamic feature filters."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .features import Keypoints
 from .flow import FlowResult
+from .provenance import Provenance as Provenance
 from .segmenter import Instances
 
-Provenance = Literal["faithful-code", "faithful-paper", "inspired", "assumed"]
 Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
 
 
@@ -157,8 +156,8 @@ class DynamicFilter(Protocol):
 
     def configure(self, settings: Settings) -> None:
         """Put settings of one of its groups into force from the next frame on."""
-        objects = isinstance(settings, SegmentationSettings) and hasattr(self, "segmentation")
-        setattr(self, "segmentation" if objects else "settings", settings)
+        of_objects = hasattr(self, "segmentation") and isinstance(settings, type(self.segmentation))
+        setattr(self, "segmentation" if of_objects else "settings", settings)
 
     def reset(self, camera: Camera) -> None:
         """Forget everything: a new sequence begins."""

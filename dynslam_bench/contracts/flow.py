@@ -1,4 +1,4 @@
-"""The interface of all sparse flows: where do these points of one image lie in another?"""
+"""The contract of all sparse flows: where do these points of one image lie in another?"""
 
 from __future__ import annotations
 
@@ -25,6 +25,24 @@ class FlowResult:
     valid: NDArray[np.bool_]
     cost: NDArray[np.float32]
     stats: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FlowSpec:
+    """Announces an optical flow; importable without torch or OpenCV.
+
+    Attributes:
+        id: Name that `FlowSettings.method` (built in) or `FlowSettings.plugin` takes.
+        entry_point: ``"module:factory"``; called as ``factory(settings: FlowSettings, *, device: str, threads: int)``,
+            returns a `FlowEstimator`.
+        summary: One line.
+        license: SPDX id or remark.
+    """
+
+    id: str
+    entry_point: str
+    summary: str = ""
+    license: str = ""
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""What every segmenter returns, and the protocol of a segmenter."""
+"""The contract of segmenters: what announces them, what they are told and what they return."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from .sequence import Frame
+from .sequence import Frame, MaskSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,8 @@ class Instances:
     @classmethod
     def empty(cls, height: int, width: int) -> Instances:
         """No objects in an image of this size."""
-        return cls(
-            np.zeros((0, height, width), bool), np.zeros((0, 4), np.float32), (), np.zeros(0, np.float32)
-        )  # fmt: skip
+        masks, boxes = np.zeros((0, height, width), bool), np.zeros((0, 4), np.float32)
+        return cls(masks, boxes, (), np.zeros(0, np.float32))
 
     def of_classes(self, names: Collection[str]) -> Instances:
         """Only the objects of these classes."""
@@ -50,6 +49,47 @@ class Instances:
     def union(self) -> NDArray[np.bool_]:
         """Bool ``[H, W]``: pixels of any object."""
         return np.asarray(self.masks.any(axis=0))
+
+
+@dataclass(frozen=True)
+class SegmenterContext:
+    """What a segmenter is told of where it runs.
+
+    Attributes:
+        sequence_id: Id of the sequence.
+        masks: Exact masks of the sequence, for oracles only; None where there are none.
+        device: ``cpu`` or ``cuda:N``.
+        threads: Threads it may use.
+        argument: What stands after the colon of the source, e.g. a path.
+        floor: Least score of a detection that is returned; the settings' confidence is applied afterwards.
+    """
+
+    sequence_id: str = ""
+    masks: MaskSource | None = None
+    device: str = "cpu"
+    threads: int = 1
+    argument: str = ""
+    floor: float = 0.1
+
+
+@dataclass(frozen=True)
+class SegmenterSpec:
+    """Announces a segmenter; importable without torch or OpenCV.
+
+    Attributes:
+        id: For example ``embedded``; users write ``segmentation.source = plugin:ID`` for those that are not built in.
+        entry_point: ``"module:factory"``, called as ``factory(settings, context)`` with `SegmentationSettings` and
+            `SegmenterContext`; returns a `Segmenter`.
+        summary: One line.
+        license: Of code and weights, SPDX id or remark.
+        citation: What to cite.
+    """
+
+    id: str
+    entry_point: str
+    summary: str = ""
+    license: str = ""
+    citation: str = ""
 
 
 @runtime_checkable

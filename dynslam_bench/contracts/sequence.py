@@ -1,4 +1,4 @@
-"""What a sequence hands out: frames, ground truth, and masks where there are any."""
+"""The contract of data sets: what announces them, and what a sequence hands out."""
 
 from __future__ import annotations
 
@@ -102,3 +102,25 @@ class Sequence(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+
+@dataclass(frozen=True)
+class DatasetSpec:
+    """Announces a data set; importable without torch or OpenCV.
+
+    Attributes:
+        id: Prefix of its sequences: the data set ``mine`` serves ``mine/anything``.
+        entry_point: ``"module:factory"``, called as ``factory(sequence_id, data_root=Path)``; it returns a
+            `Sequence` or raises a `SequenceError`.
+        sequences: Ids that are listed; the factory may accept more.
+        summary: One line.
+        license: SPDX id or remark.
+        citation: What to cite.
+    """
+
+    id: str
+    entry_point: str
+    sequences: tuple[str, ...] = ()
+    summary: str = ""
+    license: str = ""
+    citation: str = ""

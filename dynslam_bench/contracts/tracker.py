@@ -13,10 +13,9 @@ from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
+from .provenance import Provenance as Provenance
 from .result import TrackResult
 from .sequence import Frame, MaskSource
-
-Provenance = Literal["own", "faithful-code", "faithful-paper", "inspired", "assumed", "external", "control"]
 
 
 @runtime_checkable
@@ -24,7 +23,7 @@ class Tracker(Protocol):
     """A SLAM or odometry system that is fed one frame at a time.
 
     Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last optimisation of the map),
-    ``map_outputs() -> slam.outputs.MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``)
+    ``map_outputs() -> MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``)
     and ``close()``.
     """
 

@@ -115,9 +115,15 @@ def tunable(
         when: Conditions on sibling fields (names relative to the model that holds this field).
         choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
-    annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online,
-                  "when": {key: list(values) for key, values in (when or {}).items()},
-                  "choices": list(choices or ())}  # fmt: skip
+    annotation: dict[str, Any] = {
+        "low": low,
+        "high": high,
+        "scale": scale,
+        "unit": unit,
+        "online": online,
+        "when": {key: list(values) for key, values in (when or {}).items()},
+        "choices": list(choices or ()),
+    }
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")
     accepted = limits if limits is not None else (low, high)

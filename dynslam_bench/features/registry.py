@@ -2,30 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from dynslam_bench.contracts.features import FeatureSpec
 from dynslam_bench.core.plugins import Registry
 
-
-@dataclass(frozen=True)
-class FeatureSpec:
-    """Announces a feature extractor; importable without torch or OpenCV.
-
-    Attributes:
-        id: Name that `FeatureSettings.extractor` takes.
-        entry_point: ``"module:factory"``; called as ``factory(settings: FeatureSettings)``, returns a
-            `FeatureExtractor`.
-        summary: One line.
-        descriptor_bytes: Length of a descriptor, packed bits compared by Hamming distance.
-        license: SPDX id or remark.
-    """
-
-    id: str
-    entry_point: str
-    summary: str = ""
-    descriptor_bytes: int = 32
-    license: str = ""
-
+__all__ = ["FEATURES", "ORB", "FeatureSpec"]
 
 ORB = FeatureSpec(
     id="orb",

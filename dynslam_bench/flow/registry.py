@@ -2,28 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from dynslam_bench.contracts.flow import FlowSpec
 from dynslam_bench.core.plugins import Registry
 
-
-@dataclass(frozen=True)
-class FlowSpec:
-    """Announces an optical flow; importable without torch or OpenCV.
-
-    Attributes:
-        id: Name that `FlowSettings.method` (built in) or `FlowSettings.plugin` takes.
-        entry_point: ``"module:factory"``; called as ``factory(settings: FlowSettings, *, device: str, threads: int)``,
-            returns an `contracts.flow.FlowEstimator`.
-        summary: One line.
-        license: SPDX id or remark.
-    """
-
-    id: str
-    entry_point: str
-    summary: str = ""
-    license: str = ""
-
+__all__ = ["FLOWS", "FlowSpec"]
 
 BUILT_IN = (
     FlowSpec(

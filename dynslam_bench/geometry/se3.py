@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -39,7 +43,7 @@ def log(pose: Array) -> Array:
     """Twists ``[..., 6]`` = (rho, phi) of poses ``[..., 4, 4]``; rotation angles in [0, pi]."""
     pose = np.asarray(pose, dtype=np.float64)
     flat = pose.reshape(-1, 4, 4)
-    phi = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
+    phi = _rotations().from_matrix(flat[:, :3, :3]).as_rotvec()
     theta = np.linalg.norm(phi, axis=-1)[:, None, None]
     small = theta < 1e-5
     safe = np.where(small, 1.0, theta)
@@ -67,7 +71,7 @@ def from_quaternion(translation: Array, quaternion: Array) -> Array:
     translation = np.asarray(translation, dtype=np.float64)
     quaternion = np.asarray(quaternion, dtype=np.float64)
     pose = np.zeros((*translation.shape[:-1], 4, 4))
-    rotation = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
+    rotation = _rotations().from_quat(quaternion.reshape(-1, 4)).as_matrix()
     pose[..., :3, :3] = rotation.reshape(*translation.shape[:-1], 3, 3)
     pose[..., :3, 3] = translation
     pose[..., 3, 3] = 1.0
@@ -77,14 +81,14 @@ def from_quaternion(translation: Array, quaternion: Array) -> Array:
 def to_quaternion(pose: Array) -> tuple[Array, Array]:
     """Translations ``[..., 3]`` and unit quaternions ``[..., 4]`` (qx qy qz qw, qw >= 0) of poses ``[..., 4, 4]``."""
     pose = np.asarray(pose, dtype=np.float64)
-    quaternion = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    quaternion = _rotations().from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
     return pose[..., :3, 3].copy(), quaternion.reshape(*pose.shape[:-2], 4)
 
 
 def rotation_angle(pose: Array) -> Array:
     """Rotation angles ``[...]`` in rad, in [0, pi]; accurate for small angles too."""
     pose = np.asarray(pose, dtype=np.float64)
-    angles = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).magnitude()
+    angles = _rotations().from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).magnitude()
     return np.asarray(angles).reshape(pose.shape[:-2])
 
 
@@ -105,3 +109,10 @@ def is_pose(pose: object, tolerance: float = 1e-4) -> bool:
         and np.linalg.det(rotation) > 0
         and np.abs(pose[3] - (0, 0, 0, 1)).max() < tolerance
     )
+
+
+def _rotations() -> type[Rotation]:
+    """The rotations of scipy, loaded when first needed: whoever only hands poses on does not pay for them."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation

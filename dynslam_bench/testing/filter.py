@@ -5,22 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView
-from dynslam_bench.contracts.flow import FlowResult
-from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts import (
+    DynamicFilter,
+    FilterResult,
+    FilterState,
+    FlowResult,
+    FrameBundle,
+    Instances,
+    KeyframeView,
+    Keypoints,
+    Need,
+    Provenance,
+)
 from dynslam_bench.geometry import se3
 
 from .report import ConformanceReport, require
 from .scenes import CornerSequence
 
-NEEDS = frozenset({"masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"})
+NEEDS: frozenset[str] = frozenset(get_args(Need))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,32 +139,26 @@ def check_result(result: FilterResult, frame: FrameBundle) -> None:
     """
     at, count = f"frame {frame.index}", len(frame)
     require(isinstance(result, FilterResult), f"{at}: apply() gave a {type(result).__name__}, not a FilterResult")
-    require(
-        result.keep.dtype == np.bool_ and result.keep.shape == (count,),
-        f"{at}: keep is {result.keep.dtype} {result.keep.shape}, expected bool {(count,)}",
-        "the verdict is on all keypoints, not only on those that earlier filters kept",
-    )
-    weight = result.weight
-    require(
-        weight.dtype == np.float32 and weight.shape == (count,),
-        f"{at}: weight is {weight.dtype} {weight.shape}, expected float32 {(count,)}",
-    )
+    keep, weight = result.keep, result.weight
+    found = f"{at}: keep is {keep.dtype} {keep.shape}, expected bool {(count,)}"
+    cause = "the verdict is on all keypoints, not only on those that earlier filters kept"
+    require(keep.dtype == np.bool_ and keep.shape == (count,), found, cause)
+    found = f"{at}: weight is {weight.dtype} {weight.shape}, expected float32 {(count,)}"
+    require(weight.dtype == np.float32 and weight.shape == (count,), found)
     require(((weight >= 0) & (weight <= 1)).all(), f"{at}: a weight lies outside [0, 1] or is no number")
     bad = {key: value for key, value in result.stats.items() if not np.isfinite(value)}
     require(not bad, f"{at}: stats hold values that are not finite: {bad}")
     mask = result.mask
     if mask is not None:
-        require(
-            mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
-            f"{at}: the mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}",
-        )
+        found = f"{at}: the mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}"
+        require(mask.dtype == np.bool_ and mask.shape == frame.depth.shape, found)
 
 
 def _declaration(candidate: DynamicFilter) -> None:
     require(isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}")
     unknown = set(candidate.needs) - NEEDS
     require(not unknown, f"unknown needs {sorted(unknown)}", f"known are {', '.join(sorted(NEEDS))}")
-    known = ("own", "faithful-code", "faithful-paper", "inspired", "assumed", "external", "control")
+    known = get_args(Provenance)
     require(candidate.provenance in known, f"provenance is {candidate.provenance!r}", f"one of {', '.join(known)}")
 
 

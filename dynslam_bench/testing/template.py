@@ -23,9 +23,8 @@ import time
 
 import numpy as np
 
+from dynslam_bench.contracts import TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.slam.result import TrackResult
-from dynslam_bench.trackers import TrackerSpec
 
 
 class @CLASS@Settings(Settings):

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from dynslam_bench.contracts.result import TrackResult
-from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
+from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
+from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
 from dynslam_bench.core.settings import Settings, apply_overrides, build
-from dynslam_bench.geometry.se3 import inverse, is_pose
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.se3 import inverse
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 from .report import ConformanceError, ConformanceReport, NotApplicable, require, still_alive
@@ -125,65 +123,29 @@ class _Runner:
         return results
 
 
-def check_result(result: TrackResult, frame: Frame) -> None:
+def check_result(result: object, frame: Frame) -> None:
     """Check what a tracker gave for one frame.
 
     Raises:
-        ConformanceError: Something in it breaks the contract.
+        ConformanceError: It has a fault or a blemish, see `contracts.checks`.
     """
     still_alive()
-    at = f"frame {frame.index}"
-    require(
-        isinstance(result, TrackResult),
-        f"{at}: track() gave a {type(result).__name__}, not a TrackResult",
-        "a bare pose has to be wrapped: TrackResult(T_world_cam, 'ok')",
-    )
-    require(result.state in ("initialising", "ok", "lost"), f"{at}: the state is {result.state!r}")
-    pose = result.T_world_cam
-    require(pose is not None or result.state != "ok", f"{at}: state 'ok' without a pose", "a lost frame says 'lost'")
-    if pose is not None:
-        shape = getattr(pose, "shape", type(pose).__name__)
-        require(
-            isinstance(pose, np.ndarray) and shape == (4, 4), f"{at}: the pose is {shape}, expected an array (4, 4)"
-        )
-        require(
-            np.isfinite(pose).all(),
-            f"{at}: the pose holds values that are not finite",
-            "a solver diverged; say 'lost' instead",
-        )
-        require(
-            is_pose(pose),
-            f"{at}: the pose is no rigid transformation (det {np.linalg.det(pose[:3, :3]):.4f})",
-            "the rotation drifted from orthonormal, or world-to-camera scale is mixed in",
-        )
-    for name, values in (("stats", result.stats), ("timings", result.timings)):
-        bad = {
-            key: value for key, value in values.items() if not isinstance(value, (int, float)) or not np.isfinite(value)
-        }
-        require(not bad, f"{at}: {name} hold values that are no finite numbers: {bad}")
-    require(all(value >= 0 for value in result.timings.values()), f"{at}: a timing is negative")
-    mask = result.dynamic_mask
-    if mask is not None:
-        require(
-            mask.dtype == np.bool_ and mask.shape == frame.depth.shape,
-            f"{at}: the dynamic mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}",
-        )
-    xy, keep = result.keypoints_xy, result.keypoints_keep
-    require(xy is None or (xy.ndim == 2 and xy.shape[1] == 2), f"{at}: keypoints_xy is no [N, 2] array")
-    require(
-        keep is None or (xy is not None and keep.shape == (len(xy),)), f"{at}: keypoints_keep does not fit keypoints_xy"
-    )
+    _none_of(faults(result, frame), f"frame {frame.index}: track() gave")
+    assert isinstance(result, TrackResult)
+    _none_of(blemishes(result), f"frame {frame.index}: track() gave")
+
+
+def _none_of(found: Iterable[Fault], doing: str) -> None:
+    for fault in found:
+        require(False, f"{doing} {fault.found}", fault.cause)
 
 
 def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> None:
     require(spec.id and spec.label, "the spec has no id or label")
     default = spec.settings()
     copy = build(spec.settings, json.loads(default.model_dump_json()))
-    require(
-        copy == default,
-        "the default settings change when they are written as JSON and read again",
-        "a field's type does not survive JSON",
-    )
+    changed = "the default settings change when they are written as JSON and read again"
+    require(copy == default, changed, "a field's type does not survive JSON")
     for name, overrides in spec.presets.items():
         try:
             apply_overrides(default, overrides)
@@ -203,11 +165,8 @@ def _construct(construct: Callable[[], Tracker]) -> None:
 def _results(run: _Runner) -> None:
     results = run.track(run.frames)
     states = [result.state for result in results]
-    require(
-        "ok" in states,
-        f"no frame of an easy scene was tracked: {states}",
-        "on this scene features abound and depth is exact",
-    )
+    cause = "on this scene features abound and depth is exact"
+    require("ok" in states, f"no frame of an easy scene was tracked: {states}", cause)
     _direction(run, results)
 
 
@@ -216,11 +175,8 @@ def _same_keys(run: _Runner) -> None:
     keys = set(results[0].stats)
     for frame, result in zip(run.frames, results, strict=True):
         changed = keys ^ set(result.stats)
-        require(
-            not changed,
-            f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}",
-            "the keys must be the same on every frame; use 0 where there is nothing to say",
-        )
+        found = f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}"
+        require(not changed, found, "the keys must be the same on every frame; use 0 where there is nothing to say")
 
 
 def _direction(run: _Runner, results: list[TrackResult]) -> None:
@@ -241,11 +197,8 @@ def _direction(run: _Runner, results: list[TrackResult]) -> None:
     found = (
         f"the camera moved {distance:.3f} m; the poses are off by {error:.3f} m, their inverses by {error_inverse:.3f}"
     )
-    require(
-        not (error > distance > 0 and error_inverse < 0.3 * error),
-        found,
-        "the poses are world-to-camera; return their inverse",
-    )
+    inverted = error > distance > 0 and error_inverse < 0.3 * error
+    require(not inverted, found, "the poses are world-to-camera; return their inverse")
 
 
 def _frames_left_alone(run: _Runner) -> None:
@@ -253,11 +206,8 @@ def _frames_left_alone(run: _Runner) -> None:
     before = [(frame.rgb.copy(), frame.depth.copy()) for frame in frames]
     run.track(frames)
     for frame, (rgb, depth) in zip(frames, before, strict=True):
-        require(
-            np.array_equal(frame.rgb, rgb) and np.array_equal(frame.depth, depth),
-            f"frame {frame.index} was changed by the tracker",
-            "draw on a copy",
-        )
+        same = np.array_equal(frame.rgb, rgb) and np.array_equal(frame.depth, depth)
+        require(same, f"frame {frame.index} was changed by the tracker", "draw on a copy")
 
 
 def _results_are_kept(run: _Runner) -> None:
@@ -270,11 +220,8 @@ def _results_are_kept(run: _Runner) -> None:
         copies.append(None if pose is None else pose.copy())
     _close(tracker)
     for index, (pose, copy) in enumerate(zip(given, copies, strict=True)):
-        require(
-            pose is None or copy is None or np.array_equal(pose, copy),
-            f"the pose of frame {index} changed later",
-            "return a copy of the state, not the state",
-        )
+        same = pose is None or copy is None or np.array_equal(pose, copy)
+        require(same, f"the pose of frame {index} changed later", "return a copy of the state, not the state")
 
 
 def _determinism(run: _Runner, deterministic: bool) -> None:
@@ -293,12 +240,8 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
     again = run.track(run.frames, tracker)
     _close(tracker)
     if deterministic:
-        _same(
-            first,
-            again,
-            "the same frames give other results after a second reset()",
-            "reset() leaves something of the sequence before: map, last pose, motion model, generator",
-        )
+        cause = "reset() leaves something of the sequence before: map, last pose, motion model, generator"
+        _same(first, again, "the same frames give other results after a second reset()", cause)
 
 
 def _hard_frame(run: _Runner, name: str) -> None:
@@ -346,16 +289,11 @@ def _finalize(run: _Runner) -> None:
 
 
 def _check_final(final: object, frames: list[Frame]) -> None:
-    require(isinstance(final, Trajectory), f"finalize() gave a {type(final).__name__}, not a Trajectory")
+    _none_of(trajectory_faults(final), "finalize() gave")
     assert isinstance(final, Trajectory)
     foreign = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
-    require(
-        not foreign,
-        f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}",
-        "stamps have to be those of the frames, unrounded",
-    )
-    bad = [stamp for stamp, pose in zip(final.timestamps, final.T_world_cam, strict=True) if not is_pose(pose)]
-    require(not bad, f"{len(bad)} poses of the final trajectory are no rigid transformations")
+    found = f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}"
+    require(not foreign, found, "stamps have to be those of the frames, unrounded")
 
 
 def _closing(run: _Runner) -> None:

@@ -93,11 +93,15 @@ def scribble(self, result, frame):
     ("tracker", "check", "words"),
     [
         (gave(lambda s, r, f: r.T_world_cam), "results", "gave a ndarray, not a TrackResult"),
-        (gave(lambda s, r, f: replace(r, state="fine")), "results", "the state is 'fine'"),
+        (gave(lambda s, r, f: replace(r, state="fine")), "results", "gave state 'fine'"),
         (gave(lambda s, r, f: replace(r, T_world_cam=None)), "results", "state 'ok' without a pose"),
         (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam * np.nan)), "results", "a solver diverged"),
         (gave(lambda s, r, f: replace(r, T_world_cam=skew(r.T_world_cam))), "results", "no rigid transformation"),
-        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam[:3])), "results", r"the pose is \(3, 4\)"),
+        (
+            gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam[:3])),
+            "results",
+            r"shape \(3, 4\) as pose",
+        ),
         (gave(lambda s, r, f: replace(r, T_world_cam=inverse(r.T_world_cam))), "results", "world-to-camera"),
         (gave(lambda s, r, f: replace(r, state="lost")), "results", "no frame of an easy scene was tracked"),
         (
@@ -106,8 +110,8 @@ def scribble(self, result, frame):
             "the same on every frame",
         ),
         (gave(lambda s, r, f: replace(r, stats={"n": float("nan")})), "results", "no finite numbers"),
-        (gave(lambda s, r, f: replace(r, timings={"t": -1.0})), "results", "a timing is negative"),
-        (gave(lambda s, r, f: replace(r, dynamic_mask=np.zeros((4, 4), bool))), "results", "the dynamic mask is"),
+        (gave(lambda s, r, f: replace(r, timings={"t": -1.0})), "results", "a timing that is negative"),
+        (gave(lambda s, r, f: replace(r, dynamic_mask=np.zeros((4, 4), bool))), "results", "a dynamic mask of shape"),
         (gave(scribble), "frames are left alone", "draw on a copy"),
         (Drifting, "results are kept", "the pose of frame 0 changed"),
         (

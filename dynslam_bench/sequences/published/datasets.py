@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
+from dynslam_bench.contracts.sequence import DatasetSpec
 from dynslam_bench.core.plugins import Registry
 
 from ..synthetic import SYNTHETIC_IDS
 from .entries import catalogue
 
+__all__ = ["DATASETS", "DatasetSpec"]
+
 OPENERS = "dynslam_bench.sequences.catalogue"
 """The module that opens sequences of the built-in data sets; loaded when the first one is opened."""
-
-
-@dataclass(frozen=True)
-class DatasetSpec:
-    """Announces a data set; importable without torch or OpenCV.
-
-    Attributes:
-        id: Prefix of its sequences: the data set ``mine`` serves ``mine/anything``.
-        entry_point: ``"module:factory"``, called as ``factory(sequence_id, data_root=Path)``; it returns a
-            `dynslam_bench.contracts.sequence.Sequence` or raises a `SequenceError`.
-        sequences: Ids that are listed; the factory may accept more.
-        summary: One line.
-        license: SPDX id or remark.
-        citation: What to cite.
-    """
-
-    id: str
-    entry_point: str
-    sequences: tuple[str, ...] = ()
-    summary: str = ""
-    license: str = ""
-    citation: str = ""
 
 
 def _builtin() -> Iterator[DatasetSpec]:
