@@ -36,9 +36,8 @@ class Instances:
     @classmethod
     def empty(cls, height: int, width: int) -> Instances:
         """No objects in an image of this size."""
-        return cls(
-            np.zeros((0, height, width), bool), np.zeros((0, 4), np.float32), (), np.zeros(0, np.float32)
-        )  # fmt: skip
+        boxes, scores = np.zeros((0, 4), np.float32), np.zeros(0, np.float32)
+        return cls(np.zeros((0, height, width), bool), boxes, (), scores)
 
     def of_classes(self, names: Collection[str]) -> Instances:
         """Only the objects of these classes."""
