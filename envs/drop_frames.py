@@ -59,9 +59,7 @@ class DropFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Frames dropped in this episode so far."""
         return sum(outcome.state == "dropped" for outcome in self._base.episode.outcomes)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:  # fmt: skip
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; the clock starts when frame 0 arrives."""
         outcome = self.env.reset(seed=seed, options=options)
         self._free_at = self._arrivals()[0] + self._busy_s()

@@ -27,9 +27,7 @@ class RecordTimings(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         self._base = slam_env_of(env, "RecordTimings")
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:  # fmt: skip
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset, with the times of frame 0 in ``info``."""
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, info | {"timings": self._last()}

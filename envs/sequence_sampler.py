@@ -44,9 +44,7 @@ class SequenceSampler(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._next = 0
         self._rng = gym.utils.seeding.np_random(None)[0]
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:  # fmt: skip
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode on the next sequence; ``options["sequence"]`` wins over the sampler.
 
         A seed also sets the sampler back: to the first sequence, or to the seed's first draw.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -12,8 +11,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.checks import check_result, check_trajectory
-from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.checks import check_trajectory
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
@@ -21,7 +19,7 @@ from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Settings, apply_overrides
 from dynslam_bench.core.steering import Steerable
-from dynslam_bench.evaluation.online import OnlineError, OnlineSample
+from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -31,6 +29,7 @@ from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_set
 from .control import ActionMap
 from .device import resolve_device
 from .episode import Episode, FrameOutcome
+from .info import frame_info
 from .metrics import episode_metrics
 from .observation import (
     ObservationContext,
@@ -40,10 +39,10 @@ from .observation import (
     stats_observation,
     stats_space,
 )
+from .one_frame import FrameTransform, track_one
 from .reward import RewardKind, reward_named
 from .source import Frames, open_frames, preprocessing_of
 
-FrameTransform = Callable[[Frame], Frame]
 Array = NDArray[np.float64]
 
 
@@ -119,19 +118,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         threads: int = 1,
         cache: bool = False,
     ) -> None:
-        EzPickle.__init__(
-            self, sequence, tracker, settings=settings, control=control, observation=observation, reward=reward,
-            protocol=protocol, frames=frames, stride=stride, lost_after=lost_after, device=device,
-            render_mode=render_mode, data_root=data_root, camera=camera, threads=threads, cache=cache,
-        )  # fmt: skip
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise SettingsError(f"unknown render mode '{render_mode}'", "known: rgb_array")
-        if observation not in ("stats", "rgbd"):
-            raise SettingsError(f"unknown observation '{observation}'", "known: stats, rgbd")
-        if lost_after is not None and lost_after < 1:
-            raise SettingsError(f"lost_after is {lost_after}", "give a number of frames >= 1, or None")
-        if threads < 1:
-            raise SettingsError(f"threads is {threads}", "give a number >= 1")
+        given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
+        _check_arguments(render_mode, observation, lost_after, threads)
         self.render_mode = render_mode
         self.protocol = get_protocol(protocol)
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
@@ -153,9 +142,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._use_sequence(sequence)
         segmentation_source(self.settings, self.sequence, fetch=False)
         self.action_space = self._actions.space()
-        self.observation_space = (
-            stats_space() if observation == "stats" else rgbd_space(self.sequence.camera)
-        )  # fmt: skip
+        self.observation_space = stats_space() if observation == "stats" else rgbd_space(self.sequence.camera)
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Any = None
@@ -199,9 +186,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:  # fmt: skip
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and track frame 0.
 
         Args:
@@ -223,7 +208,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._final = None
         self._canvas = None
         self._track_next(tracker)
-        return self._observe(), self._info()
+        return self._observe(), frame_info(self.episode.outcomes[-1])
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Track the next frame.
@@ -244,7 +229,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             stamps = self.sequence.timestamps[self.episode.next_index :]
             reward += sum(self._reward(self._errors.update(float(stamp), None, False)) for stamp in stamps)
         self.episode.over = terminated or truncated
-        info = self._info()
+        info = frame_info(self.episode.outcomes[-1])
         if self.episode.over:
             info["episode_metrics"] = self.episode_metrics()
             info["protocol"] = self.protocol.id
@@ -331,9 +316,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if "settings" in options:
             changes = options["settings"]
             before_settings = preprocessing_of(self.settings)
-            self._use_settings(
-                changes if isinstance(changes, Settings) else apply_overrides(self.settings, changes or {})
-            )  # fmt: skip
+            complete = isinstance(changes, Settings)
+            self._use_settings(changes if complete else apply_overrides(self.settings, changes or {}))
             if preprocessing_of(self.settings) != before_settings:
                 options = {"sequence": self._source, **options}
         if "sequence" in options:
@@ -377,26 +361,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _track_next(self, tracker: Tracker) -> None:
         index = self.episode.next_index
-        began = time.perf_counter()
-        frame = self.sequence[index]
-        for transform in self.frame_transforms:
-            frame = transform(frame)
-        read = time.perf_counter()
-        result = tracker.track(frame)
-        total = time.perf_counter() - read
-        result = check_result(result, frame, self.tracker_spec.id)
-        if result.stats.get("cached_stages"):  # the stages report what they cost without the cache
-            total = max(total, sum(result.timings.values()))
+        done = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
+        frame, result = self.frame, self.result = done.frame, done.result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose, pose is not None)
-        own = {"read": read - began, "total": total}
-        timings = own | {stage: float(seconds) for stage, seconds in result.timings.items() if stage not in own}
-        self.frame, self.result = frame, result
-        self.episode.add(
-            FrameOutcome(
-                index, frame.timestamp, result.state, pose, result.stats, timings, error, self._reward(error)
-            )
-        )  # fmt: skip
+        reward = self._reward(error)
+        timings = done.timings
+        self.episode.add(FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error, reward))
 
     def _observe(self) -> Any:
         outcomes = self.episode.outcomes
@@ -407,26 +378,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         make = stats_observation if self._observation == "stats" else rgbd_observation
         return make(self.frame, self.result, context)
 
-    def _info(self) -> dict[str, Any]:
-        outcome = self.episode.outcomes[-1]
-        info: dict[str, Any] = {
-            "frame_index": outcome.index,
-            "timestamp": float(outcome.timestamp),
-            "tracking_state": str(outcome.state),
-            "stats": dict(outcome.stats),
-        }
-        if outcome.T_world_cam is not None:
-            info["pose"] = np.concatenate(se3.to_quaternion(outcome.T_world_cam))
-        return info | _defined(outcome.error)
 
-
-def _defined(error: OnlineSample | None) -> dict[str, float]:
-    if error is None:
-        return {}
-    named = {
-        "pose_error_trans_m": error.trans_m,
-        "pose_error_rot_deg": error.rot_deg,
-        "frame_error_trans_m": error.frame_trans_m,
-        "frame_error_rot_deg": error.frame_rot_deg,
-    }
-    return {name: float(value) for name, value in named.items() if value is not None}
+def _check_arguments(render_mode: str | None, observation: str, lost_after: int | None, threads: int) -> None:
+    if render_mode not in (None, *SlamEnv.metadata["render_modes"]):
+        raise SettingsError(f"unknown render mode '{render_mode}'", "known: rgb_array")
+    if observation not in ("stats", "rgbd"):
+        raise SettingsError(f"unknown observation '{observation}'", "known: stats, rgbd")
+    if lost_after is not None and lost_after < 1:
+        raise SettingsError(f"lost_after is {lost_after}", "give a number of frames >= 1, or None")
+    if threads < 1:
+        raise SettingsError(f"threads is {threads}", "give a number >= 1")

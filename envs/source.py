@@ -32,10 +32,10 @@ def open_frames(
     """
     start, stop = parse_frames(frames if frames is None or isinstance(frames, str) else _pair(frames))
     if isinstance(sequence, str | Path):
+        part = (start, stop)
         return open_sequence(
-            sequence, data_root=data_root, camera=camera, frames=(start, stop), stride=stride,
-            preprocessing=preprocessing,
-        )  # fmt: skip
+            sequence, data_root=data_root, camera=camera, frames=part, stride=stride, preprocessing=preprocessing
+        )
     if stride < 1:
         raise SequenceError(f"stride is {stride}, expected at least 1")
     if preprocessing is not None and preprocessing.changes_images:

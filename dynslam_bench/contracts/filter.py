@@ -142,11 +142,13 @@ class DynamicFilter(Protocol):
         name: Short name, the prefix of its stats.
         needs: What must be there for it to work; `FilterState` fields that are None make it keep all.
         provenance: How closely it follows its source.
+        stats_names: Names of the stats that every verdict holds, with the ``dropped`` that `FilterResult.of` adds.
     """
 
     name: str
     needs: frozenset[Need]
     provenance: Provenance
+    stats_names: tuple[str, ...] = ("dropped",)
 
     @property
     def groups(self) -> tuple[str, ...]:

@@ -51,6 +51,9 @@ class FlowEstimator(Protocol):
 
     `prepare` does what depends on one image only (pyramids, descriptor maps), so that a frame that is first target
     and then reference is prepared once.
+
+    Optional attribute, found by name: ``stats_names``, the names of the stats that every result holds (see
+    `stats_names_of`).
     """
 
     def prepare(self, gray: NDArray[np.uint8]) -> Any:
@@ -80,3 +83,11 @@ class FlowEstimator(Protocol):
             never an exception or NaN in valid rows.
         """
         ...
+
+
+def stats_names_of(flow: FlowEstimator) -> tuple[str, ...]:
+    """The stats that a flow declares, in order; none if it declares nothing.
+
+    A pipeline shows these and no others: on frames without a previous one they are zero.
+    """
+    return tuple(getattr(flow, "stats_names", ()))

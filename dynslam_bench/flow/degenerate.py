@@ -13,6 +13,10 @@ FLAT_RANGE = 2
 """Grey levels between the darkest and the brightest pixel up to which an image has no texture."""
 
 
+STATS_NAMES = ("points", "valid", "evaluations", "degenerate")
+"""Of `flow_stats`."""
+
+
 def flow_stats(points: int, valid: int = 0, evaluations: int = 0, *, degenerate: bool = False) -> dict[str, float]:
     """The stats of all our flows, the same keys in every result.
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.flow import FlowResult
 
-from .degenerate import flow_stats, request, unseen_result, usable_points
+from .degenerate import STATS_NAMES, flow_stats, request, unseen_result, usable_points
 from .settings import FlowSettings
 
 _PRESETS = {
@@ -22,6 +22,8 @@ SMALLEST_SIDE = 32
 
 class DisFlow:
     """Dense flow, read at the points; the way back is a check; see `contracts.flow.FlowEstimator`."""
+
+    stats_names = STATS_NAMES
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         self.settings = settings or FlowSettings(method="dis")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.flow import FlowResult
 
-from .degenerate import flow_stats, request, usable_points
+from .degenerate import STATS_NAMES, flow_stats, request, usable_points
 from .settings import FlowSettings
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
@@ -17,6 +17,8 @@ _MIN_EIGENVALUE = 1e-4
 
 class LucasKanadeFlow:
     """Bouguet's pyramidal tracker, with its way back as a check; see `contracts.flow.FlowEstimator`."""
+
+    stats_names = STATS_NAMES
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         self.settings = settings or FlowSettings(method="lucas-kanade")

@@ -5,10 +5,8 @@ Every published system runs this file; it differs only in its list of filters, i
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
@@ -16,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.features import FeatureExtractor
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
-from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
+from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
+from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.contracts.map_outputs import MapOutputs
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
@@ -26,14 +24,17 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.core.steering import Steerable, Steering
-from dynslam_bench.culling.guard import GuardSettings, restore_starved
+from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.culling.tools.ego_motion import refine_prediction
-from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .backend import RgbdBackend
+from .culled import Culled, settled
+from .flow_to_previous import flow_to_previous
 from .frame_checks import check_frame, own_depth
+from .localisation.localised import Localised
+from .stage_clock import CachedStage, StageClock
 
 KEYFRAMES_SHOWN = 20
 """How many of the latest keyframes filters may look at (DynaSLAM's window)."""
@@ -53,11 +54,21 @@ class MaskStage(Protocol):
         ...
 
 
-class CachedStage(Protocol):
-    """A stage that may have answered its last call from the stage cache."""
+@dataclass(frozen=True, eq=False)
+class Remembered:
+    """What the next frame is told of this one.
 
-    hit: bool
-    saved_s: float
+    Attributes:
+        frame: The frame.
+        keep: bool ``[N]``, which of its keypoints were kept.
+        image: Its image as the flow prepared it; None if no flow ran.
+        T_world_cam: Its pose, None if it was not tracked.
+    """
+
+    frame: FrameBundle
+    keep: NDArray[np.bool_]
+    image: Any
+    T_world_cam: NDArray[np.float64] | None
 
 
 class SlamPipeline:
@@ -108,15 +119,13 @@ class SlamPipeline:
         self._camera = camera
         self._seed = derive_seed(rng)
         self._backend.reset(camera, seed=self._seed)
-        self._no_flow_stats = {} if self._flow is None else _keys_of(self._flow, camera)
         for each in (*self._filters, self._masks):
             if each is not None and hasattr(each, "reset"):
                 each.reset(camera)
-        self._previous: FrameBundle | None = None
-        self._previous_keep: NDArray[np.bool_] | None = None
-        self._previous_image: Any = None
-        self._previous_pose: NDArray[np.float64] | None = None
+        self._previous: Remembered | None = None
         self._keyframe_due = True
+
+    # ------------------------------------------------------------------ one frame
 
     def track(self, frame: Frame) -> TrackResult:
         """Track one frame.
@@ -126,67 +135,111 @@ class SlamPipeline:
         """
         camera = self._begun("track")
         check_frame(frame, camera)
-        clock = _Clock(self._cached)
+        clock = StageClock(self._cached)
+        seen = self._see(frame, camera, clock)
+        culled = self._cull(seen, self._known(seen, camera), clock)
+        located = self._backend.track(seen, culled.keep, culled.weight)
+        self._remember(seen, culled, located)
+        return TrackResult(
+            located.T_world_cam,
+            located.state,
+            self._stats(seen, culled, located),
+            clock.seconds | dict(located.timings),
+            culled.mask,
+            seen.keypoints.xy,
+            culled.keep,
+        )
+
+    def _see(self, frame: Frame, camera: Camera, clock: StageClock) -> FrameBundle:
+        """Keypoints with their depth, and the objects in the image."""
         with clock("features"):
-            bundle = self._extract(frame, camera)
+            seen = self._extract(frame, camera)
         with clock("segmentation"):
             if self._masks is not None:
-                bundle.instances = self._masks.masks_for(frame, bundle.gray, keyframe=self._keyframe_due)
-        state = FilterState(
+                seen.instances = self._masks.masks_for(frame, seen.gray, keyframe=self._keyframe_due)
+        return seen
+
+    def _extract(self, frame: Frame, camera: Camera) -> FrameBundle:
+        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        keypoints = self._extractor.extract(gray)
+        depth = own_depth(frame.depth)
+        column, row = np.rint(keypoints.xy).astype(np.intp).T
+        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
+        xy = camera.undistort_points(keypoints.xy)
+        return FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z)
+
+    def _known(self, seen: FrameBundle, camera: Camera) -> FilterState:
+        """What the filters may know beside the frame: the past, the prediction and the map."""
+        before = self._previous
+        return FilterState(
             camera=camera,
-            keep=np.ones(len(bundle), dtype=bool),
-            previous=self._previous,
-            previous_keep=self._previous_keep,
-            T_world_prev=self._previous_pose,
-            T_world_pred=self._backend.predict(frame.timestamp),
-            motion_covariance=self._backend.motion_covariance(frame.timestamp),
+            keep=np.ones(len(seen), dtype=bool),
+            previous=None if before is None else before.frame,
+            previous_keep=None if before is None else before.keep,
+            T_world_prev=None if before is None else before.T_world_cam,
+            T_world_pred=self._backend.predict(seen.timestamp),
+            motion_covariance=self._backend.motion_covariance(seen.timestamp),
             keyframes=self._backend.keyframe_views(KEYFRAMES_SHOWN),
             map_points=self._backend.map_points(),
-            seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
+            seed=int(stream(self._seed, "frame", seen.index).integers(2**63)),
         )
-        image = None
-        verdicts: list[FilterResult] = []
-        stats: dict[str, float] = {"keypoints": float(len(bundle))}
+
+    def _cull(self, seen: FrameBundle, state: FilterState, clock: StageClock) -> Culled:
+        """The filters' verdicts in order; the flow is found for what is left when the first filter needs it."""
+        image: Any = None
+        verdicts = []
         for each in self._filters:
-            if "flow" in each.needs and image is None and self._flow is not None:
-                with clock("flow"):
-                    image = self._flow.prepare(bundle.gray)
-                    state.flow = self._flow_to_previous(bundle, image, state)
-                with clock("ego_motion"):
-                    state.T_world_pred = refine_prediction(bundle, state)
+            if "flow" in each.needs and image is None:
+                image = self._find_flow(seen, state, clock)
             with clock(f"culling_{each.name}"):
-                verdict = each.apply(bundle, state)
-            verdicts.append(verdict)
+                verdict = each.apply(seen, state)
             state.keep = state.keep & verdict.keep
-            stats |= {f"{each.name}_{key}": value for key, value in verdict.stats.items()}
-        keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard)
-        if not verdicts:
-            keep = state.keep
-        used = verdicts[: len(verdicts) - undone]
-        mask = _union([verdict.mask for verdict in used])
-        weight = np.prod([verdict.weight for verdict in used], axis=0, dtype=np.float32) if used else None
-        result = self._backend.track(bundle, keep, np.ones(len(bundle), np.float32) if weight is None else weight, mask)
-        stats |= {
-            "culled": float(np.count_nonzero(~keep)),
-            "guard_undone": float(undone),
-            "mask_fraction": 0.0 if mask is None else float(mask.mean()),
+            verdicts.append((each.name, verdict))
+        return settled(state, verdicts, image, self._guard)
+
+    def _find_flow(self, seen: FrameBundle, state: FilterState, clock: StageClock) -> Any:
+        """Put the flow to the previous image, and the pose that it predicts, into `state`; the prepared image."""
+        assert self._flow is not None  # the constructor has seen to it
+        with clock("flow"):
+            image = self._flow.prepare(seen.gray)
+            if (before := self._previous) is not None:
+                other = self._flow.prepare(before.frame.gray) if before.image is None else before.image
+                state.flow = flow_to_previous(self._flow, image, other, seen, state)
+        with clock("ego_motion"):
+            state.T_world_pred = refine_prediction(seen, state)
+        return image
+
+    def _remember(self, seen: FrameBundle, culled: Culled, located: Localised) -> None:
+        tracked = located.state == "ok"
+        self._previous = Remembered(seen, culled.keep, culled.image, located.T_world_cam if tracked else None)
+        self._keyframe_due = not tracked or located.keyframe
+
+    def _stats(self, seen: FrameBundle, culled: Culled, located: Localised) -> dict[str, float]:
+        """The frame's diagnostics, the same keys on every frame."""
+        stats = {
+            "keypoints": float(len(seen)),
+            "culled": float(np.count_nonzero(~culled.keep)),
+            "matches": float(located.matches),
+            "inliers": float(located.inliers),
+            "map_points": float(located.map_points),
+            "keyframes": float(located.keyframes),
+            "keyframe": float(located.keyframe),
+            "residual_px": located.residual_px,
+            "mask_fraction": 0.0 if culled.mask is None else float(culled.mask.mean()),
+            "relocalised": float(located.relocalised),
+            **culled.stats,
+            "guard_undone": float(culled.undone),
         }
         if self._flow is not None:
-            found = self._no_flow_stats if state.flow is None else state.flow.stats
-            stats |= {f"flow_{key}": value for key, value in found.items()}
+            found = {} if culled.flow is None else culled.flow.stats
+            stats |= {f"flow_{name}": found.get(name, 0.0) for name in stats_names_of(self._flow)}
         if self._masks is not None:
             stats["segmented"] = float(self._masks.segmented)
         if self._cached:
             stats["cached_stages"] = float(sum(stage.hit for stage in self._cached.values()))
-        self._remember(bundle, keep, image, result)
-        return replace(
-            result,
-            stats=dict(result.stats) | stats,
-            timings=clock.seconds | dict(result.timings),
-            dynamic_mask=mask,
-            keypoints_xy=bundle.keypoints.xy,
-            keypoints_keep=keep,
-        )
+        return stats
+
+    # ------------------------------------------------------------------ afterwards, and steering
 
     def finalize(self) -> Trajectory:
         """The trajectory after the last optimisation of the map.
@@ -237,95 +290,7 @@ class SlamPipeline:
             raise TrackerError(f"{method}() was called before reset()")
         return self._camera
 
-    def _extract(self, frame: Frame, camera: Camera) -> FrameBundle:
-        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        keypoints = self._extractor.extract(gray)
-        depth = own_depth(frame.depth)
-        column, row = np.rint(keypoints.xy).astype(np.intp).T
-        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
-        return FrameBundle(
-            index=frame.index, timestamp=frame.timestamp, rgb=frame.rgb, gray=gray, depth=depth,
-            keypoints=keypoints, xy=camera.undistort_points(keypoints.xy), z=z,
-        )  # fmt: skip
-
-    def _flow_to_previous(self, bundle: FrameBundle, image: Any, state: FilterState) -> FlowResult | None:
-        """Flow of the keypoints that are left, in rows of all keypoints; None on the first frame."""
-        assert self._flow is not None
-        if self._previous is None:
-            return None
-        if self._previous_image is None:
-            self._previous_image = self._flow.prepare(self._previous.gray)
-        chosen = np.flatnonzero(state.keep)
-        result = self._flow.track(
-            image, self._previous_image, bundle.keypoints.xy[chosen],
-            guess=predicted_flow(bundle, state)[chosen], seed=state.seed,
-        )  # fmt: skip
-        xy = np.full((len(bundle), 2), np.nan, np.float32)
-        valid = np.zeros(len(bundle), bool)
-        cost = np.full(len(bundle), np.inf, np.float32)
-        xy[chosen], valid[chosen], cost[chosen] = result.xy, result.valid, result.cost
-        return FlowResult(xy, valid, cost, result.stats)
-
-    def _remember(self, bundle: FrameBundle, keep: NDArray[np.bool_], image: Any, result: TrackResult) -> None:
-        self._previous, self._previous_keep, self._previous_image = bundle, keep, image
-        self._previous_pose = result.T_world_cam if result.state == "ok" else None
-        self._keyframe_due = result.state != "ok" or result.stats.get("keyframe", 0.0) > 0
-
-
-def predicted_flow(bundle: FrameBundle, state: FilterState) -> NDArray[np.float32]:
-    """Where the motion model expects this frame's keypoints in the previous image.
-
-    Args:
-        bundle: The current frame.
-        state: With the previous pose and the predicted one.
-
-    Returns:
-        Raw pixels float32 ``[N, 2]``; NaN where depth or a prediction is missing.
-    """
-    guess = np.full((len(bundle), 2), np.nan, np.float32)
-    known = bundle.z > 0
-    if state.T_world_prev is None or state.T_world_pred is None or not known.any():
-        return guess
-    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-    points = se3.transform(T_prev_cur, state.camera.unproject(bundle.xy[known], bundle.z[known]))
-    ahead = points[:, 2] > 0.05
-    pixels = np.full((len(points), 2), np.nan)
-    pixels[ahead] = state.camera.distort_points(state.camera.project(points[ahead]))
-    guess[known] = pixels
-    return guess
-
-
-def _keys_of(flow: FlowEstimator, camera: Camera) -> dict[str, float]:
-    """The flow's stats at zero, for frames without a previous one."""
-    blank = flow.prepare(np.zeros((camera.height, camera.width), np.uint8))
-    return dict.fromkeys(flow.track(blank, blank, np.full((1, 2), 100.0, np.float32)).stats, 0.0)
-
 
 def groups_of(each: DynamicFilter) -> tuple[str, ...]:
     """The groups of settings that a filter takes; its name alone where it does not say."""
     return tuple(getattr(each, "groups", (each.name,)))
-
-
-def _union(masks: list[NDArray[np.bool_] | None]) -> NDArray[np.bool_] | None:
-    given = [mask for mask in masks if mask is not None]
-    return np.logical_or.reduce(given) if given else None
-
-
-class _Clock:
-    """Wall-clock seconds by stage, in the order of first use; what the stage cache saved is added again."""
-
-    def __init__(self, cached: Mapping[str, CachedStage]) -> None:
-        self.seconds: dict[str, float] = {}
-        self._cached = cached
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        cached = self._cached.get(stage)
-        if cached is not None:
-            cached.hit, cached.saved_s = False, 0.0
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed

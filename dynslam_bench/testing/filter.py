@@ -64,6 +64,7 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
         return report
     if not report.run("results", lambda: _apply_all(construct(), scene.steps)):
         return report
+    report.run("declared stats", lambda: _declared_stats(construct(), scene.steps))
     report.run("same keys on every frame", lambda: _keys(construct(), scene.steps))
     report.run("frames are left alone", lambda: _left_alone(construct(), scene.steps))
     report.run("determinism", lambda: _determinism(construct, scene.steps))
@@ -174,6 +175,13 @@ def _run(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]])
 
 def _apply_all(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
     _run(candidate, steps)
+
+
+def _declared_stats(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
+    declared = set(getattr(candidate, "stats_names", DynamicFilter.stats_names))
+    for result, (frame, _) in zip(_run(candidate, steps), steps, strict=True):
+        for found, wrong in (("not declared", set(result.stats) - declared), ("missing", declared - set(result.stats))):
+            require(not wrong, f"frame {frame.index}: stats {found}: {sorted(wrong)}", "list them all in stats_names")
 
 
 def _keys(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:

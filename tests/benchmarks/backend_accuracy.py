@@ -105,7 +105,7 @@ def run(frames, camera, masks, settings, first, extractor):
         pixel = np.rint(features.keypoints.xy).astype(int).reshape(-1, 2)
         keep = np.ones(len(features), bool) if masks is None else ~masks[i][pixel[:, 1], pixel[:, 0]]
         start, cpu = time.perf_counter(), time.process_time()
-        results.append(backend.track(features, keep, np.ones(len(features), np.float32), None))
+        results.append(backend.track(features, keep, np.ones(len(features), np.float32)))
         times.append((spent + time.perf_counter() - start, cpu_spent + time.process_time() - cpu))
     return results, np.array(times), backend
 
@@ -145,7 +145,7 @@ def main() -> int:
                     ate_mm(stamps, positions, sequence.ground_truth),
                     ate_mm(final.timestamps, final.positions, sequence.ground_truth),
                     len(ok) / len(results),
-                    sum(result.stats["keyframe"] for result in results),
+                    sum(result.keyframe for result in results),
                 )
             )
             times.append(1e3 * spent)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.flow import FlowEstimator
+from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
 from dynslam_bench.flow.build_flow import build_flow
@@ -340,6 +340,7 @@ def test_methods_behind_the_interface(method):
     target, matrix = moved(image, 1.01, 1, 4, -3)
     points = grid()
     result = flow.track(flow.prepare(image), flow.prepare(target), points)
+    assert stats_names_of(flow) == tuple(result.stats)
     truth = points @ matrix[:, :2].T + matrix[:, 2]
     error = np.hypot(*(result.xy - truth).T)
     assert result.xy.dtype == np.float32 and result.valid.dtype == bool and result.cost.dtype == np.float32

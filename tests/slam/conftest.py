@@ -78,7 +78,7 @@ def track_all(backend, frames, keeps=None):
     results = []
     for i, frame in enumerate(frames):
         keep = np.ones(len(frame), bool) if keeps is None else keeps[i]
-        results.append(backend.track(frame, keep, np.ones(len(frame), np.float32), None))
+        results.append(backend.track(frame, keep, np.ones(len(frame), np.float32)))
     return results
 
 

@@ -250,6 +250,8 @@ class Keep:
             {"apply": lambda s, f, st: replace(FilterResult.of(np.ones(len(f), bool)), stats={f"n{f.index}": 1.0})},
             "other keys",
         ),
+        ({"stats_names": ("dropped", "tested")}, r"stats missing: \['tested'\]"),
+        ({"stats_names": ()}, r"stats not declared: \['dropped'\]"),
         ({"apply": lambda s, f, st: FilterResult.of(np.random.rand(len(f)) > 0.5)}, "state.seed"),  # noqa: NPY002
     ],
 )

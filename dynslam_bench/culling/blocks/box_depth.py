@@ -26,6 +26,7 @@ class BoxDepthFilter(DynamicFilter):
     name = "box_depth"
     needs: frozenset[Need] = frozenset({"boxes", "depth"})
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "objects", "ignored", "mask_fraction")
 
     def __init__(self, settings: BoxDepthSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

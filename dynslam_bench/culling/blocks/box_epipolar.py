@@ -29,6 +29,7 @@ class BoxEpipolarFilter(DynamicFilter):
     name = "box_epipolar"
     needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
     provenance: Provenance = "faithful-paper"
+    stats_names = ("dropped", "matches", "lost", "failed", "f_asked", "f_judged", "boxes")
 
     def __init__(self, settings: BoxEpipolarSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

@@ -33,6 +33,7 @@ class BoxFilter(DynamicFilter):
     name = "boxes"
     needs: frozenset[Need] = frozenset({"boxes"})
     provenance: Provenance = "faithful-code"
+    stats_names = ("dropped", "objects")
 
     def __init__(self, settings: BoxSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

@@ -25,6 +25,7 @@ class ClassRuleFilter(DynamicFilter):
     name = "class_rule"
     needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "on_people", "on_movable", "moving_objects", "lost", "f_asked", "f_judged")
 
     def __init__(self, settings: ClassRuleSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

@@ -40,6 +40,7 @@ class CorrelationFilter(DynamicFilter):
     name = "correlation"
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
 
     def __init__(self, settings: CorrelationSettings) -> None:
         self.settings = settings

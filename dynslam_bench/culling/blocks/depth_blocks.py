@@ -28,6 +28,7 @@ class DepthBlockFilter(DynamicFilter):
     name = "depth_blocks"
     needs: frozenset[Need] = frozenset({"masks", "depth"})
     provenance: Provenance = "faithful-paper"
+    stats_names = ("dropped", "objects", "touched", "blocks", "mask_fraction")
 
     def __init__(self, settings: DepthBlockSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

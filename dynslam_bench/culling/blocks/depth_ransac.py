@@ -63,6 +63,7 @@ class DepthRansacFilter(DynamicFilter):
     name = "depth_ransac"
     needs: frozenset[Need] = frozenset({"boxes", "depth"})
     provenance: Provenance = "faithful-paper"
+    stats_names = ("dropped", "objects", "in_boxes")
 
     def __init__(self, settings: DepthRansacSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

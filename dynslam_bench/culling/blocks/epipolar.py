@@ -72,6 +72,18 @@ class EpipolarFilter(DynamicFilter):
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
     provenance: Provenance = "faithful-paper"
+    stats_names = (
+        "dropped",
+        "matches",
+        "inliers",
+        "parallax_px",
+        "homography_share",
+        "contradiction",
+        "degenerate",
+        "moving_objects",
+        "f_asked",
+        "f_judged",
+    )
 
     def __init__(self, settings: EpipolarSettings) -> None:
         self.settings = settings

@@ -35,6 +35,7 @@ class FreeSpaceFilter(DynamicFilter):
     name = "free_space"
     needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
     provenance: Provenance = "assumed"
+    stats_names = ("dropped", "asked", "tested")
 
     def __init__(self, settings: FreeSpaceSettings) -> None:
         self.settings = settings

@@ -37,6 +37,7 @@ class ProbabilityFilter(DynamicFilter):
     name = "probability"
     needs: frozenset[Need] = frozenset({"masks", "flow", "previous"})
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "linked", "mean_probability")
 
     def __init__(
         self, settings: ProbabilitySettings, segmentation: SegmentationSettings, evidence: str = "masks"

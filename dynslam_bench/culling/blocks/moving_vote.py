@@ -36,6 +36,7 @@ class MovingVoteFilter(DynamicFilter):
     name = "moving_vote"
     needs: frozenset[Need] = frozenset({"masks", "previous"})
     provenance: Provenance = "faithful-code"
+    stats_names = ("dropped", "corners", "moving", "votes", "f_judged", "f_asked")
 
     def __init__(self, settings: MovingVoteSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

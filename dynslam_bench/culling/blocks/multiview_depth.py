@@ -43,6 +43,7 @@ class MultiViewFilter(DynamicFilter):
     name = "multiview"
     needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
     provenance: Provenance = "faithful-code"
+    stats_names = ("dropped", "references", "seeds", "mask_fraction")
 
     def __init__(self, settings: MultiViewSettings) -> None:
         self.settings = settings

@@ -35,6 +35,7 @@ class ReseedingFilter(DynamicFilter):
     name = "reseeding"
     needs: frozenset[Need] = frozenset()
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "static", "reseeded", "missing")
 
     def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:
         self.settings = settings

@@ -35,6 +35,7 @@ class ResidualFilter(DynamicFilter):
     name = "residual"
     needs: frozenset[Need] = frozenset({"depth", "previous", "prediction", "masks"})
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "clusters", "moving", "mask_fraction")
 
     def __init__(self, settings: ResidualSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

@@ -24,6 +24,7 @@ class RigidMotionFilter(DynamicFilter):
     name = "motion"
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
     provenance: Provenance = "assumed"
+    stats_names = ("dropped", "tested", "failed")
 
     def __init__(self, settings: RigidMotionSettings) -> None:
         self.settings = settings

@@ -28,6 +28,7 @@ class SemanticFilter(DynamicFilter):
     name = "semantic"
     needs: frozenset[Need] = frozenset({"masks"})
     provenance: Provenance = "faithful-code"
+    stats_names = ("dropped", "objects", "mask_fraction")
     group = "segmentation"
 
     def __init__(self, settings: SegmentationSettings) -> None:

@@ -25,6 +25,7 @@ class TemplateFilter(DynamicFilter):
     name = "template"
     needs: frozenset[Need] = frozenset({"boxes", "depth", "prediction", "previous"})
     provenance: Provenance = "inspired"
+    stats_names = ("dropped", "in_boxes", "tested", "median_zncc")
 
     def __init__(self, settings: TemplateSettings, segmentation: SegmentationSettings) -> None:
         self.settings = settings

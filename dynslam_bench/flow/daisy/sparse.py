@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.flow import FlowResult
 
-from ..degenerate import empty_result, flow_stats, says_nothing, unseen_result, usable_points
+from ..degenerate import STATS_NAMES, empty_result, flow_stats, says_nothing, unseen_result, usable_points
 from ..kernels.buffers import BufferPool
 from ..kernels.workers import run_stripes
 from ..searches.common import SearchState, new_state
@@ -56,6 +56,8 @@ class SparseDaisyFlow:
         settings: How.
         threads: Over which rows and points are divided; the result does not depend on it.
     """
+
+    stats_names = STATS_NAMES
 
     def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
         self.settings = settings or FlowSettings()

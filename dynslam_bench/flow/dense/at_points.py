@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.flow import FlowResult
 
 from ..daisy.maps import OrientationMaps
-from ..degenerate import flow_stats, request, usable_points
+from ..degenerate import STATS_NAMES, flow_stats, request, usable_points
 from ..settings import FlowSettings
 from .labels import DenseDaisyFlow
 
@@ -24,6 +24,8 @@ class DensePointFlow:
         settings: How.
         threads: Over which regions are divided; the result does not depend on it.
     """
+
+    stats_names = STATS_NAMES
 
     def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
         self._dense = DenseDaisyFlow(settings or FlowSettings(mode="dense"), threads=threads)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernels import motion as motion_kernels
 from .kernels import raycast as kernels
 from .kernels import sensors
 from .scenes.parts import QUAD, ROUND_CONE
@@ -109,10 +110,10 @@ class Renderer:
         if settings.color.shutter > 0:
             flow = np.empty((height, width, 2), np.float32)
             motion = self._motion(now, after)
-            self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
+            self._rows(lambda a, b: motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
             sharp, color = color, np.empty_like(color)
             blurred = color
-            self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, flow, settings.color.shutter, blurred))
+            self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, flow, settings.color.shutter, blurred))
         rgb = self._expose(index, color)
         ids = np.append(scene.instance, 0).astype(np.uint8)
         return Rendered(rgb, raw, depth, ids[hit >> 3])
@@ -126,7 +127,7 @@ class Renderer:
         hit, depth = self._geometry(now, self._tiles(now))
         flow = np.empty((*hit.shape, 2), np.float32)
         motion = self._motion(now, after)
-        self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
+        self._rows(lambda a, b: motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
         return flow
 
     def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

@@ -99,10 +99,8 @@ def _options(query: str | None, text: str) -> dict[str, int]:
     for option in [] if query is None else query.split("&"):
         key, separator, value = option.partition("=")
         if key not in _OPTIONS or not separator:
-            raise SequenceError(
-                f"'{text}' has an unknown option '{option}'",
-                "write ?frames=N, ?noise=SEED or both, as ?frames=N&noise=SEED",
-            )
+            forms = "write ?frames=N, ?noise=SEED or both, as ?frames=N&noise=SEED"
+            raise SequenceError(f"'{text}' has an unknown option '{option}'", forms)
         if key in found:
             raise SequenceError(f"'{text}' names {key} twice", "leave one out")
         found[key] = _integer(value, key, text, *_OPTIONS[key])

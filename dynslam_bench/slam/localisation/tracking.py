@@ -164,6 +164,52 @@ def solve(world: Map, seen: Observations, matches: Matches, T_cam_world: Array, 
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class MapFit:
+    """A pose by all that the frame sees of the map.
+
+    Attributes:
+        matches: The matches it was fitted to.
+        estimate: The pose.
+        inliers: bool ``[M]``, which matches fit it and show a map point.
+        in_view: Slots of the map points that should be in view.
+    """
+
+    matches: Matches
+    estimate: PoseEstimate
+    inliers: NDArray[np.bool_]
+    in_view: Slots
+
+    @property
+    def count(self) -> int:
+        """Number of inliers."""
+        return int(np.count_nonzero(self.inliers))
+
+
+def fit_to_map(
+    world: Map, seen: Observations, known: Matches, T_cam_world: Array, settings: TrackingSettings
+) -> MapFit:
+    """Look for the rest of the local map around a first pose, and fit the pose to all of it.
+
+    Points that only the last frame's depth gives count no more where there are enough of the map's own.
+
+    Args:
+        world: The map.
+        seen: The frame's features.
+        known: Matches of the first pose.
+        T_cam_world: The first pose.
+        settings: Radius, descriptor distances and number of inliers.
+    """
+    candidates = local_points(world, known, settings.local_map)
+    found, in_view = match_map(world, seen, T_cam_world, known, candidates, settings)
+    matches = known.joined(found)
+    mapped = matches.select(matches.point >= 0)
+    if len(mapped) >= 2 * settings.min_inliers:
+        matches = mapped
+    estimate = solve(world, seen, matches, T_cam_world)
+    return MapFit(matches, estimate, estimate.inliers & (matches.point >= 0), in_view)
+
+
 def local_points(world: Map, known: Matches, mode: str, limit: int = 80) -> Slots:
     """Which map points to look for: all, or those that keyframes see which share points with the known matches."""
     if mode == "all":

@@ -94,7 +94,8 @@ def compose(
     from dynslam_bench.segmentation.cached import cache_segmenter
     from dynslam_bench.segmentation.masks.schedule import build_mask_stage
     from dynslam_bench.slam.backend import RgbdBackend
-    from dynslam_bench.slam.pipeline import CachedStage, SlamPipeline
+    from dynslam_bench.slam.pipeline import SlamPipeline
+    from dynslam_bench.slam.stage_clock import CachedStage
 
     cache = None if context.cache is None else StageCache(Path(context.cache))
     cached: dict[str, CachedStage] = {}

@@ -1,4 +1,4 @@
-"""The numba kernels of the renderer: ray casting over tile bins, edge antialiasing, flow and motion blur.
+"""The numba kernels of the renderer: ray casting over tile bins and edge antialiasing.
 
 Geometry is a list of primitives, each a unit shape in a local frame that is rigid up to a scale per axis (so that a
 round cone may have an elliptic section). A ray leaves the camera centre with direction
@@ -14,105 +14,15 @@ import math
 import numpy as np
 
 from ..scenes.parts import BOX, ROUND_CONE
-from .compiled import kernel
+from .compiled import Intrinsics, Ints, Reals, kernel
+from .hits import NEAR_M, hit_box, hit_round_cone
 
 TILE = 8
-_NEAR = 0.05
 _PER_TURN = 1.0 / (2.0 * math.pi)
 
 
 @kernel
-def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz, t_max):  # type: ignore[no-untyped-def]
-    """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side)."""
-    t_in, t_out, face = -1.0e30, 1.0e30, -1
-    if abs(dx) < 1e-12:
-        if abs(ox) > hx:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dx
-        a, b = (-hx - ox) * inv, (hx - ox) * inv
-        side = 0
-        if a > b:
-            a, b, side = b, a, 1
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if abs(dy) < 1e-12:
-        if abs(oy) > hy:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dy
-        a, b = (-hy - oy) * inv, (hy - oy) * inv
-        side = 2
-        if a > b:
-            a, b, side = b, a, 3
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if abs(dz) < 1e-12:
-        if abs(oz) > hz:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dz
-        a, b = (-hz - oz) * inv, (hz - oz) * inv
-        side = 4
-        if a > b:
-            a, b, side = b, a, 5
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if t_in > t_out or t_in < _NEAR or t_in >= t_max:
-        return 1e30, -1
-    return t_in, face
-
-
-@kernel
-def _hit_round_cone(ox, oy, oz, dx, dy, dz, h, r1, r2, t_max):  # type: ignore[no-untyped-def]
-    """Nearest hit with the hull of a sphere r1 at the origin and a sphere r2 at (0, 0, h); h = 0 is a sphere."""
-    best = 1e30
-    dd = dx * dx + dy * dy + dz * dz
-    # Bounding sphere first: most rays of a tile miss.
-    cz = oz - 0.5 * h
-    rb = 0.5 * h + max(r1, r2)
-    b = ox * dx + oy * dy + cz * dz
-    if b * b < dd * (ox * ox + oy * oy + cz * cz - rb * rb):
-        return best
-    if h > 0.0:
-        # Tangent cone: sin(alpha) = s = (r1 - r2) / h; its side is x^2 + y^2 = (r1 - s z)^2 / (1 - s^2).
-        s = (r1 - r2) / h
-        k = 1.0 / (1.0 - s * s)
-        w, wd = r1 - s * oz, -s * dz
-        a2 = dx * dx + dy * dy - k * wd * wd
-        b2 = ox * dx + oy * dy - k * w * wd
-        c2 = ox * ox + oy * oy - k * w * w
-        disc = b2 * b2 - a2 * c2
-        if disc >= 0.0 and abs(a2) > 1e-14:
-            t = (-b2 - math.sqrt(disc)) / a2
-            z = oz + t * dz
-            # The side counts between the two circles of tangency.
-            if _NEAR < t and r1 * s <= z <= h + r2 * s and r1 - s * z > 0.0:
-                best = t
-    b = ox * dx + oy * dy + oz * dz
-    disc = b * b - dd * (ox * ox + oy * oy + oz * oz - r1 * r1)
-    if disc >= 0.0:
-        t = (-b - math.sqrt(disc)) / dd
-        if _NEAR < t < best:
-            best = t
-    if h > 0.0:
-        cz = oz - h
-        b = ox * dx + oy * dy + cz * dz
-        disc = b * b - dd * (ox * ox + oy * oy + cz * cz - r2 * r2)
-        if disc >= 0.0:
-            t = (-b - math.sqrt(disc)) / dd
-            if _NEAR < t < best:
-                best = t
-    if best >= t_max:
-        return 1e30
-    return best
-
-
-@kernel
-def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
+def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Ints, Ints]:
     """Primitive lists of all tiles, nearest bound first.
 
     Args:
@@ -149,7 +59,10 @@ def bin_tiles(order, boxes, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, hit, depth):  # type: ignore[no-untyped-def]
+def cast_geometry(
+    row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
+    local: Reals, shape: Reals, hit: Ints, depth: Reals,
+) -> None:  # fmt: skip
     """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows.
 
     What the neighbouring pixel of the tile saw is tried first, which bounds the search.
@@ -180,16 +93,16 @@ def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, l
                 ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
                 a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
                 if kind[q] == ROUND_CONE:
-                    t_hit = _hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                    t_hit = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
                     if t_hit < t:
                         t, p, face = t_hit, q, 0
                 elif kind[q] == BOX:
-                    t_hit, face_hit = _hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                    t_hit, face_hit = hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
                     if face_hit >= 0:
                         t, p, face = t_hit, q, face_hit
                 else:
                     t_hit = -oz / dz
-                    if _NEAR < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
+                    if NEAR_M < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
                         t, p, face = t_hit, q, 4
             last = p
             hit[row, column] = 8 * p + face if p >= 0 else -1
@@ -197,10 +110,11 @@ def cast_geometry(row0, row1, intrinsics, tiles_x, start, members, zmin, kind, l
 
 
 @kernel
-def shade_pixels(  # type: ignore[no-untyped-def]
-    row0, row1, intrinsics, tiles_x, start, members, zmin, kind, local, shape, texture, uv, tint, facets, atlas,
-    level_offset, log2_size, lights, hit, depth, jitter, color, cosine
-):  # fmt: skip
+def shade_pixels(
+    row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
+    local: Reals, shape: Reals, texture: Ints, uv: Reals, tint: Reals, facets: Reals, atlas: Reals, level_offset: Ints,
+    log2_size: Ints, lights: Reals, hit: Ints, depth: Reals, jitter: Reals, color: Reals, cosine: Reals,
+) -> None:  # fmt: skip
     """Colour (float32, 0-255 scale) and cosine of incidence of rows.
 
     ``facets`` [P, 6, 5] holds for each face its unit normal in the camera frame (boxes and quads), its light, and for
@@ -248,16 +162,16 @@ def shade_pixels(  # type: ignore[no-untyped-def]
                         ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
                         a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
                         if kind[q] == ROUND_CONE:
-                            t_hit = _hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                            t_hit = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
                             if t_hit < t:
                                 t, p, face = t_hit, q, 0
                         elif kind[q] == BOX:
-                            t_hit, face_hit = _hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
+                            t_hit, face_hit = hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
                             if face_hit >= 0:
                                 t, p, face = t_hit, q, face_hit
                         else:
                             t_hit = -oz / dz
-                            if _NEAR < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
+                            if NEAR_M < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
                                 t, p, face = t_hit, q, 4
                     seen = 8 * p + face if p >= 0 else -1
                     if seen == key:
@@ -347,73 +261,3 @@ def shade_pixels(  # type: ignore[no-untyped-def]
                 red, green, blue = own_red, own_green, own_blue
             color[row, column, 0], color[row, column, 1], color[row, column, 2] = red, green, blue
             cosine[row, column] = own_cos
-
-
-@kernel
-def flow_field(row0, row1, intrinsics, hit, depth, motion, flow):  # type: ignore[no-untyped-def]
-    """Exact optical flow (float32 pixels) of rows.
-
-    ``motion`` [P, 12] takes a point in this camera's frame, fixed to primitive p, to the other camera's frame; where
-    nothing is hit or the point leaves the front of the camera, the flow is NaN.
-    """
-    fx, fy, cx, cy = intrinsics
-    width = hit.shape[1]
-    for row in range(row0, row1):
-        for column in range(width):
-            key = hit[row, column]
-            if key < 0:
-                flow[row, column, 0] = flow[row, column, 1] = np.nan
-                continue
-            p = key >> 3
-            z = depth[row, column]
-            x, y = (column - cx) / fx * z, (row - cy) / fy * z
-            w = motion[p, 8] * x + motion[p, 9] * y + motion[p, 10] * z + motion[p, 11]
-            if w <= _NEAR:
-                flow[row, column, 0] = flow[row, column, 1] = np.nan
-                continue
-            u = motion[p, 0] * x + motion[p, 1] * y + motion[p, 2] * z + motion[p, 3]
-            v = motion[p, 4] * x + motion[p, 5] * y + motion[p, 6] * z + motion[p, 7]
-            flow[row, column, 0] = u / w * fx + cx - column
-            flow[row, column, 1] = v / w * fy + cy - row
-
-
-@kernel
-def motion_blur(row0, row1, color, flow, shutter, blurred):  # type: ignore[no-untyped-def]
-    """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred."""
-    height, width = color.shape[:2]
-    for row in range(row0, row1):
-        for column in range(width):
-            du, dv = flow[row, column, 0] * shutter, flow[row, column, 1] * shutter
-            length = math.sqrt(du * du + dv * dv)
-            if not length > 0.75:
-                for ch in range(3):
-                    blurred[row, column, ch] = color[row, column, ch]
-                continue
-            taps = min(int(length) + 2, 16)
-            r, g, b = 0.0, 0.0, 0.0
-            for i in range(taps):
-                s = (i + 0.5) / taps - 0.5
-                x = min(max(column + s * du, 0.0), width - 1.001)
-                y = min(max(row + s * dv, 0.0), height - 1.001)
-                x0, y0 = int(x), int(y)
-                ax, ay = x - x0, y - y0
-                w00, w10, w01, w11 = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
-                r += (
-                    w00 * color[y0, x0, 0]
-                    + w10 * color[y0, x0 + 1, 0]
-                    + w01 * color[y0 + 1, x0, 0]
-                    + w11 * color[y0 + 1, x0 + 1, 0]
-                )
-                g += (
-                    w00 * color[y0, x0, 1]
-                    + w10 * color[y0, x0 + 1, 1]
-                    + w01 * color[y0 + 1, x0, 1]
-                    + w11 * color[y0 + 1, x0 + 1, 1]
-                )
-                b += (
-                    w00 * color[y0, x0, 2]
-                    + w10 * color[y0, x0 + 1, 2]
-                    + w01 * color[y0 + 1, x0, 2]
-                    + w11 * color[y0 + 1, x0 + 1, 2]
-                )
-            blurred[row, column, 0], blurred[row, column, 1], blurred[row, column, 2] = r / taps, g / taps, b / taps

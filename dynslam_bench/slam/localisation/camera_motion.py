@@ -1,0 +1,82 @@
+"""Where the camera should be now: the motion model's state from frame to frame, and what stamps it believes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..settings import MotionSettings
+from .motion_model import MotionState, pose_covariance
+from .tracking import Tracked
+
+Array = NDArray[np.float64]
+
+FIRST_INTERVAL_S = 1 / 30
+"""Taken for the interval between frames until one was measured."""
+JITTER = 0.1
+"""Share of the last interval by which a stamp may be off and still count as regular: the noise of stamping."""
+
+
+class CameraMotion:
+    """The motion model while tracking; it knows nothing at the start and after a lost frame."""
+
+    def __init__(self) -> None:
+        self._state: MotionState | None = None
+        self._interval = FIRST_INTERVAL_S
+
+    def forget(self) -> None:
+        """The camera was lost: nothing is known of its motion."""
+        self._state = None
+
+    def relocated(self, T_cam_world: Array) -> None:
+        """The same motion at another pose, as after bundle adjustment."""
+        if self._state is not None:
+            self._state = self._state.relocated(T_cam_world)
+
+    def regular(self, last: Tracked, timestamp: float) -> float:
+        """The stamp, or where it is within `JITTER` of a regular one, the regular one."""
+        due = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval
+        return last.timestamp + self._interval if due else timestamp
+
+    def predicted(self, last: Tracked, timestamp: float, settings: MotionSettings) -> Array:
+        """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
+        ahead = self._ahead(last, timestamp, settings)
+        return last.T_cam_world if ahead is None else ahead.T_cam_world
+
+    def covariance(self, last: Tracked, timestamp: float, settings: MotionSettings) -> Array | None:
+        """How far the motion since the last frame may be from the predicted one (`MotionState.motion_covariance`)."""
+        dt = self._known_gap(last, timestamp, settings)
+        return None if dt is None or self._state is None else self._state.motion_covariance(dt, settings)
+
+    def filtered(
+        self, last: Tracked, timestamp: float, measured: Array, information: Array, settings: MotionSettings
+    ) -> Array:
+        """Weigh the image's pose against the motion model, and remember the motion.
+
+        Args:
+            last: The last tracked frame.
+            timestamp: The stamp of the new one, seconds.
+            measured: Its world-to-camera pose by the image.
+            information: Gauss-Newton matrix of that pose.
+            settings: Of the motion model.
+
+        Returns:
+            World-to-camera pose; the measured one where nothing is known of the gap, or the filter is off.
+        """
+        covariance = pose_covariance(measured, information, settings.inflation)
+        dt, ahead = self._known_gap(last, timestamp, settings), self._ahead(last, timestamp, settings)
+        if dt is None or ahead is None:
+            self._state = MotionState.at(measured, covariance)
+            return measured
+        self._interval = dt
+        self._state = ahead.updated(measured, covariance)
+        return self._state.T_cam_world if settings.filter else measured
+
+    def _ahead(self, last: Tracked, timestamp: float, settings: MotionSettings) -> MotionState | None:
+        dt = self._known_gap(last, timestamp, settings)
+        return None if dt is None or self._state is None else self._state.predicted(dt, settings)
+
+    def _known_gap(self, last: Tracked, timestamp: float, settings: MotionSettings) -> float | None:
+        """Seconds since the last frame; None where the motion model says nothing of them."""
+        dt = timestamp - last.timestamp
+        return dt if self._state is not None and 0 < dt <= settings.max_gap_s else None

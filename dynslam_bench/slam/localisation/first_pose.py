@@ -1,0 +1,121 @@
+"""A first pose of a frame: from the last frame; else from the reference keyframe, or any keyframe.
+
+All functions are pure: they read the map and never change it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.seeding import stream
+
+from ..mapping.map import Map
+from ..places import most_alike
+from ..settings import BackendSettings, TrackingSettings
+from .observation import Observations
+from .pose import PoseEstimate
+from .relocalisation import Relocalised, locate
+from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
+
+Array = NDArray[np.float64]
+
+TRUSTED_FIRST = 50
+TRUSTED_SHARE = 0.5
+"""Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
+WIDE = 2.5
+"""Factor on the search window where the narrow one gave no trusted pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Before:
+    """What is known of the camera when a frame comes.
+
+    Attributes:
+        last: The last tracked frame.
+        prediction: World-to-camera pose that the motion model expects.
+        reference: Slot of the keyframe that shares most points with the last tracked frame.
+        tracked: Whether the frame before this one was tracked.
+        close_m: Depth below which a feature's depth is trusted, metres.
+        seed: Of the sequence's random draws.
+        frame: Index of the frame that comes.
+    """
+
+    last: Tracked
+    prediction: Array
+    reference: int
+    tracked: bool
+    close_m: float
+    seed: int
+    frame: int
+
+
+@dataclass(frozen=True, eq=False)
+class FirstPose:
+    """A pose that enough matches agree on.
+
+    Attributes:
+        T_cam_world: World-to-camera pose.
+        matches: The matches that agree.
+        relocalised: Whether they are a keyframe's, not the last frame's.
+    """
+
+    T_cam_world: Array
+    matches: Matches
+    relocalised: bool
+
+
+def first_pose(world: Map, seen: Observations, before: Before, settings: BackendSettings) -> FirstPose | None:
+    """A first pose, or None.
+
+    The last frame's map points come first. Where they are few, what only its depth gives helps as well. A pose that few
+    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'.
+
+    Args:
+        world: The map.
+        seen: The frame's features.
+        before: What is known of the camera.
+        settings: Of tracking and relocalisation.
+    """
+    best: tuple[Matches, PoseEstimate] | None = None
+    for matches in _from_last_frame(world, seen, before, settings.tracking):
+        estimate = solve(world, seen, matches, before.prediction, rounds=3)
+        if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
+            best = matches, estimate
+        if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
+            return _agreed(*best, relocalised=False)
+    found = _from_keyframes(world, seen, before, settings, ENOUGH_FIRST // 2 if best is None else best[1].count + 1)
+    if found is not None:
+        return _agreed(found.matches, found.estimate, relocalised=True)
+    return None if best is None else _agreed(*best, relocalised=False)
+
+
+def _agreed(matches: Matches, estimate: PoseEstimate, *, relocalised: bool) -> FirstPose:
+    return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), relocalised)
+
+
+def _from_last_frame(world: Map, seen: Observations, before: Before, s: TrackingSettings) -> Iterator[Matches]:
+    """Matches with the last frame, each search wider than the one before; those with too few are left out."""
+    searches = ((1.0, 0.0, s.mapped_matches), (1.0, before.close_m, ENOUGH_FIRST), (WIDE, before.close_m, ENOUGH_FIRST))
+    for widen, depth_m, enough in searches:
+        radius = widen * s.radius_px
+        matches = match_last_frame(world, before.last, seen, before.prediction, radius, depth_m, s.max_distance)
+        if len(matches) >= enough:
+            yield matches
+
+
+def _from_keyframes(
+    world: Map, seen: Observations, before: Before, settings: BackendSettings, least: int
+) -> Relocalised | None:
+    """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike."""
+    s = settings.relocalisation
+    rng = stream(before.seed, "relocalisation", before.frame)
+    for alike in (False, True) if before.tracked else (True,):
+        keyframes = most_alike(world, world.keyframes, seen, s.searched) if alike else [before.reference]
+        found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
+        if found is not None and found.estimate.count >= least:
+            return found
+    return None

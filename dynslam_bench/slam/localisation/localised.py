@@ -1,0 +1,41 @@
+"""What the back end says of one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.result import TrackingState
+
+
+@dataclass(frozen=True, eq=False)
+class Localised:
+    """Where a frame was taken, and what finding that out did to the map.
+
+    Attributes:
+        T_world_cam: Camera-to-world pose ``[4, 4]``, after bundle adjustment if the frame became a keyframe; a
+            prediction while `state` is ``lost``; None before the first keyframe.
+        state: ``ok`` (tracked), ``lost`` or ``initialising``.
+        matches: Features matched with points of the map or of the last frame.
+        inliers: How many of them fit the pose and observe a map point.
+        residual_px: Median reprojection error of the inliers in pixels of octave 0; 0 where there is no pose.
+        relocalised: Whether the first pose came from keyframes' descriptors.
+        keyframe: Whether the frame became a keyframe.
+        map_points: Points in the map afterwards.
+        keyframes: Keyframes in the map afterwards.
+        timings: Seconds of ``tracking``, ``mapping`` and ``bundle_adjustment``.
+    """
+
+    T_world_cam: NDArray[np.float64] | None
+    state: TrackingState
+    matches: int
+    inliers: int
+    residual_px: float
+    relocalised: bool
+    keyframe: bool
+    map_points: int
+    keyframes: int
+    timings: Mapping[str, float]

@@ -1,0 +1,96 @@
+"""What filters, files and the sheet may see of the map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import KeyframeView
+from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
+
+from .mapping.map import Map
+
+Array = NDArray[np.float64]
+
+
+class MapViews:
+    """Keyframes and points of a map, looked up anew only after a keyframe: nothing else changes the map.
+
+    Args:
+        world: The map.
+    """
+
+    def __init__(self, world: Map) -> None:
+        self._world = world
+        self._depth_images: dict[int, NDArray[np.float32]] = {}
+        self._views: dict[int, tuple[KeyframeView, ...]] = {}
+        self._cloud: tuple[NDArray[np.int64], Array] | None = None
+
+    def renew(self, slot: int, depth: NDArray[np.float32], dropped: list[int], depth_images: int) -> None:
+        """A keyframe was made.
+
+        Args:
+            slot: Its slot.
+            depth: Its depth image.
+            dropped: Slots of the keyframes that went.
+            depth_images: How many of the newest keyframes keep their depth image.
+        """
+        self._views.clear()
+        self._cloud = None
+        for gone in dropped:
+            self._depth_images.pop(gone, None)
+        self._depth_images[slot] = depth
+        for old in self._world.keyframes[: -depth_images or None].tolist():
+            self._depth_images.pop(old, None)
+
+    def keyframes(self, limit: int) -> tuple[KeyframeView, ...]:
+        """The newest keyframes, newest first, at most `limit`."""
+        if limit not in self._views:
+            newest = self._world.keyframes[::-1][: max(limit, 0)].tolist()
+            self._views[limit] = tuple(self._keyframe(slot) for slot in newest)
+        return self._views[limit]
+
+    def points(self) -> tuple[NDArray[np.int64], Array]:
+        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points."""
+        if self._cloud is None:
+            points = self._world.points
+            self._cloud = self._world.id[points], self._world.position[points]
+        return self._cloud
+
+    def outputs(self) -> MapOutputs:
+        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
+        world, points = self._world, self._world.points
+        records = tuple(_record(world, slot) for slot in world.keyframes.tolist())
+        observations = world.n_obs[points].astype(np.int64)
+        return MapOutputs(records, world.id[points], world.position[points], world.rgb[points], observations)
+
+    def _keyframe(self, slot: int) -> KeyframeView:
+        world, n = self._world, int(self._world.kf_count[slot])
+        keypoints = Keypoints(
+            world.kf_raw[slot, :n],
+            world.kf_octave[slot, :n].astype(np.int32),
+            world.kf_angle[slot, :n],
+            world.kf_response[slot, :n],
+            world.kf_words[slot, :n].view(np.uint8),
+        )
+        return KeyframeView(
+            world.T_world_cam(slot),
+            keypoints,
+            world.kf_xy[slot, :n],
+            world.kf_z[slot, :n],
+            self._depth_images.get(slot),
+            float(world.kf_stamp[slot]),
+        )
+
+
+def _record(world: Map, slot: int) -> KeyframeRecord:
+    count = int(world.kf_count[slot])
+    return KeyframeRecord(
+        int(world.kf_id[slot]),
+        int(world.kf_frame[slot]),
+        float(world.kf_stamp[slot]),
+        world.T_world_cam(slot),
+        count,
+        int(np.count_nonzero(world.kf_point[slot, :count] >= 0)),
+    )
