@@ -84,9 +84,12 @@ def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
         if line.startswith("| `")
     }
     assert verdicts == {
-        "`dynaslam-n`": "match", "`orb-slam2`": "match", "`yolo-slam`": "**miss**", "`dai-slam`": "match",
+        "`dynaslam-n`": "match",
+        "`orb-slam2`": "match",
+        "`yolo-slam`": "**miss**",
+        "`dai-slam`": "match",
         "`cfp-slam`": "match (not counted)",
-    }  # fmt: skip
+    }
     assert "match: 3 of 4 (75 %; the bar is 75 %)" in text
     assert "yolo-slam on walking_rpy: survives" in text and "published fails" in text
 
