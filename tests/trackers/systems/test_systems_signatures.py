@@ -13,7 +13,7 @@ import pytest
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.runs import RunSpec, RunStore, run_many
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[2]
 
 
 def load(name: str, path: Path):
