@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from dynslam_bench.contracts.features import Keypoints
@@ -12,8 +13,14 @@ from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+SEGMENTATION = SegmentationSettings(dilation_px=0)
+SIDEWAYS = se3.exp(np.array([0.06, 0.02, 0.03, 0.01, -0.01, 0.005]))
+ROTATION = se3.exp(np.array([0, 0, 0, 0.02, 0.03, 0.01]))
+ACROSS = np.array([0.0, 0.05, 0.0])
+BOX = (200, 100, 331, 381)
 
 
 @dataclass
@@ -26,9 +33,12 @@ class Scene:
 def keypoints(xy: np.ndarray) -> Keypoints:
     n = len(xy)
     return Keypoints(
-        xy.astype(np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32), np.ones(n, np.float32),
+        xy.astype(np.float32),
+        np.zeros(n, np.int32),
+        np.zeros(n, np.float32),
+        np.ones(n, np.float32),
         np.zeros((n, 32), np.uint8),
-    )  # fmt: skip
+    )
 
 
 def bundle(xy: np.ndarray, z: np.ndarray, depth: np.ndarray, timestamp: float) -> FrameBundle:
@@ -54,9 +64,14 @@ def on_top(xy: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def scene(
-    T_prev_cur: np.ndarray, *, n_static: int = 300, n_moving: int = 60, motion: np.ndarray | None = None,
-    noise_px: float = 0.1, seed: int = 0,
-) -> Scene:  # fmt: skip
+    T_prev_cur: np.ndarray,
+    *,
+    n_static: int = 300,
+    n_moving: int = 60,
+    motion: np.ndarray | None = None,
+    noise_px: float = 0.1,
+    seed: int = 0,
+) -> Scene:
     """Static points all over the image, moving ones inside x 200..330, y 100..380 at 1.5 m.
 
     `motion` [3] is the moving points' displacement between the frames, metres, in the previous camera frame.
@@ -97,3 +112,24 @@ def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> In
 def keyframe(T_world_cam: np.ndarray, depth: np.ndarray, timestamp: float) -> KeyframeView:
     empty = np.zeros((0, 2))
     return KeyframeView(T_world_cam, keypoints(empty), empty, np.zeros(0, np.float32), depth, timestamp)
+
+
+def on_box(made: Scene) -> np.ndarray:
+    x, y = made.frame.keypoints.xy.T
+    return (x >= BOX[0]) & (x < BOX[2]) & (y >= BOX[1]) & (y < BOX[3])
+
+
+def texture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 255, (480, 640), dtype=np.uint8)
+    blurred = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return cv2.normalize(blurred, None, 0, 255, cv2.NORM_MINMAX)
+
+
+def moved_patch(shift: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two images of a textured wall; the box's texture has moved by `shift` pixels downwards in the second."""
+    wall, person = texture(0), texture(1)
+    x0, y0, x1, y1 = BOX
+    before, after = wall.copy(), wall.copy()
+    before[y0:y1, x0:x1] = person[y0:y1, x0:x1]
+    after[y0:y1, x0:x1] = person[y0 - shift : y1 - shift, x0:x1]
+    return before, after

@@ -35,5 +35,5 @@ def shown(page: str) -> str:
 
 if __name__ == "__main__":
     sys.path.insert(0, str(ROOT))
-    text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(text.replace(shown(text), table()), encoding="utf-8")
+    rows, text = table(), PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(text.replace(shown(text), rows), encoding="utf-8")

@@ -9,7 +9,7 @@ import numpy as np
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
-from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.settings import Settings, parameters
 from dynslam_bench.segmentation.masks.oracle import instances_of
 from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -74,7 +74,9 @@ def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
     """A tracker for the scene, with fewer features as its images are smaller."""
     given: dict[str, object] = {"features.n_features": 500, "features.levels": 4}
     if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto":
-        given |= {"segmentation.dilation_px": 4, "segmentation.source": f"plugin:{__file__}:SEGMENTER"}
+        given["segmentation.source"] = f"plugin:{__file__}:SEGMENTER"
+        if "segmentation.dilation_px" in {each.name for each in parameters(spec.settings)}:
+            given["segmentation.dilation_px"] = 4
     return build_tracker(spec, given | settings, TrackerContext(sequence_id=scene.id, masks=scene))
 
 

@@ -100,9 +100,11 @@ def test_a_sudden_turn_is_no_translation(sequence, degrees: int) -> None:
     rotation = cv2.Rodrigues(np.array([0, np.deg2rad(degrees), 0]))[0]
     warp, size = matrix @ rotation @ np.linalg.inv(matrix), (sequence.camera.width, sequence.camera.height)
     turned = Frame(
-        3, 0.1, np.asarray(cv2.warpPerspective(frame.rgb, warp, size), np.uint8),
+        3,
+        0.1,
+        np.asarray(cv2.warpPerspective(frame.rgb, warp, size), np.uint8),
         np.asarray(cv2.warpPerspective(frame.depth, warp, size, flags=cv2.INTER_NEAREST), np.float32),
-    )  # fmt: skip
+    )
     result = tracker.track(turned)
     assert result.state == "lost" or np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02
 

@@ -17,6 +17,8 @@ from ..tools.ego_motion import depth_sigma
 from ..tools.links import link_to_previous
 from .correlation_graph_settings import CorrelationSettings
 
+Numbers = NDArray[np.floating]
+
 MIN_POINTS = 20
 _NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 _WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
@@ -110,9 +112,8 @@ class CorrelationFilter(DynamicFilter):
         return past
 
     def _observe(
-        self, xy: NDArray[np.floating], raw: NDArray[np.floating], z: NDArray[np.floating],
-        depth: NDArray[np.float32], camera: Camera,
-    ) -> NDArray[np.float64]:  # fmt: skip
+        self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
+    ) -> NDArray[np.float64]:
         """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
         seen = np.full((len(xy), 12), np.nan)
         valid = np.isfinite(z) & (z > 0)

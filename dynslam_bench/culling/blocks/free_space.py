@@ -48,10 +48,9 @@ class FreeSpaceFilter(DynamicFilter):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Ask the latest keyframes whether they saw past each point."""
         keep = np.ones(len(frame), dtype=bool)
-        keyframes = [
-            view for view in state.keyframes
-            if view.depth is not None and frame.timestamp - view.timestamp <= self.settings.max_age_s
-        ][: self.settings.keyframes]  # fmt: skip
+        oldest = self.settings.max_age_s
+        fresh = [view for view in state.keyframes if frame.timestamp - view.timestamp <= oldest]
+        keyframes = [view for view in fresh if view.depth is not None][: self.settings.keyframes]
         known = np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(known):
             return FilterResult.of(keep, {"asked": 0.0, "tested": 0.0})

@@ -66,8 +66,8 @@ class ResidualFilter(DynamicFilter):
         picture[valid] = moving[label]
         size = (frame.depth.shape[1], frame.depth.shape[0])
         mask = cv2.resize(picture.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        stats |= {"clusters": float(len(moving)), "moving": float(np.count_nonzero(moving)),
-                  "mask_fraction": float(mask.mean())}  # fmt: skip
+        stats |= {"clusters": float(len(moving)), "moving": float(np.count_nonzero(moving))}
+        stats["mask_fraction"] = float(mask.mean())
         return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
 
     def _residual(

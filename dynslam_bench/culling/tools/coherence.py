@@ -6,16 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+Flags = NDArray[np.bool_]
+
 CELL = 16
 REACH = 5
 """Cells on a side of the neighbourhood: 5 x 16 px."""
 MIN_FAILING = 3
 
 
-def coherent(
-    failing: NDArray[np.bool_], tested: NDArray[np.bool_], xy: NDArray[np.floating], share: float,
-    size: tuple[int, int],
-) -> NDArray[np.bool_]:  # fmt: skip
+def coherent(failing: Flags, tested: Flags, xy: NDArray[np.floating], share: float, size: tuple[int, int]) -> Flags:
     """The failing points among whose tested neighbours enough fail too.
 
     Args:
@@ -34,7 +33,7 @@ def coherent(
     cell = np.floor(xy / CELL).astype(np.intp)
     index = cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1)
 
-    def around(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def around(flags: Flags) -> NDArray[np.float64]:
         counts = np.bincount(index, weights=flags, minlength=rows * columns).reshape(rows, columns)
         return np.asarray(
             cv2.boxFilter(counts, -1, (REACH, REACH), normalize=False, borderType=cv2.BORDER_CONSTANT), np.float64

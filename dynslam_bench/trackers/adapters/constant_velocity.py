@@ -117,9 +117,14 @@ def relative_motion(
     points = camera.unproject(camera.undistort_points(corners[good]), depth[good])
     pixels = camera.undistort_points(followed.reshape(-1, 2)[good])
     success, rotation, translation, agreeing = cv2.solvePnPRansac(
-        points, pixels, camera.matrix, np.zeros(5), iterationsCount=200, reprojectionError=REPROJECTION_PX,
+        points,
+        pixels,
+        camera.matrix,
+        np.zeros(5),
+        iterationsCount=200,
+        reprojectionError=REPROJECTION_PX,
         flags=cv2.SOLVEPNP_P3P,
-    )  # fmt: skip
+    )
     inliers = 0 if agreeing is None else len(agreeing)
     if not success or inliers < LEAST_INLIERS:
         return None, inliers

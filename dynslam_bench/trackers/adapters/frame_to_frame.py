@@ -99,8 +99,6 @@ def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.f
     """Column and row ``[H, W]`` in the distorted image of each undistorted pixel; None without distortion."""
     if not camera.is_distorted:
         return None
-    columns, rows = cv2.initUndistortRectifyMap(
-        camera.matrix, np.asarray(camera.distortion), np.eye(3), camera.matrix, (camera.width, camera.height),
-        cv2.CV_32FC1,
-    )  # fmt: skip
+    distortion, turn, size = np.asarray(camera.distortion), np.eye(3), (camera.width, camera.height)
+    columns, rows = cv2.initUndistortRectifyMap(camera.matrix, distortion, turn, camera.matrix, size, cv2.CV_32FC1)
     return np.asarray(columns, dtype=np.float32), np.asarray(rows, dtype=np.float32)

@@ -49,10 +49,10 @@ class _MultiScale:
     def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
         try:
             with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+                scales = (self._criteria, self._method, self._parameters)
                 result = self._pipeline.rgbd_odometry_multi_scale(
-                    current, reference, self._intrinsics, self._still, 1.0, self._max_depth, self._criteria,
-                    self._method, self._parameters,
-                )  # fmt: skip
+                    current, reference, self._intrinsics, self._still, 1.0, self._max_depth, *scales
+                )
         except RuntimeError:  # singular: too little texture or depth
             return None
         return np.asarray(result.transformation.numpy(), dtype=np.float64) if result.fitness > 0 else None

@@ -95,9 +95,11 @@ class OrbSlam3Settings(ProgramSettings):
     """Settings of `orbslam3`: those of its own settings file that matter for RGB-D."""
 
     vocabulary: str = names(
-        "", "file", otherwise="DYNSLAM_BENCH_ORB_VOCABULARY",
+        "",
+        "file",
+        otherwise="DYNSLAM_BENCH_ORB_VOCABULARY",
         meaning="DBoW2 text vocabulary (.txt or .txt.xz); empty for $DYNSLAM_BENCH_ORB_VOCABULARY",
-    )  # fmt: skip
+    )
     features: int = tunable(
         1000, meaning="ORB features a frame", low=500, high=2500, scale="log", limits=(100, 10000), unit="features"
     )

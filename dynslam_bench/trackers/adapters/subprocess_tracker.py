@@ -73,9 +73,15 @@ class ProgramTracker:
             "op": "reset",
             "protocol": PROTOCOL,
             "camera": {
-                "width": camera.width, "height": camera.height,
-                "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-                "distortion": list(camera.distortion), "baseline_m": camera.baseline_m, "fps": self.context.fps,
+                "width": camera.width,
+                "height": camera.height,
+                "fx": camera.fx,
+                "fy": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+                "distortion": list(camera.distortion),
+                "baseline_m": camera.baseline_m,
+                "fps": self.context.fps,
             },
             "images": self._exchange.announce(),
             "seed": seed,
@@ -83,7 +89,7 @@ class ProgramTracker:
             "device": self.context.device,
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
-        }  # fmt: skip
+        }
         try:
             self._program.ask(request, self.limits.start_timeout_s, "at reset")
         except DynslamError:

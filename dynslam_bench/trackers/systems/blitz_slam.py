@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 from dynslam_bench.culling.blocks.depth_blocks_settings import DepthBlockSettings
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import SemanticSystemSettings, UnrepairedSettings, compose
 from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 class BlitzSlamSettings(SemanticSystemSettings):
     """Repaired masks and the epipolar test in boxes."""
 
-    segmentation: SegmentationSettings = SegmentationSettings(dilation_px=0)
+    segmentation: UnrepairedSettings = UnrepairedSettings(dilation_px=0)
     depth_blocks: DepthBlockSettings = DepthBlockSettings()
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.5, test_outside=False)
     flow: PublishedFlowSettings = PublishedFlowSettings()

@@ -19,25 +19,27 @@ from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings
 
-from .published import masks_in_words
-
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Where masks can come from, as `segmentation.source` names it."""
-SHARED_MASKS = masks_in_words(SegmentationSettings())
-"""An assumption of every system with a semantic source."""
-CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
-"""The paper's improved mask branch, as far as it is there."""
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts.filter import DynamicFilter
+    from dynslam_bench.segmentation.masks.schedule import MaskScheduler
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
-class ObjectSettings(SegmentationSettings):
+class UnrepairedSettings(SegmentationSettings):
+    """Segmentation for systems with another use of depth: nothing repairs a mask there."""
+
+    repair: Literal["none"] = Field("none", description="masks are not repaired")
+    repair_depth_m: float = Field(0.2, description="no effect: masks are not repaired")
+    repair_band_px: int = Field(8, description="no effect: masks are not repaired")
+
+
+class ObjectSettings(UnrepairedSettings):
     """Segmentation for systems that look at objects or their boxes: nothing grows or repairs a mask there."""
 
     dilation_px: Literal[0] = Field(0, description="masks are not grown: objects and boxes count as they were found")
-    repair: Literal["none"] = Field("none", description="masks are not repaired")
 
 
 class SystemSettings(Settings):
@@ -91,8 +93,8 @@ def compose(
     from dynslam_bench.core.stage_cache import StageCache
     from dynslam_bench.features.build_extractor import build_extractor
     from dynslam_bench.features.cached import CachedExtractor
+    from dynslam_bench.flow.build_flow import build_flow
     from dynslam_bench.segmentation.cached import cache_segmenter
-    from dynslam_bench.segmentation.masks.schedule import build_mask_stage
     from dynslam_bench.slam.backend import RgbdBackend
     from dynslam_bench.slam.pipeline import SlamPipeline
     from dynslam_bench.slam.stage_clock import CachedStage
@@ -102,36 +104,45 @@ def compose(
     extractor = build_extractor(settings.features)
     if cache is not None:
         extractor = cached["features"] = CachedExtractor(extractor, settings.features, cache, context.threads)
-    masks = None
-    if isinstance(settings, SemanticSystemSettings):
-        masks = build_mask_stage(
-            settings.segmentation, sequence_id=context.sequence_id, masks=context.masks, device=context.device,
-            threads=context.threads, deferred=cache is not None, also=movable_classes(filters),
-        )  # fmt: skip
-    if masks is None:
-        needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
-        if needing:
-            raise SegmentationError(
-                f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'",
-                f"sources: {SOURCES}",
-            )
-    elif cache is not None:
+    masks = _mask_stage(settings, context, filters, deferred=cache is not None)
+    if masks is not None and cache is not None:
         segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
         if segmenter is not None:
             cached["segmentation"] = segmenter
-    estimator = None
-    if flow is not None:
-        from dynslam_bench.flow.build_flow import build_flow
-
-        estimator = build_flow(flow, device=context.device, threads=context.threads)
+    backend = RgbdBackend(
+        settings.backend, scale_factor=settings.features.scale_factor, levels=settings.features.levels
+    )
     return SlamPipeline(
         extractor=extractor,
         masks=masks,
         filters=filters,
-        flow=estimator,
-        backend=RgbdBackend(
-            settings.backend, scale_factor=settings.features.scale_factor, levels=settings.features.levels
-        ),
+        flow=None if flow is None else build_flow(flow, device=context.device, threads=context.threads),
+        backend=backend,
         settings=settings,
         cached=cached,
     )
+
+
+def _mask_stage(
+    settings: SystemSettings, context: TrackerContext, filters: Sequence[DynamicFilter], *, deferred: bool
+) -> MaskScheduler | None:
+    """Where the system's masks come from; None without a source, unless a filter needs one."""
+    from dynslam_bench.segmentation.masks.schedule import build_mask_stage
+
+    masks = None
+    if isinstance(settings, SemanticSystemSettings):
+        masks = build_mask_stage(
+            settings.segmentation,
+            sequence_id=context.sequence_id,
+            masks=context.masks,
+            device=context.device,
+            threads=context.threads,
+            deferred=deferred,
+            also=movable_classes(filters),
+        )
+    needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
+    if masks is None and needing:
+        raise SegmentationError(
+            f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'", f"sources: {SOURCES}"
+        )
+    return masks

@@ -9,6 +9,7 @@ from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationS
 from dynslam_bench.flow.settings import FlowSettings
 
 from .composition import SystemSettings, compose
+from .published import tracks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -42,6 +43,7 @@ SPEC = TrackerSpec(
     assumptions=(
         "the graph is over tracked features and their last frames; the paper's is over map points and their keyframes, "
         "with a second one over a window of keyframes",
+        f"features are followed by {tracks_in_words(DaiSlamSettings().flow)}; one that it loses is not judged",
         "each edge is tested against the oldest common observation of at most 8 frames ago; no Huber step",
         "components are those of points observed for 4 frames or more; younger points follow the settled ones around "
         "them; what has neither flow nor depth is never judged",

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, links_in_words, masks_in_words
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 class DetectSlamSettings(SemanticSystemSettings):
     """Boxes on keyframes and the moving average."""
 
-    segmentation: SegmentationSettings = SegmentationSettings(schedule="keyframes", dilation_px=0)
+    segmentation: ObjectSettings = ObjectSettings(schedule="keyframes")
     probability: ProbabilitySettings = ProbabilitySettings(rule="average", threshold=0.75, expand_px=32.0)
     flow: PublishedFlowSettings = PublishedFlowSettings()
 

@@ -8,9 +8,8 @@ from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
 from dynslam_bench.culling.guard import GuardSettings
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 class DiSlamSettings(SemanticSystemSettings):
     """The epipolar test with boxes and multi-view depth."""
 
-    segmentation: SegmentationSettings = SegmentationSettings(confidence=0.1)
+    segmentation: ObjectSettings = ObjectSettings(confidence=0.1)
     guard: GuardSettings = GuardSettings(min_fraction=0.1)
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous")
     multiview: MultiViewSettings = MultiViewSettings(grow=False, min_keyframes=5)

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import masks_in_words
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 class DsSlamSettings(SemanticSystemSettings):
     """Masks and the moving-consistency vote."""
 
-    segmentation: SegmentationSettings = SegmentationSettings(dilation_px=0)
+    segmentation: ObjectSettings = ObjectSettings()
     moving_vote: MovingVoteSettings = MovingVoteSettings()
 
 

@@ -15,7 +15,8 @@ from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
 from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
 from dynslam_bench.flow.settings import FlowSettings
 
-from .composition import CFPN, SHARED_MASKS, ObjectSettings, SemanticSystemSettings, SystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, SystemSettings, compose
+from .published import CFPN, grown_in_words, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts.filter import DynamicFilter
@@ -145,12 +146,14 @@ DEPTH = "rigid motion in depth and free space seen before are tested as well (ou
 
 def _assumptions(name: str, settings: type[SystemSettings]) -> tuple[str, ...]:
     said = [WHOSE] if name == "emfoa-oft" else []
-    if issubclass(settings, SemanticSystemSettings):
-        said += [SHARED_MASKS, CFPN]
-    if not issubclass(settings, EpipolarTestSettings):
+    defaults = settings()
+    if isinstance(defaults, SemanticSystemSettings):
+        said += [masks_in_words(defaults.segmentation), CFPN]
+        if defaults.segmentation.dilation_px:
+            said.append(grown_in_words(defaults.segmentation))
+    if not isinstance(defaults, EpipolarTestSettings):
         return (*said, SENSOR)
     said += NOT_STATED
-    defaults = settings()
     if defaults.flow.method == "daisy":
         said += DENSE if defaults.flow.mode == "dense" else [SPARSE]
     if not issubclass(settings, PaperTestSettings):
@@ -183,16 +186,16 @@ def _spec(name: str, summary: str, settings: type[SystemSettings], factory: str 
 
 SPECS = [
     _spec(
-        "emfoa-oft", "our own system: masks, EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
+        "emfoa-oft",
+        "our own system: masks, EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
         EmfoaOftSettings,
     ),
     _spec(
-        "emfoa-oft-paper", "the paper's system: masks, EMFOA-optimised dense DAISY Filter Flow, epipolar culling",
+        "emfoa-oft-paper",
+        "the paper's system: masks, EMFOA-optimised dense DAISY Filter Flow, epipolar culling",
         PaperSettings,
     ),
-    _spec(
-        "emfoa-oft-paper-sparse", "ablation: the paper's test on the flow of our own system", PaperSparseSettings
-    ),
+    _spec("emfoa-oft-paper-sparse", "ablation: the paper's test on the flow of our own system", PaperSparseSettings),
     _spec("emfoa-oft-paper-no-masks", "ablation: the paper's flow and epipolar test alone", PaperTestSettings),
     _spec(
         "emfoa-oft-no-depth-test", "ablation: without the tests of depth, which are ours", MaskedEpipolarTestSettings
@@ -204,11 +207,15 @@ SPECS = [
     _spec("emfoa-oft-patchmatch", "ablation: PatchMatch instead of EMFOA", PatchMatchSettings),
     _spec("emfoa-oft-literal", "ablation: the moth-flame equations as printed", LiteralSettings),
     _spec(
-        "emfoa-oft-object", "ablation: objects go by the vote of their points, not by class", ObjectVoteSettings,
+        "emfoa-oft-object",
+        "ablation: objects go by the vote of their points, not by class",
+        ObjectVoteSettings,
         "build_object_mode",
     ),
     _spec(
-        "emfoa-oft-object-depth-test", "ablation: the vote of an object's points, and the tests of depth",
-        ObjectVoteDepthTestSettings, "build_object_mode",
+        "emfoa-oft-object-depth-test",
+        "ablation: the vote of an object's points, and the tests of depth",
+        ObjectVoteDepthTestSettings,
+        "build_object_mode",
     ),
-]  # fmt: skip
+]

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 
-from .composition import CFPN, SHARED_MASKS, SemanticSystemSettings, compose
+from .composition import SemanticSystemSettings, compose
+from .published import CFPN, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -29,7 +30,7 @@ SPEC = TrackerSpec(
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
     assumptions=(
-        SHARED_MASKS,
+        masks_in_words(SemanticSystemSettings().segmentation),
         CFPN,
         "masks of people alone; DynaSLAM, whose rule it is, culls nineteen classes (dynaslam-n)",
         "no further drop of features at the border of the grown mask",

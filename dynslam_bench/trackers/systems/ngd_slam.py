@@ -8,9 +8,8 @@ from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.box_depth_settings import BoxDepthSettings
 from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import masks_in_words
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ class NgdSlamSettings(SemanticSystemSettings):
     """Depth masks of boxes, and half as many features again to choose the static ones from."""
 
     features: FeatureSettings = FeatureSettings(n_features=1500)
-    segmentation: SegmentationSettings = SegmentationSettings(schedule="every_nth", n=3, carry="sparse")
+    segmentation: ObjectSettings = ObjectSettings(schedule="every_nth", n=3, carry="sparse")
     box_depth: BoxDepthSettings = BoxDepthSettings()
     reseeding: ReseedingSettings = ReseedingSettings(budget=1000)
 

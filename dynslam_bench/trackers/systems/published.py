@@ -14,6 +14,9 @@ from dynslam_bench.culling.tools.unmatched import Unmatched
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
+CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
+"""The paper's improved mask branch, as far as it is there."""
+
 
 class PublishedFlowSettings(FlowSettings):
     """Lucas-Kanade as published systems use it: no source of theirs names a check on the way back, so there is none."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import PublishedFlowSettings, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 class SgcSlamSettings(SemanticSystemSettings):
     """The epipolar test with boxes."""
 
+    segmentation: ObjectSettings = ObjectSettings()
     box_epipolar: BoxEpipolarSettings = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0)
     flow: PublishedFlowSettings = PublishedFlowSettings()
 

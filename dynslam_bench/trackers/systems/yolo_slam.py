@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
 
-from .composition import SemanticSystemSettings, compose
+from .composition import ObjectSettings, SemanticSystemSettings, compose
 from .published import masks_in_words
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 class YoloSlamSettings(SemanticSystemSettings):
     """Boxes and the depth RANSAC."""
 
+    segmentation: ObjectSettings = ObjectSettings()
     depth_ransac: DepthRansacSettings = DepthRansacSettings()
 
 

@@ -18,7 +18,7 @@ from dynslam_bench.sequences.published.datasets import DATASETS
 from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "plugins.md"
 
 
 @pytest.fixture

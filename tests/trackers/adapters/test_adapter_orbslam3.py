@@ -20,7 +20,7 @@ from dynslam_bench.trackers.adapters.orbslam3 import check_camera, settings_yaml
 from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
 from dynslam_bench.trackers.adapters.vocabulary import find_vocabulary
 
-SHARED = Path(__file__).resolve().parents[3] / "shared"
+SHARED = Path(__file__).resolve().parents[4] / "shared"
 PACKED = SHARED / "weights" / "orb_vocabulary_small.txt.xz"
 XYZ = SHARED / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
 INSTALLED = importlib.util.find_spec("pyorbslam3") is not None

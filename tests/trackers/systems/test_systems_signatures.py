@@ -13,7 +13,7 @@ import pytest
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.runs import RunSpec, RunStore, run_many
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[2]
 
 
 def load(name: str, path: Path):
@@ -84,9 +84,12 @@ def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
         if line.startswith("| `")
     }
     assert verdicts == {
-        "`dynaslam-n`": "match", "`orb-slam2`": "match", "`yolo-slam`": "**miss**", "`dai-slam`": "match",
+        "`dynaslam-n`": "match",
+        "`orb-slam2`": "match",
+        "`yolo-slam`": "**miss**",
+        "`dai-slam`": "match",
         "`cfp-slam`": "match (not counted)",
-    }  # fmt: skip
+    }
     assert "match: 3 of 4 (75 %; the bar is 75 %)" in text
     assert "yolo-slam on walking_rpy: survives" in text and "published fails" in text
 

@@ -58,19 +58,26 @@ def moving_scene(thing: str) -> tuple[FrameBundle, FilterState, np.ndarray, np.n
         mask[0, 80:400, 220:420] = True
         each.instances = Instances(mask, np.array([[220, 80, 420, 400]], np.float32), (thing,), np.ones(1, np.float32))
     state = FilterState(
-        camera=CAMERA, keep=np.ones(380, bool), previous=previous, previous_keep=np.ones(380, bool),
-        T_world_prev=np.eye(4), T_world_pred=motion,
+        camera=CAMERA,
+        keep=np.ones(380, bool),
+        previous=previous,
+        previous_keep=np.ones(380, bool),
+        T_world_prev=np.eye(4),
+        T_world_pred=motion,
         flow=FlowResult(before.astype(np.float32), valid, np.zeros(380, np.float32)),
-    )  # fmt: skip
+    )
     return frame, state, moving, ~valid
 
 
 def bundle(xy: np.ndarray, z: np.ndarray) -> FrameBundle:
     count = len(xy)
     keypoints = Keypoints(
-        xy.astype(np.float32), np.zeros(count, np.int32), np.zeros(count, np.float32), np.ones(count, np.float32),
+        xy.astype(np.float32),
+        np.zeros(count, np.int32),
+        np.zeros(count, np.float32),
+        np.ones(count, np.float32),
         np.zeros((count, 32), np.uint8),
-    )  # fmt: skip
+    )
     image = np.zeros((480, 640), np.uint8)
     depth = np.full((480, 640), 1.5, np.float32)
     return FrameBundle(0, 0.0, image[:, :, None].repeat(3, 2), image, depth, keypoints, xy, z.astype(np.float32))
@@ -144,10 +151,16 @@ def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> 
     settings = TRACKERS.get(name).settings().flow
     assert isinstance(settings, PublishedFlowSettings)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, grid, grid.copy(), winSize=(settings.window_px,) * 2, maxLevel=settings.levels - 1,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        first,
+        second,
+        grid,
+        grid.copy(),
+        winSize=(settings.window_px,) * 2,
+        maxLevel=settings.levels - 1,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=1e-4,
-    )  # fmt: skip
+    )
     in_image = ((there >= 0) & (there <= (319, 239))).all(axis=1)
     np.testing.assert_array_equal(found.valid, (status.ravel() > 0) & in_image)
     checked = system(name, **{"flow.forward_backward_px": 1.5})._flow

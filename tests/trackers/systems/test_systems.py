@@ -209,11 +209,11 @@ def test_listing_trackers_loads_nothing_heavy() -> None:
         "import sys; from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30; "
         "heavy = {'torch', 'cv2', 'gtsam', 'numba'} & set(sys.modules); assert not heavy, heavy"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[2])
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[3])
 
 
 def test_the_page_of_baselines_lists_every_tracker_as_its_spec_says() -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "baselines.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[3] / "docs" / "baselines.md").read_text(encoding="utf-8")
     for spec in all_specs():
         told = "; ".join(spec.assumptions) + (f" ({spec.remarks})" if spec.remarks else "")
         row = f"| `{spec.id}` | {spec.provenance} | {spec.summary} | {told.strip()} |"

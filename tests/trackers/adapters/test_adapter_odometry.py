@@ -19,7 +19,7 @@ from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.adapters import opencv_odometry
 from dynslam_bench.trackers.adapters.frame_to_frame import FrameToFrame, undistortion_maps
 
-XYZ = Path(__file__).resolve().parents[3] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
+XYZ = Path(__file__).resolve().parents[4] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
 needs_data = pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")
 needs_opencv = pytest.mark.skipif(bool(opencv_odometry.unavailable()), reason=opencv_odometry.unavailable())
 needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed")

@@ -1,0 +1,198 @@
+"""Every way in which a program over JSON lines can fail, and how it is ended."""
+
+import shlex
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from adapter_programs import GOOD, frame, gone, reset
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.core.errors import SettingsError, TrackerError
+from dynslam_bench.trackers import build_tracker
+from dynslam_bench.trackers.adapters.program import files_of_command
+
+FAULTS = {
+    "raises": ("raise ValueError('no such camera')", "exit code 1; its last line: 'ValueError: no such camera'"),
+    "exits": (
+        "sys.stderr.write('cannot open\\nconfig.yaml\\n'); sys.exit(3)",
+        "exit code 3; its last line: 'config.yaml'",
+    ),
+    "silent exit": ("os._exit(0)", "exit code 0; it wrote no message"),
+    "segfault": ("os.kill(os.getpid(), 11)", "killed by SIGSEGV"),
+    "no json": ("print('{pose: 1}', flush=True)", "answered no JSON"),
+    "error": ("say({'error': 'out of\\nmemory'})", "at frame 7: out of memory"),
+    "no pose": ("say({'state': 'ok'})", "'ok' without T_world_cam"),
+    "state": ("say({'state': 'fine', 'T_world_cam': STILL})", "known: initialising, ok, lost"),
+    "shape": ("say({'state': 'ok', 'T_world_cam': STILL[:12]})", "not 16 numbers"),
+    "text": ("say({'state': 'ok', 'T_world_cam': 'identity'})", "not 16 numbers"),
+    "not rigid": ("say({'state': 'ok', 'T_world_cam': [2 * v for v in STILL]})", "no rigid pose"),
+    "nan": ("say({'state': 'ok', 'T_world_cam': [float('nan')] * 16})", "no rigid pose"),
+    "stats": ("say({'state': 'ok', 'T_world_cam': STILL, 'stats': {'a': 'b'}})", "stats is not"),
+    "hangs": (
+        "sys.stderr.write('optimising\\n'); sys.stderr.flush(); time.sleep(60)",
+        "no answer within 0.5 s.*'optimising'",
+    ),
+    "closes": ("os.close(1); time.sleep(60)", "closed its output"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_become_one_line(program, fault):
+    code, expected = FAULTS[fault]
+    tracker = program(
+        f"""
+        for request in requests:
+            if request["op"] == "track" and request["index"] == 7:
+                {code}
+            else:
+                say({{"state": "ok", "T_world_cam": STILL, "stats": {{"pid": os.getpid()}}}})
+        """,
+        frame_timeout_s=0.5 if fault == "hangs" else 20,
+        close_timeout_s=0.2,
+    )
+    pid = int(reset(tracker).track(frame(6)).stats["pid"])
+    with pytest.raises(TrackerError, match=expected) as caught:
+        tracker.track(frame(7))
+    assert "\n" not in str(caught.value) and "at frame 7" in str(caught.value)
+    tracker.close()
+    assert gone(pid)
+    reset(tracker)
+    assert tracker.track(frame(0)).state == "ok", "a reset starts the program again"
+
+
+def test_death_at_reset(program):
+    with pytest.raises(TrackerError, match=r"at reset: .*exit code 2; its last line: 'no licence'"):
+        reset(program("sys.stderr.write('no licence\\n'); sys.exit(2)"))
+
+
+def test_refusal_at_reset(program):
+    with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
+        reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
+
+
+def test_faults_at_finalize(program):
+    for answer, expected in (
+        ("{'trajectory': [[1, 2]]}", "rows of 8"),
+        ("{}", "rows of 8"),
+        ("{'trajectory': [[1, 0, 0, 0, 0, 0, 0, 0]]}", "norm 0"),
+        ("{'trajectory': [[2, 0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 1]]}", "strictly increasing"),
+    ):
+        tracker = reset(program(f"for request in requests: say({answer})", final=True))
+        with pytest.raises(TrackerError, match=expected):
+            tracker.finalize()
+
+
+def test_commands_that_cannot_start(tmp_path):
+    (tmp_path / "text").write_text("no program")
+    for name, settings, words in (
+        ("subprocess", {}, "subprocess:PROGRAM"),
+        ("subprocess:'unclosed", {}, "cannot split"),
+        ("subprocess:ls", {"folder": str(tmp_path / "none")}, "no folder"),
+        ("subprocess:/no/such/program --fast", {}, "cannot start '/no/such/program'"),
+        ("subprocess:no-such-program", {}, "cannot start 'no-such-program'"),
+        ("subprocess:./text", {"folder": str(tmp_path)}, "cannot start './text'"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            build_tracker(name, settings)
+
+
+def test_last_words_are_the_last_ones(program):
+    """Standard output that is flushed at the end must not pass for what standard error said last."""
+    said = (
+        "sys.stdout.write('loading vocabulary\\n'); sys.stderr.write('FATAL: no such camera model\\n'); "
+        "sys.stderr.flush(); sys.stdout.flush(); os._exit(3)"
+    )
+    with pytest.raises(TrackerError, match=r"exit code 3; its last line: 'FATAL: no such camera model'"):
+        reset(program(said))
+    early = (
+        "sys.stderr.write('warning: old driver\\n'); sys.stderr.flush(); next(requests); say({'ok': True}); "
+        "next(requests); time.sleep(0.3); print('lost the map', flush=True); os._exit(1)"
+    )
+    tracker = reset(program(early))
+    with pytest.raises(TrackerError, match=r"its last line: 'lost the map'"):
+        tracker.track(frame(0))
+
+
+def test_what_a_program_writes_goes_to_the_log(program, caplog):
+    with caplog.at_level("INFO", logger="dynslam_bench"):
+        reset(
+            program("""
+        sys.stderr.write("version 1.2\\n"); sys.stderr.flush()
+        for request in requests:
+            print("working"); say({"state": "ok", "T_world_cam": STILL})
+        """)
+        ).track(frame(0))
+    assert {"version 1.2", "working"} <= {message.split("] ", 1)[1] for message in caplog.messages}
+
+
+def test_the_files_of_a_command(tmp_path):
+    script = tmp_path / "slam.py"
+    script.write_text("")
+    python = Path(shutil.which("env")).resolve()
+    assert files_of_command(["env", str(script), "--fast", "", "/no/such\0name"]) == [python, script.resolve()]
+    assert files_of_command(["./slam.py", "slam.py"], tmp_path) == [script.resolve()]
+    assert files_of_command([]) == []
+
+
+def test_close_kills_what_does_not_end(program):
+    text = """
+    import signal, subprocess
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    next(requests); say({"ok": True})
+    next(requests); say({"state": "ok", "T_world_cam": STILL, "stats": {"pid": os.getpid(), "child": child.pid}})
+    time.sleep(600)
+    """
+    tracker = reset(program(text, close_timeout_s=0.2))
+    stats = tracker.track(frame(0)).stats
+    start = time.monotonic()
+    tracker.close()
+    assert time.monotonic() - start < 5
+    assert gone(int(stats["pid"])) and gone(int(stats["child"]))
+
+
+def test_dropping_the_tracker_ends_the_program(program):
+    import gc
+
+    tracker = reset(build_tracker(program(GOOD)._command and f"subprocess:{shlex.join(program(GOOD)._command)}"))
+    pid = tracker._program._process.pid
+    folder = tracker._exchange.folder
+    assert folder.is_dir()
+    del tracker
+    gc.collect()
+    assert gone(pid) and not folder.exists()
+
+
+def test_wrong_image_size(program):
+    tracker = reset(program(GOOD))
+    small = Frame(0, 0.0, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32))
+    with pytest.raises(TrackerError, match="but the camera is 64x48"):
+        tracker.track(small)
+
+
+def test_serve_answers_for_a_python_tracker(program):
+    """The helper for Python programs: numpy views of the images, exceptions as errors, prints out of the way."""
+    root = Path(__file__).resolve().parents[3]
+    text = f"""
+    sys.path.insert(0, {str(root)!r})
+    from dynslam_bench.trackers.adapters.serve import serve
+    def track(index, timestamp, rgb, depth):
+        print("tracking", index)
+        if index == 2:
+            raise RuntimeError("no features")
+        stats = {{"sum": int(rgb.sum()), "known": int((depth > 0).sum())}}
+        return {{"state": "ok", "T_world_cam": STILL, "stats": stats}}
+    serve(lambda request: None, track, lambda: [[1.5, 0, 0, 0, 0, 0, 0, 1]])
+    """
+    tracker = reset(program(text, final=True))
+    for index in range(2):
+        sent = frame(index)
+        stats = tracker.track(sent).stats
+        assert stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
+    with pytest.raises(TrackerError, match="at frame 2: RuntimeError: no features"):
+        tracker.track(frame(2))
+    assert tracker.track(frame(3)).state == "ok", "an answered error does not end the program"
+    assert len(tracker.finalize()) == 1
