@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from dynslam_bench.core.seeding import stream
@@ -56,29 +57,38 @@ def write_script(people: str, instance: int) -> Script:
     def j(low: float, high: float) -> float:
         return pick(rng, instance, low, high)
 
-    first: tuple[Key, ...]
-    second: tuple[Key, ...]
-    chairs: tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]
-    if people == "sitting":
-        ax, ay, bx, by = -j(0.5, 0.62), j(1.62, 1.74), j(0.46, 0.58), j(1.68, 1.8)
-        fa, fb = 180 + j(18, 35), 180 - j(22, 40)
-        first = (
-            Key(0, ax, ay, fa, 1, 0.39),
-            Key(4, ax, ay, fa + 1.5, 1, 0.55),
-            Key(8, ax, ay, fa - 1.5, 1, 0.28),
-            Key(12, ax, ay, fa, 1, 0.39),
-        )
-        second = (
-            Key(0, bx, by, fb, 1, 0.33),
-            Key(3, bx, by, fb - 1.5, 1, 0.22),
-            Key(7, bx, by, fb + 1.5, 1, 0.55),
-            Key(12, bx, by, fb, 1, 0.33),
-        )
-        chairs = (
-            (ChairKey(0, ax, ay, fa), ChairKey(12, ax, ay, fa)),
-            (ChairKey(0, bx, by, fb), ChairKey(12, bx, by, fb)),
-        )
-        return _mirror(Script(12.0, (first, second), chairs), flip)
+    script = _sitting(j) if people == "sitting" else _walking(j)
+    return _mirror(script, flip)
+
+
+Draw = Callable[[float, float], float]
+
+
+def _sitting(j: Draw) -> Script:
+    """Two people at the desk, talking with their hands."""
+    ax, ay, bx, by = -j(0.5, 0.62), j(1.62, 1.74), j(0.46, 0.58), j(1.68, 1.8)
+    fa, fb = 180 + j(18, 35), 180 - j(22, 40)
+    first = (
+        Key(0, ax, ay, fa, 1, 0.39),
+        Key(4, ax, ay, fa + 1.5, 1, 0.55),
+        Key(8, ax, ay, fa - 1.5, 1, 0.28),
+        Key(12, ax, ay, fa, 1, 0.39),
+    )
+    second = (
+        Key(0, bx, by, fb, 1, 0.33),
+        Key(3, bx, by, fb - 1.5, 1, 0.22),
+        Key(7, bx, by, fb + 1.5, 1, 0.55),
+        Key(12, bx, by, fb, 1, 0.33),
+    )
+    chairs = (
+        (ChairKey(0, ax, ay, fa), ChairKey(12, ax, ay, fa)),
+        (ChairKey(0, bx, by, fb), ChairKey(12, bx, by, fb)),
+    )
+    return Script(12.0, (first, second), chairs)
+
+
+def _walking(j: Draw) -> Script:
+    """Two people who walk across the room, stand talking, and sit down."""
     ax, ay, bx, by = -j(0.28, 0.4), j(1.26, 1.38), j(0.3, 0.42), j(1.44, 1.58)
     cx, cy = -j(0.55, 0.7), j(1.62, 1.7)
     side = 1.65
@@ -142,7 +152,7 @@ def write_script(people: str, instance: int) -> Script:
             ChairKey(20, 0.85, 1.88, 20),
         ),
     )
-    return _mirror(Script(20.0, (first, second), chairs), flip)
+    return Script(20.0, (first, second), chairs)
 
 
 def _mirror(script: Script, sign: float) -> Script:
