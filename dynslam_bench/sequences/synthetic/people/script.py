@@ -129,30 +129,33 @@ def _walking(j: Draw) -> Script:
         Key(18.0, bx, by, 150, 0, 1),
         Key(20.0, bx, by, 160, 0, 0.8),
     )
+    return Script(20.0, (first, second), _chairs(cx, cy))
+
+
+def _chairs(cx: float, cy: float) -> tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]:
+    """A chair that rolls as somebody sits down on it and rises, and one that is pushed in passing."""
     rest_y = cy + 0.2
-    chairs = (
-        (
-            ChairKey(0, cx, rest_y, 100),
-            ChairKey(13.2, cx, rest_y, 100),
-            ChairKey(14.3, cx, cy, 185),
-            ChairKey(14.9, cx, cy, 185),
-            ChairKey(16.2, cx, cy, 205),
-            ChairKey(16.6, cx, cy, 195),
-            ChairKey(17.5, cx, rest_y, 110),
-            ChairKey(20, cx, rest_y, 100),
-        ),
-        (
-            ChairKey(0, 0.85, 1.88, 20),
-            ChairKey(2.6, 0.85, 1.88, 20),
-            ChairKey(3.2, 0.9, 2.0, 45),
-            ChairKey(4.9, 0.9, 2.0, 45),
-            ChairKey(5.5, 0.84, 1.93, 5),
-            ChairKey(13.0, 0.84, 1.93, 5),
-            ChairKey(13.8, 0.85, 1.88, 20),
-            ChairKey(20, 0.85, 1.88, 20),
-        ),
+    first = (
+        ChairKey(0, cx, rest_y, 100),
+        ChairKey(13.2, cx, rest_y, 100),
+        ChairKey(14.3, cx, cy, 185),
+        ChairKey(14.9, cx, cy, 185),
+        ChairKey(16.2, cx, cy, 205),
+        ChairKey(16.6, cx, cy, 195),
+        ChairKey(17.5, cx, rest_y, 110),
+        ChairKey(20, cx, rest_y, 100),
     )
-    return Script(20.0, (first, second), chairs)
+    second = (
+        ChairKey(0, 0.85, 1.88, 20),
+        ChairKey(2.6, 0.85, 1.88, 20),
+        ChairKey(3.2, 0.9, 2.0, 45),
+        ChairKey(4.9, 0.9, 2.0, 45),
+        ChairKey(5.5, 0.84, 1.93, 5),
+        ChairKey(13.0, 0.84, 1.93, 5),
+        ChairKey(13.8, 0.85, 1.88, 20),
+        ChairKey(20, 0.85, 1.88, 20),
+    )
+    return first, second
 
 
 def _mirror(script: Script, sign: float) -> Script:
