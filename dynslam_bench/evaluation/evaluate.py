@@ -136,24 +136,10 @@ def evaluate(
         n_input = len(np.asarray(input_timestamps).reshape(-1))
         n_tracked = int(frames.tracked_frames(estimate, input_timestamps).sum())
     estimate = _apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
-    association = match(estimate, ground_truth, protocol)
-    if len(association) < 2:
-        raise EvaluationError(
-            f"only {len(association)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s, "
-            "at least 2 are needed",
-            association.describe(protocol.max_dt),
-        )
-    dropped = association.describe(protocol.max_dt)
-    if dropped:
-        diagnostics.append(dropped)
-
+    association = _associate(estimate, ground_truth, protocol, diagnostics)
     matched = estimate.T_world_cam[association.estimate]
     truth = ground_truth.T_world_cam[association.ground_truth]
-    similarity = align(matched, truth, protocol.alignment)
-    if similarity.degenerate:
-        diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
-    if not similarity.rotation_reliable:
-        diagnostics.append(_unreliable(similarity, truth))
+    similarity = _align(matched, truth, protocol, diagnostics)
     aligned = similarity.apply(matched)
     translation, rotation = absolute_errors(aligned, truth)
     metrics = {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
@@ -175,24 +161,8 @@ def evaluate(
         n_input=n_input,
         n_tracked=n_tracked,
         coverage=None if n_tracked is None or not n_input else n_tracked / n_input,
-        alignment=AlignmentRecord(
-            mode=protocol.alignment,
-            rotation=similarity.rotation.tolist(),
-            translation_m=similarity.translation.tolist(),
-            scale=similarity.scale,
-            degenerate=similarity.degenerate,
-            uncertainty_deg=similarity.uncertainty_deg,
-        ),
-        association=AssociationRecord(
-            n_estimate=association.n_estimate,
-            n_ground_truth=association.n_ground_truth,
-            outside=association.outside,
-            in_holes=association.in_holes,
-            taken=association.taken,
-            median_dt_s=association.median_dt,
-            largest_hole_s=association.largest_hole,
-            hole_at_s=association.hole_at,
-        ),
+        alignment=_alignment_record(protocol, similarity),
+        association=_association_record(association),
         diagnostics=diagnostics,
     )
 
@@ -237,6 +207,55 @@ def pose_errors(
         Trajectory(stamps, aligned[first]),
         Trajectory(stamps, truth[first]),
         {"trans_m": translation[first], "rot_deg": rotation[first]},
+    )
+
+
+def _associate(
+    estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol, diagnostics: list[str]
+) -> Association:
+    association = match(estimate, ground_truth, protocol)
+    dropped = association.describe(protocol.max_dt)
+    if len(association) < 2:
+        raise EvaluationError(
+            f"only {len(association)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s, "
+            "at least 2 are needed",
+            dropped,
+        )
+    if dropped:
+        diagnostics.append(dropped)
+    return association
+
+
+def _align(matched: np.ndarray, truth: np.ndarray, protocol: Protocol, diagnostics: list[str]) -> Similarity:
+    similarity = align(matched, truth, protocol.alignment)
+    if similarity.degenerate:
+        diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
+    if not similarity.rotation_reliable:
+        diagnostics.append(_unreliable(similarity, truth))
+    return similarity
+
+
+def _alignment_record(protocol: Protocol, similarity: Similarity) -> AlignmentRecord:
+    return AlignmentRecord(
+        mode=protocol.alignment,
+        rotation=similarity.rotation.tolist(),
+        translation_m=similarity.translation.tolist(),
+        scale=similarity.scale,
+        degenerate=similarity.degenerate,
+        uncertainty_deg=similarity.uncertainty_deg,
+    )
+
+
+def _association_record(association: Association) -> AssociationRecord:
+    return AssociationRecord(
+        n_estimate=association.n_estimate,
+        n_ground_truth=association.n_ground_truth,
+        outside=association.outside,
+        in_holes=association.in_holes,
+        taken=association.taken,
+        median_dt_s=association.median_dt,
+        largest_hole_s=association.largest_hole,
+        hole_at_s=association.hole_at,
     )
 
 

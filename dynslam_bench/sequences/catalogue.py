@@ -137,10 +137,8 @@ def open_folder(
     if entry is None:
         description = Description(f"folder/{folder.resolve().name}", intrinsics, fps, R_body_cam=body)
     else:
-        description = Description(
-            entry.id, intrinsics, fps or entry.fps, entry.license, entry.citation, frozenset(entry.tags), entry.split,
-            body,
-        )  # fmt: skip
+        about = (entry.license, entry.citation, frozenset(entry.tags), entry.split)
+        description = Description(entry.id, intrinsics, fps or entry.fps, *about, body)
     return TumSequence(
         folder,
         description,

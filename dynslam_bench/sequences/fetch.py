@@ -140,24 +140,7 @@ def fetch(
     except DownloadError as error:
         raise SequenceError(str(error.args[0]), error.hint) from error
     try:
-        with atomic_folder(found.place) as work:
-            sums = extract(archive, work, progress)
-            top = _top(work, entry, archive)
-            prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
-            inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
-            receipt = Receipt(
-                id=entry.id,
-                url=address,
-                sha256=sha256,
-                size_bytes=archive.stat().st_size,
-                checked=expected is not None,
-                files=len(inside),
-            )
-            write_atomic(top / RECEIPT, receipt.to_json())
-            write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(inside.items())))
-            open_folder(top, entry=entry)
-            if top != work:
-                _lift(top, work)
+        _extract(found, archive, sha256, address, expected is not None, progress)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -171,6 +154,28 @@ def fetch(
     if not keep_archive:
         archive.unlink(missing_ok=True)
     return found.place
+
+
+def _extract(found: Status, archive: Path, sha256: str, address: str, checked: bool, progress: Report | None) -> None:
+    """Unpack an archive, note where it is from and what is in it, and let the sequence appear if it can be opened."""
+    with atomic_folder(found.place) as work:
+        sums = extract(archive, work, progress)
+        top = _top(work, found.entry, archive)
+        prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
+        inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
+        receipt = Receipt(
+            id=found.entry.id,
+            url=address,
+            sha256=sha256,
+            size_bytes=archive.stat().st_size,
+            checked=checked,
+            files=len(inside),
+        )
+        write_atomic(top / RECEIPT, receipt.to_json())
+        write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(inside.items())))
+        open_folder(top, entry=found.entry)
+        if top != work:
+            _lift(top, work)
 
 
 def verify(

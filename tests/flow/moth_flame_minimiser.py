@@ -34,6 +34,23 @@ class Minimum:
     history: Floats
 
 
+def _box(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    low: Floats = np.atleast_2d(np.asarray(lower, dtype=np.float64))
+    high: Floats = np.atleast_2d(np.asarray(upper, dtype=np.float64))
+    low, high = low + np.zeros_like(high), high + np.zeros_like(low)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
+        raise ValueError("bounds must be finite, and lower <= upper")
+    return low, high
+
+
+def _join(moths: Floats, start: Floats, low: Floats, high: Floats) -> None:
+    """Put given positions in the place of the first moths; what is not finite stays drawn."""
+    problems, population, _ = moths.shape
+    given = np.broadcast_to(start, (problems, *start.shape[-2:]))[:, :population]
+    joined = moths[:, : given.shape[1]]
+    joined[:] = np.where(np.isfinite(given), np.clip(given, low, high), joined)
+
+
 def emfoa_minimise(
     fun: Callable[[Floats], Floats],
     lower: NDArray[np.floating],
@@ -62,11 +79,7 @@ def emfoa_minimise(
     Raises:
         ValueError: The bounds are not finite or crossed, or the budget is not positive.
     """
-    low: Floats = np.atleast_2d(np.asarray(lower, dtype=np.float64))
-    high: Floats = np.atleast_2d(np.asarray(upper, dtype=np.float64))
-    low, high = low + np.zeros_like(high), high + np.zeros_like(low)
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
-        raise ValueError("bounds must be finite, and lower <= upper")
+    low, high = _box(lower, upper)
     if budget < 1:
         raise ValueError(f"budget must be positive, got {budget}")
     problems, dimensions = low.shape
@@ -76,10 +89,7 @@ def emfoa_minimise(
     population = max(1, min(population, budget))
     moths = low + (high - low) * rng.random((problems, population, dimensions))
     if start is not None:
-        given = np.asarray(start, dtype=np.float64)
-        given = np.broadcast_to(given, (problems, *given.shape[-2:]))[:, :population]
-        joined = moths[:, : given.shape[1]]
-        moths[:, : given.shape[1]] = np.where(np.isfinite(given), np.clip(given, low, high), joined)
+        _join(moths, np.asarray(start, dtype=np.float64), low, high)
     flames = np.empty((problems, 0, dimensions))
     values = np.empty((problems, 0))
     history: list[Floats] = []

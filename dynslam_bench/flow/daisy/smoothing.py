@@ -93,6 +93,18 @@ def sum_line(gray, row, sums, at, columns):  # type: ignore[no-untyped-def]
     sums[at - 1], sums[at + columns] = sums[at], sums[at + columns - 1]
 
 
+@inlined
+def quarter_line(rows, upper, lower, columns, target):  # type: ignore[no-untyped-def]
+    """Means of 2 x 2 histograms of the rows that begin at `upper` and `lower`; a single column is its own neighbour."""
+    for k in range(8):
+        for each in (lower, upper):
+            rows[each + 8 * columns + k] = rows[each + 8 * columns - 8 + k]
+    for i in range(0, len(target) - 31, 32):
+        left = average(load_words(rows, upper + 2 * i), load_words(rows, lower + 2 * i))
+        right = average(load_words(rows, upper + 2 * i + 32), load_words(rows, lower + 2 * i + 32))
+        store_words(target, i, average_of_pairs(left, right))
+
+
 @kernel
 def fine_levels(start, stop, gray, half, border, blurs, geometry, margin, floor, cells, coarse):  # type: ignore[no-untyped-def]
     """The half-resolution levels, and their last one once more at quarter resolution.
@@ -152,16 +164,8 @@ def fine_levels(start, stop, gray, half, border, blurs, geometry, margin, floor,
                 cell = geometry.base[level] + (margin + y) * geometry.stride[level] + margin
                 normalise_line(rings[level + 1], at, columns, floor, cells, 8 * cell)
             if level == levels - 1 and (y & 1 or rows == 1) and y // 2 < len(coarse):
-                upper, lower = rings[levels], at
                 before = ((y & ~1) & (RING - 1)) * pitch
-                for k in range(8):  # a single column is its own neighbour
-                    for each in (at, before):
-                        upper[each + 8 * columns + k] = upper[each + 8 * columns - 8 + k]
-                target = coarse[y // 2]
-                for i in range(0, len(target) - 31, 32):
-                    left = average(load_words(upper, before + 2 * i), load_words(upper, lower + 2 * i))
-                    right = average(load_words(upper, before + 2 * i + 32), load_words(upper, lower + 2 * i + 32))
-                    store_words(target, i, average_of_pairs(left, right))
+                quarter_line(rings[levels], before, at, columns, coarse[y // 2])
 
 
 @kernel

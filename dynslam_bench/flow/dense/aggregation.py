@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..daisy.cost import appearance, describe_once, descriptor_distance, quantised
-from ..kernels.jit import kernel
+from ..kernels.jit import inlined, kernel
 from .guided_filter import filter_patch
 
 
@@ -34,7 +34,6 @@ def aggregate_and_choose(  # type: ignore[no-untyped-def]
         evaluations: int64 ``[K]``, raw costs computed.
     """
     rows, columns = guide.shape
-    height, width = target.gray.shape
     descriptors = np.empty(0, dtype=np.uint8)
     size = 0
     described = np.zeros(13, dtype=np.bool_)
@@ -43,13 +42,7 @@ def aggregate_and_choose(  # type: ignore[no-untyped-def]
     for r in range(start, stop):
         if starts[r] == starts[r + 1]:
             continue
-        top, bottom, left, right = rows, -1, columns, -1
-        for k in range(starts[r], starts[r + 1]):
-            y, x = members[k] // columns, members[k] % columns
-            top, bottom, left, right = min(top, y), max(bottom, y), min(left, x), max(right, x)
-        top, left = max(top - 2 * radius, 0), max(left - 2 * radius, 0)
-        bottom, right = min(bottom + 2 * radius, rows - 1), min(right + 2 * radius, columns - 1)
-        high, wide = bottom - top + 1, right - left + 1
+        top, left, high, wide = patch_around(members[starts[r] : starts[r + 1]], rows, columns, 2 * radius)
         n = high * wide
         if n > size:
             size = n
@@ -64,27 +57,9 @@ def aggregate_and_choose(  # type: ignore[no-untyped-def]
             u, v, s, theta = candidates[r, c, 0], candidates[r, c, 1], candidates[r, c, 2], candidates[r, c, 3]
             if not np.isfinite(u + v + s + theta):
                 continue
-            si, ti = quantised(s, theta)
-            scale = np.float32(np.exp2(s))
-            a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
-            for y in range(high):
-                for x in range(wide):
-                    k = y * wide + x
-                    px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
-                    mine = (ti * size + k) * 136
-                    if not described[ti]:
-                        describe_once(px, py, ti, reference, tables, descriptors, mine)
-                    dx, dy = px - centres[r, 0], py - centres[r, 1]
-                    tx, ty = centres[r, 0] + u + a * dx - b * dy, centres[r, 1] + v + b * dx + a * dy
-                    cost = np.int64(tables.ceiling)
-                    if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
-                        cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, descriptors, target, tables))
-                        if tables.appearance:
-                            gray, gradient = appearance(target.gray, tx, ty)
-                            own_gray, own_gradient = appearance(reference.gray, px, py)
-                            cost += tables.intensity[abs(gray - own_gray)]
-                            cost += tables.gradient[min(abs(gradient - own_gradient), 255)]
-                    raw[k] = np.float32(cost)
+            centre, corner = (centres[r, 0], centres[r, 1]), (left, top, wide, high)
+            sides = (reference, target, tables)
+            ti = raw_costs((u, v, s, theta), centre, corner, size, sides, descriptors, described, raw)
             described[ti] = True
             evaluations[r] += n
             filter_patch(patch_guide[:n], raw[:n], high, wide, radius, epsilon, work, filtered[:n])
@@ -94,6 +69,61 @@ def aggregate_and_choose(  # type: ignore[no-untyped-def]
                 if cost < best[y, x]:
                     best[y, x] = cost
                     winner[y, x, 0], winner[y, x, 1], winner[y, x, 2], winner[y, x, 3] = u, v, s, theta
+
+
+@inlined
+def patch_around(members, rows, columns, room):  # type: ignore[no-untyped-def]
+    """Top, left, height and width of the box around pixels, with `room` on every side as far as the image goes."""
+    top, bottom, left, right = rows, -1, columns, -1
+    for member in members:
+        y, x = member // columns, member % columns
+        top, bottom, left, right = min(top, y), max(bottom, y), min(left, x), max(right, x)
+    top, left = max(top - room, 0), max(left - room, 0)
+    bottom, right = min(bottom + room, rows - 1), min(right + room, columns - 1)
+    return top, left, bottom - top + 1, right - left + 1
+
+
+@inlined
+def raw_costs(label, centre, patch, size, sides, descriptors, described, raw):  # type: ignore[no-untyped-def]
+    """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
+
+    Args:
+        label: Displacement, scale and rotation at the centre.
+        centre: Full-image pixels.
+        patch: Its left and top, width and height, half-resolution pixels.
+        size: Descriptors a rotation that `descriptors` has room for.
+        sides: Reference, target and tables.
+        descriptors: uint8, flat ``[13, size, 136]``, filled for rotations that are not `described` yet.
+        described: bool ``[13]``.
+        raw: float32, flat ``[height * width]`` of the patch, filled.
+
+    Returns:
+        The index of the label's rotation.
+    """
+    (u, v, s, theta), (left, top, wide, high), (reference, target, tables) = label, patch, sides
+    height, width = target.gray.shape
+    si, ti = quantised(s, theta)
+    scale = np.float32(np.exp2(s))
+    a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
+    for y in range(high):
+        for x in range(wide):
+            k = y * wide + x
+            px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
+            mine = (ti * size + k) * 136
+            if not described[ti]:
+                describe_once(px, py, ti, reference, tables, descriptors, mine)
+            dx, dy = px - centre[0], py - centre[1]
+            tx, ty = centre[0] + u + a * dx - b * dy, centre[1] + v + b * dx + a * dy
+            cost = np.int64(tables.ceiling)
+            if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
+                cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, descriptors, target, tables))
+                if tables.appearance:
+                    gray, gradient = appearance(target.gray, tx, ty)
+                    own_gray, own_gradient = appearance(reference.gray, px, py)
+                    cost += tables.intensity[abs(gray - own_gray)]
+                    cost += tables.gradient[min(abs(gradient - own_gradient), 255)]
+            raw[k] = np.float32(cost)
+    return ti
 
 
 @kernel

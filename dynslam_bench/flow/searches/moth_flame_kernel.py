@@ -48,10 +48,7 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
     label = np.empty(4, dtype=np.float32)
     for i in range(start, stop):
-        for j in range(4):
-            lower[j], upper[j] = state.lower[i, j], state.upper[i, j]
-            for m in range(population):
-                moths[m, j], flames[m, j] = state.moths[i, m, j], state.flames[i, m, j]
+        copy_population(state.lower[i], state.upper[i], state.moths[i], state.flames[i], lower, upper, moths, flames)
         for m in range(population):
             costs[m] = state.costs[i, m]
         random = first_state(seed, i, phase)
@@ -60,41 +57,18 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
         while True:  # one place where costs are computed: what differs is which labels are tried
             count = 0
             if stage == CANDIDATES:
-                for c in range(candidates.shape[1]):
-                    total = np.float32(0)
-                    for j in range(4):
-                        trials[count, j] = candidates[i, c, j]
-                        total += candidates[i, c, j]
-                    count += np.isfinite(total)
+                count = finite_labels(candidates[i], trials)
                 if phase == 0:
                     placed = min(count, population, end - used)
                     for m in range(placed):
                         for j in range(4):
                             moths[m, j] = trials[m, j]
             elif stage == FOUNDING:
-                for m in range(placed, population):
-                    random = advance(random)
-                    bits = scrambled(random)
-                    for j in range(4):  # LB + (UB - LB) rand
-                        moths[m, j] = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
-                        trials[count, j] = moths[m, j]
-                    count += 1
+                random = scatter(moths, placed, lower, upper, trials, random)
+                count = population - placed
             elif stage == OPPOSITES:
-                for j in range(4):  # dynamic bounds dy, dz (Eq. 20)
-                    low[j], high[j] = moths[0, j], moths[0, j]
-                    for m in range(1, population):
-                        low[j], high[j] = min(low[j], moths[m, j]), max(high[j], moths[m, j])
+                random = oppose(moths, lower, upper, low, high, trials, random)
                 count = population
-                for m in range(population):
-                    random = advance(random)
-                    factor = uniform(scrambled(random), 0)
-                    random = advance(random)
-                    bits = scrambled(random)
-                    for j in range(4):
-                        opposite = factor * (low[j] + high[j]) - moths[m, j]  # Eq. 19
-                        if opposite < lower[j] or opposite > upper[j]:  # Eq. 21-22
-                            opposite = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
-                        trials[m, j] = opposite
             else:
                 if used >= end:
                     break
@@ -124,12 +98,66 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
                             moths[m, j] = flames[m, j]
                 stage = FLIGHT
         state.used[i] = used
-        for j in range(4):
-            state.lower[i, j], state.upper[i, j] = lower[j], upper[j]
-            for m in range(population):
-                state.moths[i, m, j], state.flames[i, m, j] = moths[m, j], flames[m, j]
+        copy_population(lower, upper, moths, flames, state.lower[i], state.upper[i], state.moths[i], state.flames[i])
         for m in range(population):
             state.costs[i, m] = costs[m]
+
+
+@inlined
+def copy_population(  # type: ignore[no-untyped-def]
+    from_lower, from_upper, from_moths, from_flames, lower, upper, moths, flames
+):
+    """Copy a point's box, moths and flames."""
+    for j in range(4):
+        lower[j], upper[j] = from_lower[j], from_upper[j]
+        for m in range(len(moths)):
+            moths[m, j], flames[m, j] = from_moths[m, j], from_flames[m, j]
+
+
+@inlined
+def finite_labels(candidates, trials):  # type: ignore[no-untyped-def]
+    """Fill `trials` with the candidates that are finite; returns how many."""
+    count = 0
+    for c in range(len(candidates)):
+        total = np.float32(0)
+        for j in range(4):
+            trials[count, j] = candidates[c, j]
+            total += candidates[c, j]
+        count += np.isfinite(total)
+    return count
+
+
+@inlined
+def scatter(moths, placed, lower, upper, trials, random):  # type: ignore[no-untyped-def]
+    """Place the moths from `placed` on anywhere in the box, and try them; returns the next random state."""
+    for m in range(placed, len(moths)):
+        random = advance(random)
+        bits = scrambled(random)
+        for j in range(4):  # LB + (UB - LB) rand
+            moths[m, j] = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
+            trials[m - placed, j] = moths[m, j]
+    return random
+
+
+@inlined
+def oppose(moths, lower, upper, low, high, trials, random):  # type: ignore[no-untyped-def]
+    """Fill `trials` with the moths' opposites (`moth_flame.opposites`); returns the next random state."""
+    population = len(moths)
+    for j in range(4):  # dynamic bounds dy, dz (Eq. 20)
+        low[j], high[j] = moths[0, j], moths[0, j]
+        for m in range(1, population):
+            low[j], high[j] = min(low[j], moths[m, j]), max(high[j], moths[m, j])
+    for m in range(population):
+        random = advance(random)
+        factor = uniform(scrambled(random), 0)
+        random = advance(random)
+        bits = scrambled(random)
+        for j in range(4):
+            opposite = factor * (low[j] + high[j]) - moths[m, j]  # Eq. 19
+            if opposite < lower[j] or opposite > upper[j]:  # Eq. 21-22
+                opposite = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
+            trials[m, j] = opposite
+    return random
 
 
 @inlined

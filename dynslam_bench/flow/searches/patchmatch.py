@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..daisy.cost import label_cost
-from ..kernels.jit import kernel
+from ..kernels.jit import inlined, kernel
 from .common import advance, first_state, insert, scrambled, uniform, widen
 
 
@@ -57,13 +57,7 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
                     widened = True
                 random = advance(random)
                 bits = scrambled(random)
-                for j in range(4):
-                    extent = upper[j] - lower[j]
-                    if shrink == 1:
-                        label[j] = lower[j] + extent * uniform(bits, j)
-                    else:
-                        step = (np.float32(2) * uniform(bits, j) - np.float32(1)) * window * extent
-                        label[j] = min(max(flames[0, j] + step, lower[j]), upper[j])
+                draw(label, bits, lower, upper, flames, window, shrink)
                 window *= np.float32(shrink)
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
@@ -75,3 +69,15 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
         state.used[i], state.costs[i, 0] = used, costs[0]
         for j in range(4):
             state.lower[i, j], state.upper[i, j], state.flames[i, 0, j] = lower[j], upper[j], flames[0, j]
+
+
+@inlined
+def draw(label, bits, lower, upper, flames, window, shrink):  # type: ignore[no-untyped-def]
+    """Fill a label: anywhere in the box (`shrink` 1), or in a window of it around the best label."""
+    for j in range(4):
+        extent = upper[j] - lower[j]
+        if shrink == 1:
+            label[j] = lower[j] + extent * uniform(bits, j)
+        else:
+            step = (np.float32(2) * uniform(bits, j) - np.float32(1)) * window * extent
+            label[j] = min(max(flames[0, j] + step, lower[j]), upper[j])

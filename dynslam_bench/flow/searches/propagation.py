@@ -107,12 +107,7 @@ def common_motions(points, labels, costs, hypotheses, tolerance, seed, out):  # 
     for m in range(2):
         if count < 6:
             return
-        voting, every = 0, -(-count // VOTERS)
-        for k in range(0, count, every):
-            voters[0, voting], voters[1, voting] = x[k], y[k]
-            voters[2, voting], voters[3, voting] = to_x[k], to_y[k]
-            voting += 1
-        from_x, from_y, goal_x, goal_y = voters[0, :voting], voters[1, :voting], voters[2, :voting], voters[3, :voting]
+        voting = choose_voters(x, y, to_x, to_y, count, voters)
         best = 0
         for _ in range(hypotheses):
             state = advance(state)
@@ -129,23 +124,49 @@ def common_motions(points, labels, costs, hypotheses, tolerance, seed, out):  # 
             if grown < 0.15 or grown > 6.5:
                 continue
             tx, ty = to_x[i] - a * x[i] + b * y[i], to_y[i] - b * x[i] - a * y[i]
-            votes = np.int32(0)
-            for k in range(voting):
-                rx, ry = a * from_x[k] - b * from_y[k] + tx - goal_x[k], b * from_x[k] + a * from_y[k] + ty - goal_y[k]
-                votes = np.int32(votes + np.int32(rx * rx + ry * ry < limit))
+            votes = count_votes(voters, voting, a, b, tx, ty, limit)
             if votes > best and votes >= 6:
                 best = int(votes)
                 out[m, 0], out[m, 1], out[m, 2], out[m, 3] = a, b, tx, ty
         if best == 0:
             return
         a, b, tx, ty = out[m, 0], out[m, 1], out[m, 2], out[m, 3]
-        left = 0
-        for k in range(count):  # the second motion is sought among those that do not obey the first
-            rx, ry = a * x[k] - b * y[k] + tx - to_x[k], b * x[k] + a * y[k] + ty - to_y[k]
-            if rx * rx + ry * ry >= 4 * limit:
-                x[left], y[left], to_x[left], to_y[left] = x[k], y[k], to_x[k], to_y[k]
-                left += 1
-        count = left
+        # the second motion is sought among those that do not obey the first
+        count = drop_followers(x, y, to_x, to_y, count, a, b, tx, ty, 4 * limit)
+
+
+@inlined
+def choose_voters(x, y, to_x, to_y, count, voters):  # type: ignore[no-untyped-def]
+    """Copy about `VOTERS` of `count` points, evenly spread, into ``voters`` ``[4, ...]``; returns how many."""
+    voting, every = 0, -(-count // VOTERS)
+    for k in range(0, count, every):
+        voters[0, voting], voters[1, voting] = x[k], y[k]
+        voters[2, voting], voters[3, voting] = to_x[k], to_y[k]
+        voting += 1
+    return voting
+
+
+@inlined
+def count_votes(voters, voting, a, b, tx, ty, limit):  # type: ignore[no-untyped-def]
+    """How many voters a motion takes to where they were found, by squared distance."""
+    from_x, from_y, goal_x, goal_y = voters[0, :voting], voters[1, :voting], voters[2, :voting], voters[3, :voting]
+    votes = np.int32(0)
+    for k in range(voting):
+        rx, ry = a * from_x[k] - b * from_y[k] + tx - goal_x[k], b * from_x[k] + a * from_y[k] + ty - goal_y[k]
+        votes = np.int32(votes + np.int32(rx * rx + ry * ry < limit))
+    return votes
+
+
+@inlined
+def drop_followers(x, y, to_x, to_y, count, a, b, tx, ty, limit):  # type: ignore[no-untyped-def]
+    """Move those of `count` points that a motion misses by more than the root of `limit` forward; returns how many."""
+    left = 0
+    for k in range(count):
+        rx, ry = a * x[k] - b * y[k] + tx - to_x[k], b * x[k] + a * y[k] + ty - to_y[k]
+        if rx * rx + ry * ry >= limit:
+            x[left], y[left], to_x[left], to_y[left] = x[k], y[k], to_x[k], to_y[k]
+            left += 1
+    return left
 
 
 @inlined

@@ -46,7 +46,6 @@ COCO = Checkpoint(
     "BSD-3-Clause",
     "COCO train2017",
 )
-CHECKPOINTS: dict[str, Checkpoint] = {COCO.id: COCO}
 
 
 def embedded_weights() -> Path | None:

@@ -78,13 +78,12 @@ def _panel(
         cv2.line(canvas, (left, y), (left + width, y), (225, 225, 225), 1)
         label = f"{10**tick:.3g}" if logarithmic else f"{tick:.2f}"
         cv2.putText(canvas, label, (left - 58, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (60, 60, 60), 1, cv2.LINE_AA)
-        step = f"{last * k / 4:.0f}"
-        cv2.putText(canvas, step, (left + width * k // 4 - 12, top + height + 18), cv2.FONT_HERSHEY_SIMPLEX, 0.4,
-                    (60, 60, 60), 1, cv2.LINE_AA)  # fmt: skip
+        step, at = f"{last * k / 4:.0f}", (left + width * k // 4 - 12, top + height + 18)
+        cv2.putText(canvas, step, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (60, 60, 60), 1, cv2.LINE_AA)
     for number, name in enumerate(names):
         points = [place(row["step"], row[name]) for row in rows if name in row]
         colour = COLOURS[number % len(COLOURS)]
         if points:
             cv2.polylines(canvas, [np.array(points, np.int32)], False, colour, 1, cv2.LINE_AA)
-        cv2.putText(canvas, name, (left + 8 + 85 * number, top + height + 38), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour,
-                    1, cv2.LINE_AA)  # fmt: skip
+        at = (left + 8 + 85 * number, top + height + 38)
+        cv2.putText(canvas, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)

@@ -156,8 +156,8 @@ def _paste_exactly(
     to_plane = np.array(
         [[scale[0], 0, (left + 0.5 - box[0]) * scale[0] - 0.5], [0, scale[1], (top + 0.5 - box[1]) * scale[1] - 0.5]]
     )
-    patch = cv2.warpAffine(plane, to_plane, (right - left, bottom - top), borderMode=cv2.BORDER_REPLICATE,
-                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # fmt: skip
+    size, flags = (right - left, bottom - top), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    patch = cv2.warpAffine(plane, to_plane, size, borderMode=cv2.BORDER_REPLICATE, flags=flags)
     columns, rows = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
     inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & ((columns >= box[0]) & (columns <= box[2]))[None]
     mask[top:bottom, left:right] = (patch >= threshold) & inside

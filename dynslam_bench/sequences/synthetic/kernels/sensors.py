@@ -42,11 +42,32 @@ def _uniform(h):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _depths_around(depth, row, u, reach):  # type: ignore[no-untyped-def]
+    """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
+    height, width = depth.shape
+    lowest, highest = depth[row, u], depth[row, u]
+    for k in range(4):
+        if k == 0:
+            v2, u2 = row, u - reach
+        elif k == 1:
+            v2, u2 = row, u + reach
+        elif k == 2:
+            v2, u2 = row - reach, u
+        else:
+            v2, u2 = row + reach, u
+        if 0 <= v2 < height and 0 <= u2 < width:
+            other = depth[v2, u2]
+            if other > 0.0:
+                lowest, highest = min(lowest, other), max(highest, other)
+    return lowest, highest
+
+
+@kernel
 def measure_depth(  # type: ignore[no-untyped-def]
     row0, row1, seed, fx, baseline, depth, cosine, color, disparity_noise, near, far, edge_px, dark, factor, out
 ):
     """Raw depth (uint16, `factor` units a metre, 0 = missing) of rows from the exact z-depth."""
-    height, width = depth.shape
+    width = depth.shape[1]
     shadow_right = np.empty(width, np.bool_)
     for row in range(row0, row1):
         # 1. Projector to the right of the camera: its column is u + d - const; scanning from the right, a pixel is
@@ -68,21 +89,7 @@ def measure_depth(  # type: ignore[no-untyped-def]
                 continue
             h = _hash(seed, row * width + u)
             # 3a. Depth edges: the correlation window (about 9x9 pixels) mixes two surfaces.
-            lowest, highest = z, z
-            reach = edge_px
-            for k in range(4):
-                if k == 0:
-                    v2, u2 = row, u - reach
-                elif k == 1:
-                    v2, u2 = row, u + reach
-                elif k == 2:
-                    v2, u2 = row - reach, u
-                else:
-                    v2, u2 = row + reach, u
-                if 0 <= v2 < height and 0 <= u2 < width:
-                    other = depth[v2, u2]
-                    if other > 0.0:
-                        lowest, highest = min(lowest, other), max(highest, other)
+            lowest, highest = _depths_around(depth, row, u, edge_px)
             chance = 0.0
             step = fx * baseline * (1.0 / lowest - 1.0 / highest)
             if step > 1.0:

@@ -125,67 +125,98 @@ def _yaw(angle: float) -> Array:
     return turn(math.degrees(angle))
 
 
-def add_person(parts: Parts, who: Person, how: Posture) -> None:
-    """Add the person's primitives, always as many and in the same order."""
-    k, b = who.height / 1.75, who.build
-    thigh, shin, foot = 0.43 * k, 0.41 * k, 0.085 * k
-    spine, upper, fore = 0.46 * k, 0.29 * k, 0.26 * k
-    phase, gait, sit, lively, t = how.stride, how.gait, how.sit, how.gesture, how.clock
-    seed = 1.7 * who.instance
+Style = dict[str, Any]
+"""Instance, texture, tint and so on of `Parts.add`."""
 
-    def wave(f: float, p: float) -> float:
-        return math.sin(2 * math.pi * f * t + p + seed)
 
-    # Legs: hip and knee angles of the gait, blended with sitting; the pelvis rests on the lower foot or on the seat.
-    hips, knees = [], []
-    for side in (-1, 1):
-        swing = phase + (0.0 if side < 0 else math.pi)
-        hip = gait * (0.08 + 0.46 * math.sin(swing))
-        knee = gait * (0.12 + 0.85 * max(0.0, math.cos(swing)) ** 2) + 0.03
-        hips.append(hip * (1 - sit) + sit * (1.45 + 0.03 * side))
-        knees.append(knee * (1 - sit) + sit * (1.35 + 0.12 * side))
-    drop = max(thigh * math.cos(h) + shin * math.cos(h - n) for h, n in zip(hips, knees, strict=True))
-    standing = drop + foot
-    seat = 0.485 + 0.085 * b
-    pelvis_z = standing * (1 - sit) + sit * seat
-    body = turn(how.facing)
-    sway = (1 - gait) * (1 - 0.85 * sit)
-    supple = 1 - 0.8 * sit  # who sits leans back: arms and head go on, the trunk hardly moves
-    root = np.array([how.x, how.y, pelvis_z]) + body @ np.array(
-        [0.012 * sway * wave(0.31, 0.0), 0.012 * sway * wave(0.23, 2.0), 0.0]
-    )
-    twist = gait * 0.1 * math.sin(phase) + supple * lively * 0.12 * wave(0.27, 0.4)
-    lean = 0.05 * gait + sit * 0.06 + supple * (0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2))
-    trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * supple * wave(0.17, 0.7))
-    hipline = body @ _yaw(-twist)
-    jeans: dict[str, Any] = {"instance": who.instance, "texture": "denim", "repeat": (2.0, 3.0), "tint": who.trousers}
-    shirt: dict[str, Any] = {"instance": who.instance, "texture": who.shirt, "tint": who.shirt_tint}
-    bare: dict[str, Any] = {"instance": who.instance, "texture": "plain", "tint": who.skin}
+class _Figure:
+    """A person in a posture: the joints that everything hangs on, and how to add a primitive.
 
-    def limb(a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> None:
+    Who sits leans back: arms and head go on, the trunk hardly moves.
+    """
+
+    def __init__(self, parts: Parts, who: Person, how: Posture) -> None:
+        self.parts, self.who, self.how = parts, who, how
+        self.k, self.b = who.height / 1.75, who.build
+        self.seed = 1.7 * who.instance
+        k, gait, sit, lively, wave = self.k, how.gait, how.sit, how.gesture, self.wave
+        pelvis_z = self._stand()
+        body = turn(how.facing)
+        sway = (1 - gait) * (1 - 0.85 * sit)
+        supple = 1 - 0.8 * sit
+        swaying = np.array([0.012 * sway * wave(0.31, 0.0), 0.012 * sway * wave(0.23, 2.0), 0.0])
+        self.root = np.array([how.x, how.y, pelvis_z]) + body @ swaying
+        twist = gait * 0.1 * math.sin(how.stride) + supple * lively * 0.12 * wave(0.27, 0.4)
+        lean = 0.05 * gait + sit * 0.06 + supple * (0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2))
+        self.trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * supple * wave(0.17, 0.7))
+        self.hipline = body @ _yaw(-twist)
+        self.neck = self.root + self.trunk @ np.array([0.0, -0.005, 0.46 * k + 0.05 * k])
+        self.jeans: Style = self._style("denim", who.trousers, repeat=(2.0, 3.0))
+        self.shirt: Style = self._style(who.shirt, who.shirt_tint)
+        self.bare: Style = self._style("plain", who.skin)
+
+    def _style(self, texture: str, tint: Any, **more: Any) -> Style:
+        return {"instance": self.who.instance, "texture": texture, "tint": tint, **more}
+
+    def _stand(self) -> float:
+        """Hip and knee angles of the gait, blended with sitting; the pelvis rests on the lower foot or on the seat."""
+        how, k = self.how, self.k
+        thigh, shin, foot = 0.43 * k, 0.41 * k, 0.085 * k
+        phase, gait, sit = how.stride, how.gait, how.sit
+        self.hips: list[float] = []
+        self.knees: list[float] = []
+        for side in (-1, 1):
+            swing = phase + (0.0 if side < 0 else math.pi)
+            hip = gait * (0.08 + 0.46 * math.sin(swing))
+            knee = gait * (0.12 + 0.85 * max(0.0, math.cos(swing)) ** 2) + 0.03
+            self.hips.append(hip * (1 - sit) + sit * (1.45 + 0.03 * side))
+            self.knees.append(knee * (1 - sit) + sit * (1.35 + 0.12 * side))
+        bent = zip(self.hips, self.knees, strict=True)
+        standing = max(thigh * math.cos(h) + shin * math.cos(h - n) for h, n in bent) + foot
+        seat = 0.485 + 0.085 * self.b
+        return standing * (1 - sit) + sit * seat
+
+    def wave(self, f: float, p: float) -> float:
+        """Idle movement: a sine of frequency f in Hz and phase p."""
+        return math.sin(2 * math.pi * f * self.how.clock + p + self.seed)
+
+    def limb(self, a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> None:
         """A round cone from a to c; its section is `flat` times as wide across `side`'s normal."""
         rotation, length = along(a, c, side)
-        parts.add(ROUND_CONE, rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
+        self.parts.add(ROUND_CONE, rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
 
-    def ball(centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any) -> None:
-        parts.add(ROUND_CONE, rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
+    def ball(self, centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any) -> None:
+        """An ellipsoid."""
+        self.parts.add(ROUND_CONE, rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
 
-    # Trunk: pelvis, belly, chest, shoulders; wider than deep.
+
+def add_person(parts: Parts, who: Person, how: Posture) -> None:
+    """Add the person's primitives, always as many and in the same order."""
+    figure = _Figure(parts, who, how)
+    _add_trunk(figure)
+    _add_head(figure)
+    for index, side in enumerate((-1, 1)):
+        _add_arm(figure, side)
+        _add_leg(figure, side, index)
+
+
+def _add_trunk(f: _Figure) -> None:
+    """Pelvis, belly, chest, shoulders; wider than deep."""
+    k, b, root, trunk, hipline = f.k, f.b, f.root, f.trunk, f.hipline
     right = trunk @ _X
-    limb(
+    f.limb(
         root + hipline @ np.array([-0.055 * k, 0, 0.01]),
         root + hipline @ np.array([0.055 * k, 0, 0.01]),
         0.115 * k * b,
         0.115 * k * b,
         hipline @ np.array([0.0, 0.0, 1.0]),
         0.95,
-        **jeans,
+        **f.jeans,
     )
     waist = root + trunk @ np.array([0.0, 0.0, 0.08 * k])
     chest = root + trunk @ np.array([0.0, 0.005, 0.36 * k])
-    neck = root + trunk @ np.array([0.0, -0.005, spine + 0.05 * k])
-    limb(waist, chest, 0.148 * k * b, 0.168 * k * b, right, 0.68, repeat=(5.0, 6.0), **shirt)
-    limb(
+    f.limb(waist, chest, 0.148 * k * b, 0.168 * k * b, right, 0.68, repeat=(5.0, 6.0), **f.shirt)
+    f.limb(
         chest - right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
         chest + right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
         0.088 * k * b,
@@ -193,24 +224,29 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
         trunk @ _Y,
         1.0,
         repeat=(3.0, 6.0),
-        **shirt,
+        **f.shirt,
     )
-    # Neck and head, which looks about.
+
+
+def _add_head(f: _Figure) -> None:
+    """Neck and head, which looks about."""
+    k, who, trunk, neck, gait, lively = f.k, f.who, f.trunk, f.neck, f.how.gait, f.how.gesture
+    right = trunk @ _X
     skull = neck + trunk @ np.array([0.0, 0.015 * k, 0.15 * k])
     head = (
         trunk
-        @ _yaw(0.3 * wave(0.13, 0.9) * (1 - gait) + 0.1 * lively * wave(0.4, 0.1))
-        @ _pitch(0.06 * wave(0.29, 0.3) - 0.03)
+        @ _yaw(0.3 * f.wave(0.13, 0.9) * (1 - gait) + 0.1 * lively * f.wave(0.4, 0.1))
+        @ _pitch(0.06 * f.wave(0.29, 0.3) - 0.03)
     )
-    limb(
+    f.limb(
         neck - trunk @ np.array([0, 0, 0.04 * k]),
         skull - trunk @ np.array([0, 0.01, 0.03 * k]),
         0.058 * k,
         0.052 * k,
         right,
-        **bare,
+        **f.bare,
     )
-    ball(
+    f.ball(
         skull,
         head,
         (0.077 * k, 0.098 * k, 0.122 * k),
@@ -220,20 +256,28 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
         repeat=(1.0, 0.5),
         shift=(0.5, 0.5),
     )
-    ball(skull + head @ np.array([0, 0.092 * k, -0.012 * k]), head, (0.015 * k, 0.022 * k, 0.026 * k), **bare)
+    f.ball(skull + head @ np.array([0, 0.092 * k, -0.012 * k]), head, (0.015 * k, 0.022 * k, 0.026 * k), **f.bare)
     for side in (-1, 1):
-        ball(
-            skull + head @ np.array([side * 0.077 * k, -0.005, -0.01]), head, (0.012 * k, 0.024 * k, 0.033 * k), **bare
+        f.ball(
+            skull + head @ np.array([side * 0.077 * k, -0.005, -0.01]),
+            head,
+            (0.012 * k, 0.024 * k, 0.033 * k),
+            **f.bare,
         )
-    mane: dict[str, Any] = {"instance": who.instance, "texture": "hair", "repeat": (3.0, 0.5), "tint": who.hair}
-    ball(
+    _add_hair(f, skull, head)
+
+
+def _add_hair(f: _Figure, skull: Array, head: Array) -> None:
+    k, who = f.k, f.who
+    mane: Style = {"instance": who.instance, "texture": "hair", "repeat": (3.0, 0.5), "tint": who.hair}
+    f.ball(
         skull + head @ np.array([0, -0.018 * k, 0.03 * k]),
         head @ _pitch(0.35),
         (0.086 * k, 0.101 * k, 0.108 * k),
         **mane,
     )
     if who.long_hair:
-        limb(
+        f.limb(
             skull + head @ np.array([0, -0.06, 0.0]),
             skull + head @ np.array([0, -0.075, -0.15 * k]),
             0.075 * k,
@@ -243,63 +287,71 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
             **{**mane, "repeat": (4.0, 2.0)},
         )
     if who.cap:
-        ball(
+        f.ball(
             skull + head @ np.array([0, 0.01, 0.075 * k]),
             head @ _pitch(0.15),
             (0.088 * k, 0.108 * k, 0.065 * k),
             **{**mane, "tint": who.trousers},
         )
-        ball(
+        f.ball(
             skull + head @ np.array([0, 0.12 * k, 0.06 * k]),
             head,
             (0.07 * k, 0.06 * k, 0.008 * k),
             **{**mane, "tint": who.trousers},
         )
-    for index, side in enumerate((-1, 1)):
-        # Arms: counter-swing of the gait, gestures with the hands before the chest, hands on the lap when sitting.
-        swing = phase + (math.pi if side < 0 else 0.0)
-        talk = lively * (0.5 + 0.5 * wave(0.11, 1.5 * side)) ** 0.7
-        pitch = (
-            gait * 0.42 * math.sin(swing)
-            + sit * (1 - talk) * 0.35
-            + talk * (0.45 + 0.35 * wave(0.47 + 0.06 * side, side))
-        )
-        abduct = side * (0.14 + 0.05 * (1 - gait) + talk * (0.12 + 0.15 * wave(0.33, 2.0 * side)))
-        bend = (
-            0.2
-            + gait * (0.25 + 0.15 * math.sin(swing))
-            + sit * (1 - talk) * 0.95
-            + talk * (1.35 + 0.5 * wave(0.61, 1.1 * side))
-        )
-        shoulder = neck + trunk @ np.array([side * 0.185 * k * b, 0.0, -0.055 * k])
-        arm = trunk @ _roll(-abduct) @ _pitch(pitch)
-        elbow = shoulder + arm @ np.array([0, 0, -upper])
-        lower = arm @ _roll(side * 0.35 * min(bend, 1.0)) @ _pitch(bend)
-        wrist = elbow + lower @ np.array([0, 0, -fore])
-        limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, arm @ _Y, repeat=(2.0, 6.0), **shirt)
-        if who.long_sleeves:
-            limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, lower @ _Y, repeat=(2.0, 6.0), **shirt)
-        else:
-            limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, lower @ _Y, **bare)
-        hand = lower @ _pitch(0.25 * wave(0.7, side))
-        ball(wrist + hand @ np.array([0, 0.005, -0.055 * k]), hand, (0.022 * k, 0.038 * k, 0.058 * k), **bare)
-        ball(
-            wrist + hand @ np.array([0.0, 0.035 * k, -0.035 * k]),
-            hand @ _pitch(0.6),
-            (0.011 * k, 0.013 * k, 0.034 * k),
-            **bare,
-        )
-        # Legs.
-        joint = root + hipline @ np.array([side * 0.095 * k * b, 0.0, -0.01])
-        upper_leg = hipline @ _roll(-side * (0.02 + 0.1 * sit)) @ _pitch(hips[index])
-        knee_at = joint + upper_leg @ np.array([0, 0, -thigh])
-        lower_leg = upper_leg @ _pitch(-knees[index])
-        ankle = knee_at + lower_leg @ np.array([0, 0, -shin])
-        limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, upper_leg @ _Y, **jeans)
-        limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, lower_leg @ _Y, **jeans)
-        ground = hipline @ _pitch((hips[index] - knees[index]) * 0.6 * (1 - sit))
-        heel, toe = (
-            ankle + ground @ np.array([0, -0.03, -0.035 * k]),
-            ankle + ground @ np.array([0, 0.15 * k, -0.05 * k]),
-        )
-        limb(heel, toe, 0.045 * k, 0.034 * k, ground @ _X, 0.95, instance=who.instance, texture="plain", tint=who.shoes)
+
+
+def _add_arm(f: _Figure, side: int) -> None:
+    """Counter-swing of the gait, gestures with the hands before the chest, hands on the lap when sitting."""
+    k, b, who, trunk, neck = f.k, f.b, f.who, f.trunk, f.neck
+    gait, sit, lively, upper, fore = f.how.gait, f.how.sit, f.how.gesture, 0.29 * k, 0.26 * k
+    swing = f.how.stride + (math.pi if side < 0 else 0.0)
+    talk = lively * (0.5 + 0.5 * f.wave(0.11, 1.5 * side)) ** 0.7
+    pitch = (
+        gait * 0.42 * math.sin(swing)
+        + sit * (1 - talk) * 0.35
+        + talk * (0.45 + 0.35 * f.wave(0.47 + 0.06 * side, side))
+    )
+    abduct = side * (0.14 + 0.05 * (1 - gait) + talk * (0.12 + 0.15 * f.wave(0.33, 2.0 * side)))
+    bend = (
+        0.2
+        + gait * (0.25 + 0.15 * math.sin(swing))
+        + sit * (1 - talk) * 0.95
+        + talk * (1.35 + 0.5 * f.wave(0.61, 1.1 * side))
+    )
+    shoulder = neck + trunk @ np.array([side * 0.185 * k * b, 0.0, -0.055 * k])
+    arm = trunk @ _roll(-abduct) @ _pitch(pitch)
+    elbow = shoulder + arm @ np.array([0, 0, -upper])
+    lower = arm @ _roll(side * 0.35 * min(bend, 1.0)) @ _pitch(bend)
+    wrist = elbow + lower @ np.array([0, 0, -fore])
+    f.limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, arm @ _Y, repeat=(2.0, 6.0), **f.shirt)
+    if who.long_sleeves:
+        f.limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, lower @ _Y, repeat=(2.0, 6.0), **f.shirt)
+    else:
+        f.limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, lower @ _Y, **f.bare)
+    hand = lower @ _pitch(0.25 * f.wave(0.7, side))
+    f.ball(wrist + hand @ np.array([0, 0.005, -0.055 * k]), hand, (0.022 * k, 0.038 * k, 0.058 * k), **f.bare)
+    f.ball(
+        wrist + hand @ np.array([0.0, 0.035 * k, -0.035 * k]),
+        hand @ _pitch(0.6),
+        (0.011 * k, 0.013 * k, 0.034 * k),
+        **f.bare,
+    )
+
+
+def _add_leg(f: _Figure, side: int, index: int) -> None:
+    k, b, who, root, hipline, sit = f.k, f.b, f.who, f.root, f.hipline, f.how.sit
+    thigh, shin, hip, knee = 0.43 * k, 0.41 * k, f.hips[index], f.knees[index]
+    joint = root + hipline @ np.array([side * 0.095 * k * b, 0.0, -0.01])
+    upper_leg = hipline @ _roll(-side * (0.02 + 0.1 * sit)) @ _pitch(hip)
+    knee_at = joint + upper_leg @ np.array([0, 0, -thigh])
+    lower_leg = upper_leg @ _pitch(-knee)
+    ankle = knee_at + lower_leg @ np.array([0, 0, -shin])
+    f.limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, upper_leg @ _Y, **f.jeans)
+    f.limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, lower_leg @ _Y, **f.jeans)
+    ground = hipline @ _pitch((hip - knee) * 0.6 * (1 - sit))
+    heel, toe = (
+        ankle + ground @ np.array([0, -0.03, -0.035 * k]),
+        ankle + ground @ np.array([0, 0.15 * k, -0.05 * k]),
+    )
+    f.limb(heel, toe, 0.045 * k, 0.034 * k, ground @ _X, 0.95, instance=who.instance, texture="plain", tint=who.shoes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from dynslam_bench.core.seeding import stream
@@ -56,29 +57,38 @@ def write_script(people: str, instance: int) -> Script:
     def j(low: float, high: float) -> float:
         return pick(rng, instance, low, high)
 
-    first: tuple[Key, ...]
-    second: tuple[Key, ...]
-    chairs: tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]
-    if people == "sitting":
-        ax, ay, bx, by = -j(0.5, 0.62), j(1.62, 1.74), j(0.46, 0.58), j(1.68, 1.8)
-        fa, fb = 180 + j(18, 35), 180 - j(22, 40)
-        first = (
-            Key(0, ax, ay, fa, 1, 0.39),
-            Key(4, ax, ay, fa + 1.5, 1, 0.55),
-            Key(8, ax, ay, fa - 1.5, 1, 0.28),
-            Key(12, ax, ay, fa, 1, 0.39),
-        )
-        second = (
-            Key(0, bx, by, fb, 1, 0.33),
-            Key(3, bx, by, fb - 1.5, 1, 0.22),
-            Key(7, bx, by, fb + 1.5, 1, 0.55),
-            Key(12, bx, by, fb, 1, 0.33),
-        )
-        chairs = (
-            (ChairKey(0, ax, ay, fa), ChairKey(12, ax, ay, fa)),
-            (ChairKey(0, bx, by, fb), ChairKey(12, bx, by, fb)),
-        )
-        return _mirror(Script(12.0, (first, second), chairs), flip)
+    script = _sitting(j) if people == "sitting" else _walking(j)
+    return _mirror(script, flip)
+
+
+Draw = Callable[[float, float], float]
+
+
+def _sitting(j: Draw) -> Script:
+    """Two people at the desk, talking with their hands."""
+    ax, ay, bx, by = -j(0.5, 0.62), j(1.62, 1.74), j(0.46, 0.58), j(1.68, 1.8)
+    fa, fb = 180 + j(18, 35), 180 - j(22, 40)
+    first = (
+        Key(0, ax, ay, fa, 1, 0.39),
+        Key(4, ax, ay, fa + 1.5, 1, 0.55),
+        Key(8, ax, ay, fa - 1.5, 1, 0.28),
+        Key(12, ax, ay, fa, 1, 0.39),
+    )
+    second = (
+        Key(0, bx, by, fb, 1, 0.33),
+        Key(3, bx, by, fb - 1.5, 1, 0.22),
+        Key(7, bx, by, fb + 1.5, 1, 0.55),
+        Key(12, bx, by, fb, 1, 0.33),
+    )
+    chairs = (
+        (ChairKey(0, ax, ay, fa), ChairKey(12, ax, ay, fa)),
+        (ChairKey(0, bx, by, fb), ChairKey(12, bx, by, fb)),
+    )
+    return Script(12.0, (first, second), chairs)
+
+
+def _walking(j: Draw) -> Script:
+    """Two people who walk across the room, stand talking, and sit down."""
     ax, ay, bx, by = -j(0.28, 0.4), j(1.26, 1.38), j(0.3, 0.42), j(1.44, 1.58)
     cx, cy = -j(0.55, 0.7), j(1.62, 1.7)
     side = 1.65
@@ -119,30 +129,33 @@ def write_script(people: str, instance: int) -> Script:
         Key(18.0, bx, by, 150, 0, 1),
         Key(20.0, bx, by, 160, 0, 0.8),
     )
+    return Script(20.0, (first, second), _chairs(cx, cy))
+
+
+def _chairs(cx: float, cy: float) -> tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]:
+    """A chair that rolls as somebody sits down on it and rises, and one that is pushed in passing."""
     rest_y = cy + 0.2
-    chairs = (
-        (
-            ChairKey(0, cx, rest_y, 100),
-            ChairKey(13.2, cx, rest_y, 100),
-            ChairKey(14.3, cx, cy, 185),
-            ChairKey(14.9, cx, cy, 185),
-            ChairKey(16.2, cx, cy, 205),
-            ChairKey(16.6, cx, cy, 195),
-            ChairKey(17.5, cx, rest_y, 110),
-            ChairKey(20, cx, rest_y, 100),
-        ),
-        (
-            ChairKey(0, 0.85, 1.88, 20),
-            ChairKey(2.6, 0.85, 1.88, 20),
-            ChairKey(3.2, 0.9, 2.0, 45),
-            ChairKey(4.9, 0.9, 2.0, 45),
-            ChairKey(5.5, 0.84, 1.93, 5),
-            ChairKey(13.0, 0.84, 1.93, 5),
-            ChairKey(13.8, 0.85, 1.88, 20),
-            ChairKey(20, 0.85, 1.88, 20),
-        ),
+    first = (
+        ChairKey(0, cx, rest_y, 100),
+        ChairKey(13.2, cx, rest_y, 100),
+        ChairKey(14.3, cx, cy, 185),
+        ChairKey(14.9, cx, cy, 185),
+        ChairKey(16.2, cx, cy, 205),
+        ChairKey(16.6, cx, cy, 195),
+        ChairKey(17.5, cx, rest_y, 110),
+        ChairKey(20, cx, rest_y, 100),
     )
-    return _mirror(Script(20.0, (first, second), chairs), flip)
+    second = (
+        ChairKey(0, 0.85, 1.88, 20),
+        ChairKey(2.6, 0.85, 1.88, 20),
+        ChairKey(3.2, 0.9, 2.0, 45),
+        ChairKey(4.9, 0.9, 2.0, 45),
+        ChairKey(5.5, 0.84, 1.93, 5),
+        ChairKey(13.0, 0.84, 1.93, 5),
+        ChairKey(13.8, 0.85, 1.88, 20),
+        ChairKey(20, 0.85, 1.88, 20),
+    )
+    return first, second
 
 
 def _mirror(script: Script, sign: float) -> Script:

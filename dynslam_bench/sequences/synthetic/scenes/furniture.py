@@ -9,11 +9,27 @@ from .parts import BOX, ROUND_CONE, Parts, turn
 from .plan import Plan
 
 Array = NDArray[np.float64]
+TOP = 0.74
+"""Height of a desk, metres."""
 
 
 def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
     """A desk (0.8 m deep, 0.74 m high) with monitors, keyboards, books, papers, mugs and a lamp."""
-    eye, tint, top = np.eye(3), plan.tints, 0.74
+    _add_table(parts, plan, x, y, half)
+    _add_monitors(parts, rng, plan, x, y, half)
+    _add_papers(parts, rng, x, y, half)
+    _add_books(parts, rng, x, y, half)
+    _add_mugs(parts, rng, x, y)
+    side = 1 if plan.mirrored else -1
+    eye, lamp = np.eye(3), np.array([x + side * (0.55 - half), y + 0.62, TOP])
+    parts.add(ROUND_CONE, eye, lamp, (0.02, 0.07, 0.06), tint=plan.tints["metal"], scale=(1, 1, 0.4))
+    parts.add(ROUND_CONE, eye, lamp, (0.42, 0.012, 0.012), tint=plan.tints["metal"])
+    parts.add(ROUND_CONE, eye, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=plan.tints["bin"])
+
+
+def _add_table(parts: Parts, plan: Plan, x: float, y: float, half: float) -> None:
+    """The table, and a drawer unit under one end."""
+    eye, tint, top = np.eye(3), plan.tints, TOP
     parts.add(
         BOX,
         eye,
@@ -35,7 +51,6 @@ def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: fl
     parts.add(
         BOX, eye, np.array([x, y + 0.74, 0.45]), (half - 0.06, 0.01, 0.25), texture="wood", tint=tint["desk"] * 0.85
     )
-    # A drawer unit under one end.
     side = 1 if plan.mirrored else -1
     unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
     parts.add(BOX, eye, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"])
@@ -44,6 +59,11 @@ def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: fl
             BOX, eye, unit + np.array([0, -0.305, 0.19 - 0.19 * k]), (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92
         )
         parts.add(BOX, eye, unit + np.array([0, -0.32, 0.22 - 0.19 * k]), (0.05, 0.008, 0.008), tint=tint["metal"])
+
+
+def _add_monitors(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
+    """Monitors, each with its foot, a keyboard and a mouse."""
+    tint, top = plan.tints, TOP
     spacing = 2 * half / (plan.monitors + 0.6)
     for k in range(plan.monitors):
         mx = x + (k - (plan.monitors - 1) / 2) * spacing + 0.06 * (rng.random() - 0.5)
@@ -89,6 +109,10 @@ def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: fl
             scale=(0.032, 0.055, 0.025),
             tint=tint["plastic"],
         )
+
+
+def _add_papers(parts: Parts, rng: np.random.Generator, x: float, y: float, half: float) -> None:
+    top = TOP
     for k in range(5):
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
         parts.add(
@@ -100,6 +124,11 @@ def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: fl
             fit=(5,),
             tint=(0.95,) * 3,
         )
+
+
+def _add_books(parts: Parts, rng: np.random.Generator, x: float, y: float, half: float) -> None:
+    """A pile of books at either end."""
+    top = TOP
     for k in range(2):
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
@@ -114,6 +143,10 @@ def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: fl
                 tint=shade,
                 repeat=(0.4, 3.0),
             )
+
+
+def _add_mugs(parts: Parts, rng: np.random.Generator, x: float, y: float) -> None:
+    eye, top = np.eye(3), TOP
     for k in range(2):
         mug = np.array([x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), top + 0.012])
         parts.add(
@@ -125,10 +158,6 @@ def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: fl
             repeat=(1.0, 4.0),
             tint=0.35 + 0.6 * rng.random(3),
         )
-    lamp = np.array([x + side * (0.55 - half), y + 0.62, top])
-    parts.add(ROUND_CONE, eye, lamp, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4))
-    parts.add(ROUND_CONE, eye, lamp, (0.42, 0.012, 0.012), tint=tint["metal"])
-    parts.add(ROUND_CONE, eye, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=tint["bin"])
 
 
 def add_shelf(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
