@@ -1,6 +1,7 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
 import json
+import sys
 import time
 
 import pytest
@@ -106,6 +107,21 @@ def test_progress_where_nobody_watches(capsys, monkeypatch):
     with progress("nothing"):
         pass
     assert capsys.readouterr().err == ""
+
+
+def test_with_json_nothing_but_errors_goes_to_standard_error(cli, capsys, monkeypatch):
+    monkeypatch.setattr(output, "HEARTBEAT_S", 0.01)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(output, "_for_scripts", True)
+    with output.progress("things") as advance, output.heartbeat() as beat:
+        advance(1, 3)
+        time.sleep(0.1)
+        beat("still there")
+        output.note("one of them")
+    assert capsys.readouterr().err == ""
+    assert cli("protocols", "list", "--json")[2] == ""
+    output.note("seen")  # that command is over
+    assert capsys.readouterr().err == "seen\n"
 
 
 @pytest.mark.parametrize("argument", ["abc", "-1"])
