@@ -75,7 +75,7 @@ class Tuner:
     """
 
     def __init__(self, spec: StudySpec, results: str | Path = "results", *, reading: bool = False) -> None:
-        self.spec = spec
+        self.spec = spec = _as_stored(spec, study_folder(Path(results), spec) / "study.json") if reading else spec
         self.results = Path(results)
         self.reading = reading
         self.tracker = TRACKERS.get(spec.tracker)
@@ -361,6 +361,14 @@ def run_study(
     tuner = Tuner(spec, results)
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner
+
+
+def _as_stored(spec: StudySpec, file: Path) -> StudySpec:
+    """A study that is only read, with the start offsets that it had: one of before there were any began at frame 0."""
+    if "offsets" in spec.model_fields_set or not file.is_file():
+        return spec
+    stored = json.loads(file.read_text())
+    return spec if "offsets" in stored else spec.model_copy(update={"offsets": (0,)})
 
 
 def _same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:

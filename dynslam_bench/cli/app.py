@@ -75,7 +75,6 @@ def start(arguments: list[str] | None = None) -> None:
     Args:
         arguments: What follows the program's name; by default the command line's.
     """
-    for_scripts(False)
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
         app(args=arguments, prog_name="dynslam-bench")
@@ -92,6 +91,8 @@ def start(arguments: list[str] | None = None) -> None:
         if ended.code == 130:
             _say(_INTERRUPTED)
         raise
+    finally:
+        for_scripts(False)
 
 
 LISTS = ("--seed", "--offset")

@@ -22,7 +22,7 @@ _for_scripts = False
 
 
 def for_scripts(asked: bool) -> bool:
-    """Say whether JSON is asked for; the callback of ``--json``, and reset where the program starts."""
+    """Say whether JSON is asked for; the callback of ``--json``, and taken back where the program ends."""
     global _for_scripts
     _for_scripts = asked
     return asked

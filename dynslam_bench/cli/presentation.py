@@ -70,7 +70,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare two results folders on the sequences that both have, with the same settings or with others."""
-    from dynslam_bench.reports import compare_runs as compare_results
+    from dynslam_bench.reports import compare as compare_results
 
     found = compare_results(a, b, protocol=protocol)
     if as_json:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FilterResult, FilterState
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.culling.guard import restore_starved
-from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.culling.guard import GuardSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
 import json
+import sys
 import time
 
 import pytest
@@ -18,6 +19,7 @@ def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
     assert code == 0 and "from the store" in out and "yes" in out.splitlines()[1]
     (row,) = json.loads(cli(*command, "--json")[1])
     assert row["from_store"] is True and row["settings"] == "frames=4" and row["part"] == "0:3, every 2nd"
+    assert row["repeat"] == "seed 0"
     listed = cli("runs", "list")[1]
     assert "0:3, every 2nd" in listed and "frames=4" in listed and "from the store" not in listed
     assert "my control" in cli("runs", "show")[1]
@@ -106,6 +108,21 @@ def test_progress_where_nobody_watches(capsys, monkeypatch):
     with progress("nothing"):
         pass
     assert capsys.readouterr().err == ""
+
+
+def test_with_json_nothing_but_errors_goes_to_standard_error(cli, capsys, monkeypatch):
+    monkeypatch.setattr(output, "HEARTBEAT_S", 0.01)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(output, "_for_scripts", True)
+    with output.progress("things") as advance, output.heartbeat() as beat:
+        advance(1, 3)
+        time.sleep(0.1)
+        beat("still there")
+        output.note("one of them")
+    assert capsys.readouterr().err == ""
+    assert cli("protocols", "list", "--json")[2] == ""
+    output.note("seen")  # that command is over
+    assert capsys.readouterr().err == "seen\n"
 
 
 @pytest.mark.parametrize("argument", ["abc", "-1"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import sys
@@ -18,6 +17,7 @@ from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, resolve, run_one, score
+from dynslam_bench.runs.frame_row import FrameRow, read_csv
 from dynslam_bench.runs.storage.frames import FrameLog
 
 
@@ -58,11 +58,11 @@ def test_the_run_is_the_environment(store: RunStore, toy_folder: str) -> None:
     assert truncated
     online = read_tum(store.folder(record.run_id) / "trajectory_online.txt")
     assert np.allclose(online.T_world_cam, env.online_trajectory().T_world_cam, atol=1e-8)
-    rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
-    assert [float(row["reward_m"]) for row in rows[1:]] == rewards[1:]
-    assert float(rows[-1]["pose_error_trans_m"]) == info["pose_error_trans_m"]
-    assert float(rows[-1]["stat_keypoints"]) == 100 and float(rows[-1]["tracking_s"]) == 0.002
-    assert [row["state"] for row in rows] == ["ok"] * 20 and rows[0]["frame_error_trans_m"] == ""
+    rows = read_csv(store.folder(record.run_id) / "frames.csv")
+    assert [row.reward_m for row in rows[1:]] == rewards[1:]
+    assert rows[-1].pose_error_trans_m == info["pose_error_trans_m"]
+    assert rows[-1].stats["keypoints"] == 100 and rows[-1].timings["tracking"] == 0.002
+    assert [row.state for row in rows] == ["ok"] * 20 and rows[0].frame_error_trans_m is None
     scored = score(store, record).metrics
     assert scored["ate_rmse_m"] == pytest.approx(info["episode_metrics"]["ate_rmse_m"], rel=1e-5)
 
@@ -235,8 +235,8 @@ def test_degraded_and_dropped_frames(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, degrade={"noise": 0.5}, drop_share=0.4), store)
     assert record.status == "ok" and record.n_dropped > 10
     assert record.coverage == pytest.approx(1 - record.n_dropped / 60) and record.n_processed == 60 - record.n_dropped
-    rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
-    assert sum(row["state"] == "dropped" for row in rows) == record.n_dropped
+    rows = read_csv(store.folder(record.run_id) / "frames.csv")
+    assert sum(row.state == "dropped" for row in rows) == record.n_dropped
 
 
 def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
@@ -246,8 +246,8 @@ def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
     assert (store.folder(record.run_id) / "keyframes.csv").is_file()
     assert (store.folder(record.run_id) / "map.ply").is_file()
     assert record.keyframes >= 1 and record.map_points > 10
-    rows = list(csv.DictReader((store.folder(record.run_id) / "frames.csv").open()))
-    assert np.mean([float(row["mask_iou"]) for row in rows]) == pytest.approx(record.mask_iou)
+    rows = read_csv(store.folder(record.run_id) / "frames.csv")
+    assert np.mean([row.mask_iou for row in rows]) == pytest.approx(record.mask_iou)
 
 
 def test_the_record_says_how_often_the_fundamental_matrix_was_not_used(store: RunStore) -> None:
@@ -257,17 +257,17 @@ def test_the_record_says_how_often_the_fundamental_matrix_was_not_used(store: Ru
     always = run_one(spec.model_copy(update={"tracker": "sof-slam", "settings": oracle}), store)
     without = run_one(spec.model_copy(update={"tracker": "mask-rcnn", "settings": oracle}), store)
     assert (never.epipolar_skipped, always.epipolar_skipped, without.epipolar_skipped) == (1.0, 0.0, None)
-    rows = list(csv.DictReader((store.folder(never.run_id) / "frames.csv").open()))
-    assert [float(row["stat_epipolar_f_asked"]) for row in rows] == [0, 1, 1, 1, 1]
+    rows = read_csv(store.folder(never.run_id) / "frames.csv")
+    assert [row.stats["epipolar_f_asked"] for row in rows] == [0, 1, 1, 1, 1]
 
 
 def test_frames_without_an_image_to_compare_with_do_not_count_as_skipped() -> None:
-    def frame(state: str, asked: float, judged: float) -> dict:
-        return {"state": state, "stats": {"epipolar_f_asked": asked, "epipolar_f_judged": judged, "other": 1.0}}
+    def frame(state: str, asked: float, judged: float) -> FrameRow:
+        return FrameRow(0, 0.0, state, stats={"epipolar_f_asked": asked, "epipolar_f_judged": judged, "other": 1.0})
 
     log = FrameLog([frame("ok", 0, 0), frame("ok", 1, 1), frame("ok", 1, 0), frame("lost", 1, 0), frame("ok", 1, 0)])
     assert log.epipolar_skipped() == pytest.approx(2 / 3)
-    assert FrameLog([{"state": "ok", "stats": {"other": 1.0}}]).epipolar_skipped() is None
+    assert FrameLog([FrameRow(0, 0.0, "ok", stats={"other": 1.0})]).epipolar_skipped() is None
 
 
 def test_a_fresh_interpreter_does_the_same(store: RunStore, toy_folder: str, monkeypatch, tmp_path: Path) -> None:

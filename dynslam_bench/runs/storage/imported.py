@@ -76,24 +76,16 @@ def import_trajectory(
     notes = loaded.notes.describe()
     if odd:
         notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
-    identity = _identity(file, tracker, which, opened)
-    record = RunRecord(
-        kind="imported",
-        run_id=digest(identity, 16),
-        status="ok",
-        tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        sequence=sequence_info(opened, identity["content"], part_digest(identity)),
-        frames=_pair(frames),
-        stride=stride,
-        **_counts(covered, len(opened)),
-        stamps_match=not odd,
-        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
-        versions=versions(),
-        identity=identity,
-        provenance=provenance or str(file),
-        notes=notes,
-        place=place_of(sequence),
-    ).normalised()
+    asked = {
+        "tracker": TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
+        "frames": _pair(frames),
+        "stride": stride,
+        "stamps_match": not odd,
+        "provenance": provenance or str(file),
+        "notes": notes,
+        "place": place_of(sequence),
+    }
+    record = _record(_identity(file, tracker, which, opened), opened, covered, asked)
     store = results if isinstance(results, RunStore) else RunStore(results)
     _keep(store, record, opened, loaded.trajectory, which)
     return record
@@ -108,8 +100,22 @@ def _keep(store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Tr
         store.publish(work, record)
 
 
-def _counts(covered: int, total: int) -> dict[str, Any]:
-    return {"n_frames": total, "n_tracked": covered, "n_lost": total - covered, "coverage": covered / total}
+def _record(identity: dict[str, Any], sequence: Sequence, covered: int, asked: dict[str, Any]) -> RunRecord:
+    total = len(sequence)
+    return RunRecord(
+        kind="imported",
+        run_id=digest(identity, 16),
+        status="ok",
+        sequence=sequence_info(sequence, identity["content"], part_digest(identity)),
+        n_frames=total,
+        n_tracked=covered,
+        n_lost=total - covered,
+        coverage=covered / total,
+        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
+        versions=versions(),
+        identity=identity,
+        **asked,
+    ).normalised()
 
 
 def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int]:

@@ -1,0 +1,123 @@
+"""A frame is written and read by the same code; runs and frames as pandas frames, and the way from there to a plot."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.evaluation.online import OnlineSample
+from dynslam_bench.runs import RunStore, load_frames, score
+from dynslam_bench.runs.frame_row import FrameRow, read_csv, read_log, write_csv
+from dynslam_bench.runs.storage.frames import FrameLog
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
+ROWS = [
+    FrameRow(0, 1.5, "ok", None, None, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0]),
+    FrameRow(1, 1.625, "dropped"),
+    FrameRow(
+        2, 1.75, "lost", 0.1, 0.2, 0.30000000000000004, 0.4, -0.1, None, {"total": 1e-9, "flow": 2.0}, {"f_s": 1.0}
+    ),
+]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> RunStore:
+    return RunStore(shutil.copytree(RESULTS, tmp_path / "results"))
+
+
+def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
+    (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
+    assert read_log(tmp_path / "log") == ROWS
+    assert read_log(tmp_path / "none") == []
+
+
+def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
+    write_csv(tmp_path / "frames.csv", ROWS)
+    head = (tmp_path / "frames.csv").read_text().splitlines()[0]
+    assert head.split(",")[-4:] == ["total_s", "flow_s", "stat_culled", "stat_f_s"]
+    found = read_csv(tmp_path / "frames.csv")
+    assert [row.cells() for row in found] == [row.cells() for row in ROWS]
+    assert [row.pose for row in found] == [None] * 3
+
+
+def test_a_table_without_frames(tmp_path: Path) -> None:
+    write_csv(tmp_path / "frames.csv", [])
+    assert read_csv(tmp_path / "frames.csv") == []
+    assert load_frames(tmp_path).columns[0] == "index" and len(load_frames(tmp_path)) == 0
+
+
+@pytest.mark.parametrize("text", ["run,tracker\n1,x\n", "index,timestamp,state,reward_m\n0,1.0,asleep,0\n"])
+def test_another_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "frames.csv").write_text(text)
+    with pytest.raises(RunError, match="is no table of frames: row 1 is damaged"):
+        read_csv(tmp_path / "frames.csv")
+
+
+def test_the_row_of_an_outcome() -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    error = OnlineSample(trans_m=0.5, rot_deg=5.0, frame_trans_m=0.1, frame_rot_deg=1.0)
+    row = FrameRow.of(FrameOutcome(7, 2.0, "ok", pose, {"a": 1.0}, {"total": 0.2}, error, -0.1), mask_iou=0.5)
+    assert row.pose == [1, 2, 3, 0, 0, 0, 1] and (row.pose_error_trans_m, row.frame_error_rot_deg) == (0.5, 1.0)
+    assert FrameLog([row]).trajectory().T_world_cam[0] == pytest.approx(pose)
+
+
+def test_frames_of_a_run_by_record_id_and_path(store: RunStore) -> None:
+    record = store.read("a7")
+    frame = load_frames(record, store)
+    assert [str(kind) for kind in frame.dtypes[:4]] == ["int64", "float64", "string", "Float64"]
+    assert {str(kind) for kind in frame.dtypes[8:]} == {"Float64"}
+    assert frame["frame_error_trans_m"].isna().tolist() == [True] + [False] * 7 and frame["mask_iou"].isna().all()
+    folder = store.folder(record.run_id)
+    for name in (load_frames("a7abe", store), load_frames(folder), load_frames(str(folder / "frames.csv"))):
+        pd.testing.assert_frame_equal(name, frame)
+    with pytest.raises(RunError, match="there is no run 'b'"):
+        load_frames("b", store)
+    with pytest.raises(RunError, match="cannot read"):
+        load_frames(store.root)
+
+
+def test_a_row_a_run(store: RunStore) -> None:
+    frame = store.frame()
+    records, _ = store.all()
+    assert frame["run_id"].tolist() == [record.run_id for record in records]
+    assert frame["ate_rmse_m"].tolist() == [score(store, record).metrics["ate_rmse_m"] for record in records]
+    assert frame["frame_ms"][1] == 1000 * records[1].frame_time_s and frame["frames"].tolist() == ["0:8"] * 2
+    kinds = {
+        name: str(frame[name].dtype) for name in ("label", "seed", "keyframes", "ate_rmse_m", "mask_iou", "started")
+    }
+    assert list(kinds.values()) == ["string", "Int64", "Int64", "Float64", "Float64", "datetime64[us, UTC]"]
+    missing = frame[["keyframes", "mask_iou", "reason", "noise", "settings"]]
+    assert missing.isna().all(axis=None) and missing.notna().sum().sum() == 0
+    other = store.frame("evo-default")
+    assert set(other["protocol_id"]) == {"evo-default"} and set(frame["protocol_id"]) == {"tum-rgbd/v1"}
+
+
+def test_an_empty_store_has_the_same_columns(store: RunStore, tmp_path: Path) -> None:
+    empty = RunStore(tmp_path / "nothing").frame()
+    assert len(empty) == 0 and set(empty.columns) <= set(store.frame().columns) and "ate_rmse_m" in empty
+
+
+def test_from_results_to_a_plot_in_three_lines(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's examples are run as they stand."""
+    page = (ROOT / "docs" / "environments.md").read_text()
+    section = page[page.index("### From `results/` to a plot") :]
+    first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (store.root / "latest").symlink_to("runs/a7abe04996a79cc4")
+    monkeypatch.chdir(store.root.parent)
+    for text, names in (
+        (first, ("ate.html", "Old Slam", "never move")),
+        (second, ("frames.html", "pose_error_trans_m")),
+    ):
+        assert len(text.splitlines()) == 3
+        exec(compile(text, "environments.md", "exec"), {})
+        plot = Path(names[0]).read_text()
+        assert all(name in plot for name in names[1:])
