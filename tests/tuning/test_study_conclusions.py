@@ -22,9 +22,8 @@ TUNE = Ratio(ratio=0.7, low=0.6, high=0.82, n=8, sequences=4)
 
 def candidate(low: float, ratio: float, high: float, sequences: int = 6, **changes: object) -> Candidate:
     held = Ratio(ratio=ratio, low=low, high=high, n=2 * sequences, sequences=sequences)
-    return Candidate.model_validate(
-        {"trial": 7, "params": {}, "values": [-0.3], "tune": TUNE, "held_out": held, **changes}
-    )
+    values = {"trial": 7, "params": {}, "values": [-0.3], "tune": TUNE, "held_out": held}
+    return Candidate.model_validate(values | changes)
 
 
 @pytest.mark.parametrize("sequences", [3, 5, 10, 20])
