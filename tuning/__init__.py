@@ -1,7 +1,8 @@
 """Optuna studies over the environments: search space, trials as runs, held-out check, presets.
 
 `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on held-out sequences,
-`write_page` shows it all. `search_space` and `suggest` serve studies of your own.
+`write_page` shows it all; `Study` opens a stored one and gives its trials as a pandas frame. `search_space` and
+`suggest` serve studies of your own.
 """
 
 from __future__ import annotations
@@ -10,21 +11,29 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .emfoa_sampler import EmfoaSampler
-    from .final_runs import StudySummary, finish
+    from .final_runs import finish
+    from .frame import Study
     from .page import write_page
     from .space import search_space, suggest
     from .study import StudyEvent, Tuner, run_study
     from .study_file import SpaceSpec, StudySpec, read_study
+    from .summary import StudySummary
 
 _HOMES = {
-    "EmfoaSampler": "emfoa_sampler", "SpaceSpec": "study_file", "StudyEvent": "study", "StudySpec": "study_file",
-    "StudySummary": "final_runs", "Tuner": "study", "finish": "final_runs", "read_study": "study_file",
-    "run_study": "study", "search_space": "space", "suggest": "space", "write_page": "page",
-}  # fmt: skip
+    "emfoa_sampler": ("EmfoaSampler",),
+    "final_runs": ("finish",),
+    "frame": ("Study",),
+    "page": ("write_page",),
+    "space": ("search_space", "suggest"),
+    "study": ("StudyEvent", "Tuner", "run_study"),
+    "study_file": ("SpaceSpec", "StudySpec", "read_study"),
+    "summary": ("StudySummary",),
+}
 
 __all__ = [
     "EmfoaSampler",
     "SpaceSpec",
+    "Study",
     "StudyEvent",
     "StudySpec",
     "StudySummary",
@@ -40,8 +49,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for; Optuna takes its time."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,13 +12,15 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.records import write_atomic
+from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block, Section, render
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, to_csv
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 
-from .final_runs import Candidate, Ratio, StudySummary
+from .importance import FEWEST_TRIALS, importances, inert_parameters
 from .preset import preset_text
 from .samplers import is_feasible
 from .study import Tuner
+from .summary import Candidate, Ratio, StudySummary
 
 _MODEBAR = {"bgcolor": "rgba(0,0,0,0)", "color": "#c4c9d1", "activecolor": "#1f6fb4"}
 _NAMES = {"accuracy": "log ATE ratio to the default (less is better)", "speed": "real-time factor (more is better)"}
@@ -36,30 +38,18 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     """
     spec, study = tuner.spec, tuner.study
     summary = summary.model_copy(update={"split_notes": tuner.split_notes})  # a stored one may be older than the check
+    summary = summary.model_copy(update={"inert": _inert(tuner), "importances": _importances(tuner)})
     tables = [_candidates(summary), _trials(tuner, summary)]
     figures = _figures(tuner, summary)
-    settings = {**spec.space.fixed, **summary.candidates[0].params}
+    result = [Block("table", table=tables[0]), *_shown(figures, "ratios")]
     sections = [
-        Section(
-            "result", "What the study found", "Result", [summary.conclusion],
-            [Block("table", table=tables[0]), *_shown(figures, "ratios")],
-        ),
-        Section(
-            "preset", "The chosen settings", "Settings", [],
-            [
-                Block("code", text=preset_text(settings, spec.tracker, summary.conclusion)),
-                Block("code", title="Use them", text=f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"),
-            ],
-        ),
+        Section("result", "What the study found", "Result", [summary.verdict], result),
+        Section("preset", "The chosen settings", "Settings", [], _preset(tuner, summary)),
         Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
-        Section(
-            "parameters", "Which settings matter", "Parameters",
-            ["Importances are shares of the variance that a parameter explains alone (PED-ANOVA); with few trials they "
-             "are rough."],
-            _shown(figures, "importances", "slices"),
-        ),
+        Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
         Section("trials", "All trials", "Trials", [], [Block("table", table=tables[1])]),
-    ]  # fmt: skip
+    ]
+    sections[3].blocks += _shown(figures, "importances", "slices")
     for table in tables:
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
     states = summary.trials
@@ -84,6 +74,57 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     return path
 
 
+def _names(tuner: Tuner) -> list[str]:
+    return [parameter.name for parameter in tuner.space]
+
+
+def _inert(tuner: Tuner) -> list[str]:
+    return inert_parameters(tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)), _names(tuner))
+
+
+def _importances(tuner: Tuner) -> dict[str, float]:
+    return importances(tuner.study, _names(tuner))
+
+
+def _preset(tuner: Tuner, summary: StudySummary) -> list[Block]:
+    """The chosen settings; how to use them stands there only if they hold up on the held-out split."""
+    spec, chosen = tuner.spec, summary.candidates[0]
+    text = preset_text({**spec.space.fixed, **chosen.params}, spec.tracker, summary.verdict)
+    if not summary.improves:
+        return [Block("code", title="Not recommended: they do not hold up; shown as a record", text=text)]
+    command = f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"
+    return [Block("code", text=text), Block("code", title="Use them", text=command)]
+
+
+def _importance_notes(tuner: Tuner, summary: StudySummary) -> list[str]:
+    count = summary.trials.get("complete", 0)
+    if summary.importances:
+        notes = [
+            "Importances are shares among the settings that matter more than chance (PED-ANOVA, against the same "
+            "trials with shuffled values)."
+        ]
+    elif count < FEWEST_TRIALS:
+        notes = [f"No importances: they would need {FEWEST_TRIALS} complete trials, there are {count}."]
+    else:
+        notes = ["No importances: no setting matters more than chance could make it."]
+    if summary.inert:
+        notes.append(f"Without any effect in these trials: {', '.join(summary.inert)}.")
+    return notes
+
+
+def _importance_figure(summary: StudySummary) -> dict[str, Any]:
+    names = list(reversed(summary.importances))
+    shares = [summary.importances[name] for name in names]
+    bars = {"type": "bar", "orientation": "h", "x": shares, "y": names, "marker": {"color": "#1f6fb4"}}
+    layout = layout_of(
+        height=140 + 32 * len(names),
+        xaxis=axis("share of the importance") | {"range": [0, 1.02]},
+        yaxis={"automargin": True},
+        showlegend=False,
+    )
+    return {"data": [bars], "layout": layout}
+
+
 def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     """Optuna's own plots, and the ratios with their intervals."""
     study, spec = tuner.study, tuner.spec
@@ -96,14 +137,14 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     if finished:
         plots = optuna.visualization
         figures["history"] = plots.plot_optimization_history(study, target=target, target_name=name)
-        if summary.importances:
-            figures["importances"] = plots.plot_param_importances(study, target=target, target_name=name)
         if shared:
             ranked = sorted(shared, key=lambda key: -summary.importances.get(key, 0.0))[:5]
             figures["slices"] = plots.plot_slice(study, params=ranked, target=target, target_name=name)
         if several:
             figures["front"] = plots.plot_pareto_front(study, target_names=[_NAMES[o] for o in spec.objectives])
     drawn = {key: _plain(figure) for key, figure in figures.items()}
+    if summary.importances:
+        drawn["importances"] = _importance_figure(summary)
     ratios = _ratio_figure(summary)
     return drawn if ratios is None else {"ratios": ratios, **drawn}
 
@@ -114,9 +155,9 @@ def _plain(figure: Any) -> dict[str, Any]:
     layout = specification["layout"]
     layout.pop("template", None)
     layout.pop("title", None)
-    for name, axis in layout.items():
+    for name, drawn in layout.items():
         if name.startswith(("xaxis", "yaxis")):
-            axis |= {"automargin": True, "gridcolor": "#e5e7eb", "zeroline": False}
+            drawn |= {"automargin": True, "gridcolor": "#e5e7eb", "zeroline": False}
     layout["modebar"] = _MODEBAR
     layout |= {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)"}
     layout.setdefault("height", 420)
@@ -133,36 +174,33 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
             for candidate in summary.candidates
             if (ratio := getattr(candidate, split)) is not None
         ]
-        if not points:
-            continue
-        traces.append(
-            {
-                "type": "scatter", "mode": "markers", "name": split.replace("_", "-"),
-                "x": [ratio.ratio for _, ratio in points], "y": [name for name, _ in points],
-                "marker": {"size": 11, "color": colour, "symbol": symbol},
-                "error_x": {
-                    "type": "data", "symmetric": False, "color": colour,
-                    "array": [ratio.high - ratio.ratio for _, ratio in points],
-                    "arrayminus": [ratio.ratio - ratio.low for _, ratio in points],
-                },
-            }
-        )  # fmt: skip
+        if points:
+            traces.append(_ratio_trace(split.replace("_", "-"), points, colour, symbol))
     if not traces:
         return None
-    line = {"type": "line", "x0": 1, "x1": 1, "yref": "paper", "y0": 0, "y1": 1,
-            "line": {"color": "#9ca3af", "dash": "dash"}}  # fmt: skip
-    layout = {
-        "height": 160 + 50 * len(summary.candidates), "shapes": [line], "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)", "modebar": _MODEBAR, "margin": {"l": 90, "r": 20, "t": 30, "b": 60},
-        "xaxis": {"title": {"text": "ATE ratio to the default settings (left is better)"}, "gridcolor": "#e5e7eb"},
-        "yaxis": {"autorange": "reversed", "gridcolor": "#e5e7eb"},
-    }  # fmt: skip
+    layout = layout_of(
+        height=160 + 50 * len(summary.candidates),
+        shapes=[guide(x=1.0)],
+        margin={"l": 90, "r": 20, "t": 30, "b": 60},
+        xaxis=axis("ATE ratio to the default settings (left is better)"),
+        yaxis={"autorange": "reversed", "gridcolor": GRID},
+    )
     return {"data": traces, "layout": layout}
+
+
+def _ratio_trace(name: str, points: list[tuple[str, Ratio]], colour: str, symbol: str) -> dict[str, Any]:
+    ratios = [ratio for _, ratio in points]
+    bars = {"type": "data", "symmetric": False, "color": colour}
+    bars["array"] = [0.0 if ratio.high is None else ratio.high - ratio.ratio for ratio in ratios]
+    bars["arrayminus"] = [0.0 if ratio.low is None else ratio.ratio - ratio.low for ratio in ratios]
+    trace = {"type": "scatter", "mode": "markers", "name": name, "error_x": bars}
+    trace |= {"x": [ratio.ratio for ratio in ratios], "y": [label for label, _ in points]}
+    return trace | {"marker": {"size": 11, "color": colour, "symbol": symbol}}
 
 
 def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Block]:
     captions = {
-        "ratios": "Geometric-mean ATE ratio in fresh repeats and its 95 % bootstrap interval.",
+        "ratios": "Geometric-mean ATE ratio in fresh repeats and its 95 % interval over sequences (Student).",
         "history": "Every finished trial; trial 0 is the default.",
         "front": "Accuracy against speed.",
         "importances": "",
@@ -203,7 +241,7 @@ def _candidates(summary: StudySummary) -> Table:
     def ratio(value: Ratio | None) -> TableCell:
         if value is None:
             return TableCell("-")
-        return TableCell(f"{value.ratio:.3f}", f"[{value.low:.3f}, {value.high:.3f}] n={value.n}", value.ratio)
+        return TableCell(f"{value.ratio:.3f}", f"{value.interval} n={value.n}".strip(), value.ratio)
 
     def time(candidate: Candidate) -> TableCell:
         if candidate.frame_ms is None:
@@ -212,25 +250,23 @@ def _candidates(summary: StudySummary) -> Table:
 
     rows = [
         [
-            TableCell(str(candidate.trial), value=float(candidate.trial), emphasis="best" if number == 0 else ""),
-            TableCell(f"{math.exp(candidate.values[0]):.3f}", value=math.exp(candidate.values[0])),
+            TableCell(str(candidate.trial), value=float(candidate.trial), emphasis="best" if place == 0 else ""),
+            number(math.exp(candidate.values[0]), ".3f"),
             ratio(candidate.tune),
             ratio(candidate.held_out),
             time(candidate),
             TableCell(candidate.failed or ("yes" if candidate.feasible else "no")),
         ]
-        for number, candidate in enumerate(summary.candidates)
+        for place, candidate in enumerate(summary.candidates)
     ]
     caption = (
-        "ATE ratios to the default settings on the same sequences and repeats, geometric mean, 95 % bootstrap interval "
-        "over sequences and repeats. The best on the tune split in fresh repeats is chosen; the held-out split only "
-        f"judges. Frame times without the stage cache.{_repeats(summary)}{_apart(summary)}"
+        "ATE ratios to the default settings on the same sequences and repeats, geometric mean, Student's 95 % "
+        "interval over sequences (of the logarithms). The best on the tune split in fresh repeats is chosen; the "
+        f"held-out split only judges. Frame times without the stage cache.{_repeats(summary)}{_apart(summary)}"
     )
-    columns = [
-        Column("trial"), Column("in the study", meaning="the trial's own value, optimistic: it was selected for it"),
-        Column("tune, fresh repeats"), Column("held-out"), Column("frame ms"),
-        Column("constraints hold", numeric=False),
-    ]  # fmt: skip
+    optimistic = "the trial's own value, optimistic: it was selected for it"
+    columns = [Column("trial"), Column("in the study", meaning=optimistic), *numbers("tune, fresh repeats", "held-out")]
+    columns += [Column("frame ms"), Column("constraints hold", numeric=False)]
     return Table("candidates", "The best trials, run again", caption, columns, rows)
 
 
@@ -252,30 +288,23 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     objectives = tuner.spec.objectives
     rows = []
     for trial in tuner.study.get_trials(deepcopy=False):
-        values = trial.values or [None] * len(objectives)
-        ratios = [None if v is None else (math.exp(v) if o == "accuracy" else v)
-                  for v, o in zip(values, objectives, strict=True)]  # fmt: skip
+        values = zip(objectives, trial.values or [None] * len(objectives), strict=True)
+        shown = [math.exp(v) if v is not None and objective == "accuracy" else v for objective, v in values]
         rows.append(
             [
-                TableCell(str(trial.number), value=float(trial.number)),
+                number(float(trial.number), ".0f"),
                 TableCell(trial.state.name.lower(), tip=trial.user_attrs.get("reason", "")),
-                *(TableCell("" if value is None else f"{value:.3f}", value=value) for value in ratios),
-                _number(trial.user_attrs.get("coverage"), "{:.3f}"),
-                _number(trial.user_attrs.get("fps"), "{:.1f}"),
+                *(number(value, ".3f") for value in shown),
+                number(trial.user_attrs.get("coverage"), ".3f"),
+                number(trial.user_attrs.get("fps"), ".1f"),
                 *(_value(trial.params.get(name)) for name in names),
             ]
         )
-    columns = [
-        Column("trial"), Column("state", numeric=False),
-        *(Column("ATE ratio" if objective == "accuracy" else "real-time factor") for objective in objectives),
-        Column("coverage"), Column("fps"), *(Column(name) for name in names),
-    ]  # fmt: skip
+    headings = {"accuracy": "ATE ratio", "speed": "real-time factor"}
+    columns = [Column("trial"), Column("state", numeric=False), *numbers(*(headings[each] for each in objectives))]
+    columns += numbers("coverage", "fps", *names)
     caption = f"Reasons of pruned and failed trials stand behind their state.{_apart(summary)}"
     return Table("trials", "All trials", caption, columns, rows)
-
-
-def _number(value: Any, form: str) -> TableCell:
-    return TableCell() if value is None else TableCell(form.format(value), value=float(value))
 
 
 def _value(value: Any) -> TableCell:

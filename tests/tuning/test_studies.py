@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import optuna
 import pytest
 import toy_tracker
@@ -20,8 +19,6 @@ from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.runs import RunStore
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
 from dynslam_bench.tuning.dominance import hopeless
-from dynslam_bench.tuning.final_runs import paired_ratio
-from dynslam_bench.tuning.objective import Instance, Outcome
 from dynslam_bench.tuning.space import distribution
 from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
@@ -54,10 +51,12 @@ def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_p
     assert best.value < -0.5 and abs(math.log(best.params["gain"])) < math.log(1.3)
     summary = finish(tuner, jobs=2)
     held = summary.candidates[0].held_out
-    assert held.high < 1 and held.sequences == 2
+    assert held.ratio < 1 and held.sequences == 2
     assert not summary.improves, "two held-out sequences prove nothing"
-    assert summary.importances["gain"] > summary.importances["wobble"]
+    assert not summary.importances, "fourteen trials are too few"
     page = write_page(tuner, summary).read_text()
+    assert "Use them" not in page and "Not recommended" in page
+    assert "would need 30 complete trials, there are 14" in page
     assert "from which nothing follows for others" in page and "https://" not in page.split("<script>")[0]
     from dynslam_bench.cli.options import read_settings
 
@@ -79,7 +78,7 @@ def test_an_untunable_study_says_that_it_did_not_help(sequences: list[str], tmp_
     summary = finish(tuner)
     held = summary.candidates[0].held_out
     assert summary.improves == held.shows_gain
-    assert held.verdict in summary.conclusion
+    assert summary.conclusion == summary.verdict and "eep the default" in summary.conclusion
 
 
 def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> None:
@@ -258,19 +257,3 @@ def test_space_of_a_real_tracker_can_be_drawn() -> None:
         values = suggest(study.ask(), space, flatten(settings()))
         apply_overrides(settings(), values)  # every drawn configuration is valid
     assert all(distribution(parameter) is not None for parameter in space)
-
-
-def test_paired_ratio_covers_the_truth() -> None:
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(60):
-        instances = [Instance(f"s{i}", seed) for i in range(8) for seed in range(2)]
-        effect = {f"s{i}": rng.normal(math.log(0.8), 0.2) for i in range(8)}
-        default = {i: Outcome(i, "", 0.02, 1.0, 0.03, 1.0) for i in instances}
-        tuned = {
-            i: Outcome(i, "", 0.02 * math.exp(effect[i.sequence] + rng.normal(0, 0.05)), 1.0, 0.03, 1.0)
-            for i in instances
-        }
-        found = paired_ratio(tuned, default, instances)
-        hits += found.low <= 0.8 <= found.high
-    assert hits >= 48
