@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
-
 
 def statistics(error: NDArray[np.float64]) -> dict[str, float]:
     """RMSE, mean, median, population standard deviation, minimum, maximum and sum of squares of errors ``[N]``.
