@@ -31,7 +31,7 @@ from dynslam_bench.core.errors import RunError
 from .family import adopt_orphans, children, end_descendants, end_family
 
 PRELOADED = (
-    "numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gymnasium", "dynslam_bench.envs",
+    "numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium", "dynslam_bench.envs",
     "dynslam_bench.evaluation.evaluate", "dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend",
     "dynslam_bench.flow.build_flow", "dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.child",
 )  # fmt: skip
