@@ -53,7 +53,6 @@ COCO = Checkpoint(
     "BSD-3-Clause",
     "COCO train2017",
 )
-CHECKPOINTS: dict[str, Checkpoint] = {COCO.id: COCO}
 
 
 def weights_cache() -> Path:
