@@ -33,7 +33,7 @@ from .provenance import Provenance
 from .result import TrackingState, TrackResult
 from .segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
 from .sequence import DatasetSpec, Frame, FrameMasks, MaskSource, Sequence
-from .tracker import FinalizingTracker, Tracker, TrackerContext, TrackerSpec
+from .tracker import Tracker, TrackerContext, TrackerSpec
 
 __all__ = [
     "Camera",
@@ -43,7 +43,6 @@ __all__ = [
     "FeatureSpec",
     "FilterResult",
     "FilterState",
-    "FinalizingTracker",
     "FlowEstimator",
     "FlowResult",
     "FlowSpec",

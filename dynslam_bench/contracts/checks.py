@@ -66,7 +66,7 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
         bad = {key: value for key, value in values.items() if not _is_number(value)}
         if bad:
             yield Fault(f"{name} with values that are no finite numbers: {bad}")
-    if any(value < 0 for value in result.timings.values()):
+    if any(_is_number(value) and value < 0 for value in result.timings.values()):
         yield Fault("a timing that is negative")
     mask, xy, keep = result.dynamic_mask, result.keypoints_xy, result.keypoints_keep
     if mask is not None and getattr(mask, "dtype", None) != np.bool_:

@@ -11,7 +11,6 @@ import numpy as np
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
 
 from .provenance import Provenance as Provenance
 from .result import TrackResult
@@ -33,15 +32,6 @@ class Tracker(Protocol):
 
     def track(self, frame: Frame) -> TrackResult:
         """Process one frame and return its camera-to-world pose, causally: later frames change nothing."""
-        ...
-
-
-@runtime_checkable
-class FinalizingTracker(Tracker, Protocol):
-    """A tracker with a final trajectory beside the online one."""
-
-    def finalize(self) -> Trajectory:
-        """Poses of all tracked frames after the whole sequence was seen."""
         ...
 
 

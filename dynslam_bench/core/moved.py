@@ -10,13 +10,17 @@ import types
 import warnings
 from collections.abc import Sequence
 
+CONTRACTS = "dynslam_bench.contracts"
 MOVED: dict[str, tuple[str, ...]] = {
     "dynslam_bench.culling.filter": ("dynslam_bench.contracts.filter",),
     "dynslam_bench.features.keypoints": ("dynslam_bench.contracts.features",),
     "dynslam_bench.flow.estimator": ("dynslam_bench.contracts.flow",),
-    "dynslam_bench.flow.spec": ("dynslam_bench.flow.registry",),
+    "dynslam_bench.flow.spec": ("dynslam_bench.contracts.flow", "dynslam_bench.flow.registry"),
     "dynslam_bench.segmentation.instances": ("dynslam_bench.contracts.segmenter",),
-    "dynslam_bench.sequences.datasets": ("dynslam_bench.sequences.published.datasets",),
+    "dynslam_bench.sequences.datasets": (
+        "dynslam_bench.contracts.sequence",
+        "dynslam_bench.sequences.published.datasets",
+    ),
     "dynslam_bench.sequences.frame": ("dynslam_bench.contracts.sequence", "dynslam_bench.sequences.view"),
     "dynslam_bench.slam.result": ("dynslam_bench.contracts.result",),
     "dynslam_bench.trackers.protocol": ("dynslam_bench.contracts.tracker",),
@@ -36,9 +40,9 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def exec_module(self, module: types.ModuleType) -> None:
         """Fill the old module."""
         homes = MOVED[module.__name__]
-        warnings.warn(
-            f"'{module.__name__}' has moved to '{homes[0]}' and will be gone in 0.3", DeprecationWarning, stacklevel=2
-        )
+        room = CONTRACTS if homes[0].startswith(f"{CONTRACTS}.") else homes[0]
+        message = f"'{module.__name__}' has moved and will be gone in 0.3; import from '{room}'"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
         for home in reversed(homes):
             found = importlib.import_module(home)
             module.__dict__.update({name: value for name, value in vars(found).items() if not name.startswith("__")})

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState
 from dynslam_bench.contracts.flow import FlowResult
-from dynslam_bench.culling.guard import restore_starved
-from dynslam_bench.culling.guard import GuardSettings
+from dynslam_bench.culling.guard import GuardSettings, restore_starved
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ def documented() -> list[str]:
 def test_the_documented_command_parses(line: str) -> None:
     words = expand_lists(shlex.split(line, comments=True)[1:])
     command: Any = typer.main.get_command(app)
+    assert command.commands, "the command line has no verbs"
     while commands := getattr(command, "commands", None):  # a group, of whichever click typer brings
         name = words.pop(0) if words and words[0] in commands else "make"  # the default verb of `DefaultGroup`
         assert name in commands, f"there is no '{words[:1]}' below '{command.name}'"

@@ -53,6 +53,7 @@ def test_pose_error_against_an_independent_computation() -> None:
     env = SlamEnv(ToySequence(12), TARGET)
     _, infos, _ = play(env)
     estimate, true = env.online_trajectory().T_world_cam, truth(12)
+    assert len(infos) == 12
     for i, info in enumerate(infos):
         error = np.linalg.inv(np.linalg.inv(true[0]) @ true[i]) @ (np.linalg.inv(estimate[0]) @ estimate[i])
         assert info["pose_error_trans_m"] == pytest.approx(np.linalg.norm(error[:3, 3]), abs=1e-12)

@@ -115,7 +115,9 @@ def test_the_leaderboard_orders_and_compares(made):
 
 def test_numbers_are_those_of_the_evaluation(made):
     store, paths = made
-    for row in rows_of(paths.csv["runs"])[::7]:
+    rows = rows_of(paths.csv["runs"])[::7]
+    assert rows
+    for row in rows:
         trajectory = store.trajectory(row["run_id"])
         truth = truth_of(row["sequence"])
         assert float(row["ate_rmse_m"]) == pytest.approx(evaluate(trajectory, truth).metrics["ate_rmse_m"], rel=1e-6)

@@ -1,6 +1,7 @@
 """The back end on a simulated world: accuracy, repeatability, honest loss, bad input."""
 
 import warnings
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -146,7 +147,10 @@ def test_most_of_the_image_moves_and_only_some_of_it_is_culled(room, tracked):
     assert errors(results, truth).max() < 0.03
 
 
-@pytest.mark.parametrize("solver", ["schur", "gtsam"])
+NEEDS_GTSAM = pytest.mark.skipif(find_spec("gtsam") is None, reason="the extra [gtsam] is not installed")
+
+
+@pytest.mark.parametrize("solver", ["schur", pytest.param("gtsam", marks=NEEDS_GTSAM)])
 def test_both_solvers_run(room, tracked, solver):
     truth = room.path(40)
     results = tracked(make(room, bundle_adjustment__solver=solver), [room.see(p, i) for i, p in enumerate(truth)])

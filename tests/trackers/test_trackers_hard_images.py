@@ -113,10 +113,13 @@ def test_a_gap_of_a_second_is_bridged_or_said(sequence) -> None:
     tracker = build_tracker("orb-slam2", {}, TrackerContext(sequence_id=sequence.id))
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     truth = sequence.ground_truth.T_world_cam
+    tracked = []
     for index in (*range(5), *range(36, 44)):
         result = tracker.track(sequence[index])
         if result.state == "ok":
             assert np.linalg.norm((truth[0] @ result.T_world_cam - truth[index])[:3, 3]) < 0.03
+            tracked.append(index)
+    assert tracked[:5] == [0, 1, 2, 3, 4]
 
 
 def test_frames_of_another_kind_are_refused_in_one_line(sequence) -> None:

@@ -84,7 +84,9 @@ def test_an_untunable_study_says_that_it_did_not_help(sequences: list[str], tmp_
 def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> None:
     tuner = run_study(make(sequences, trials=3), results=tmp_path)
     stored = set(RunStore(tmp_path).ids())
-    for trial in tuner.study.get_trials():
+    trials = tuner.study.get_trials()
+    assert trials
+    for trial in trials:
         named = {run_id for _, _, run_id, *_ in trial.user_attrs["instances"]}
         assert len(named) == 2 and named <= stored
 

@@ -68,11 +68,6 @@ class SyntheticSequence:
         return str(self._id)
 
     @property
-    def synthetic_id(self) -> SyntheticId:
-        """The id in parts."""
-        return self._id
-
-    @property
     def camera(self) -> Camera:
         """The camera of TUM's fr3 sequences, without distortion."""
         return CAMERA

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import gtsam
 import numpy as np
+
+from dynslam_bench.core.errors import TrackerError
 
 from ..localisation.pose import CHI2_DEPTH, CHI2_MONO
 from .schur import BundleProblem, BundleResult, reprojection_chi2
@@ -20,7 +21,11 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     Args:
         problem: As for `bundle.adjust_bundle`.
         iterations: Levenberg-Marquardt iterations at most.
+
+    Raises:
+        TrackerError: gtsam is not installed.
     """
+    gtsam = _load_gtsam()
     camera = problem.camera
     mono = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
     stereo = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
@@ -39,7 +44,7 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     for k in range(len(problem.obs_pose)):
         info, info_right = float(problem.info[k]), float(problem.info_right[k])
         if (info, info_right) not in models:
-            models[info, info_right] = _noise(info, info_right)
+            models[info, info_right] = _noise(gtsam, info, info_right)
         keys = pose_keys[problem.obs_pose[k]], point_keys[problem.obs_point[k]]
         u, v = problem.uv[k]
         if info_right > 0:
@@ -61,7 +66,16 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     return BundleResult(poses, points, chi2 <= limit, before, after)
 
 
-def _noise(info: float, info_right: float) -> Any:
+def _load_gtsam() -> Any:
+    try:
+        import gtsam
+    except ImportError as error:
+        message = f"bundle_adjustment.solver 'gtsam' needs a package that cannot be imported: {error}"
+        raise TrackerError(message, "pip install 'dynslam-bench[gtsam]', or use the solver 'schur'") from error
+    return gtsam
+
+
+def _noise(gtsam: Any, info: float, info_right: float) -> Any:
     sigma = info**-0.5
     if info_right > 0:
         base = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, info_right**-0.5, sigma]))

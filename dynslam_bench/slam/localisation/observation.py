@@ -56,10 +56,6 @@ class Observations:
         """What `search_in_radius` takes: pixels, right coordinates, octaves, descriptors."""
         return self.xy, self.right, self.octave, self.words
 
-    def in_camera(self, camera: Camera) -> NDArray[np.float64]:
-        """Points ``[N, 3]`` of the camera frame, metres; meaningless rows where `z` is 0."""
-        return camera.unproject(self.xy, self.z)
-
 
 def observe(
     frame: FrameBundle,

@@ -46,7 +46,6 @@ class Map:
         self.scales = np.ascontiguousarray(scales, np.float64)
         self.next_keyframe = 0
         self.next_point = 0
-        self._kf_tables: dict[str, tuple[str, tuple[int, ...]]] = {}
         self._free_points: list[int] = []
         self._freed_points: list[int] = []
         self._top = 0

@@ -1,0 +1,73 @@
+"""Names that nothing in the package uses, each with the reason why it stays; read by vulture, never run."""
+
+# public API, used from outside
+read_kitti  # users with trajectories in KITTI's format
+write_kitti  # the same, the other way
+relative_to_first  # on a Trajectory, for users who compare with systems that start at the identity
+of_classes  # on Instances, for authors of filters and segmenters
+action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
+neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
+BoxFilter  # a rejection rule for systems of one's own, held to its paper by tests/culling
+emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
+hamming  # features.matching: the reference in numpy that the kernel is held against
+exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
+
+# called by name: specs name their factories as "module:name"
+OrbExtractor  # features.registry
+build_daisy  # flow.registry
+build_lucas_kanade  # flow.registry
+build_dis  # flow.registry
+build_recorded  # segmentation.registry
+build_onnx  # segmentation.registry
+build_embedded  # segmentation.registry
+build_coco  # segmentation.registry
+build_weights  # segmentation.registry
+open_rendered  # sequences.catalogue
+run_loop  # runs.process.child.WORK
+ConstantVelocity  # trackers.adapters.specs
+NeverMove  # trackers.adapters.specs
+Open3dOdometry  # trackers.adapters.specs
+OpenCvOdometry  # trackers.adapters.specs
+OrbSlam3  # trackers.adapters.specs
+Replay  # trackers.adapters.specs
+build_masks_only  # trackers.systems.dynaslam: a variant's spec
+build_object_mode  # trackers.systems.emfoa_oft: a variant's spec
+
+# called by a library
+__getattr__  # Python asks it for names of a package that are loaded late
+action_space  # gymnasium.Env
+observation_space  # gymnasium.Env
+infer_relative_search_space  # optuna.samplers.BaseSampler
+sample_relative  # optuna.samplers.BaseSampler
+default_factory  # pydantic.fields.FieldInfo
+writeable  # numpy.ndarray.flags
+_LanesModel  # numba registers it by its decorator
+_WordsModel  # numba registers it by its decorator
+keywords  # numba: a signature of a typing template
+muted_rows  # reports/html/templates/report.html.j2
+mtime_ns  # core.fingerprint: part of the key of the cached function
+modified_ns  # trackers.adapters.vocabulary: part of the key of the cached function
+
+# fields of records and results: written for those who read the files
+descriptor_bytes  # FeatureSpec
+median_dt_s  # evaluation
+hole_at_s  # evaluation
+n_initialising  # run.json
+n_dropped  # run.json
+finalize_s  # run.json
+peak_gpu_memory_mb  # run.json
+trained_on  # a checkpoint's record
+median_ms  # segmenter evaluate
+ap  # segmenter evaluate
+ap50  # segmenter evaluate
+frame_iou  # segmenter evaluate
+instance_iou  # segmenter evaluate
+checked  # record of a fetched sequence
+improves  # a study's summary
+cost_before  # BundleResult, printed by tests/benchmarks/backend_bundle.py
+cost_after  # BundleResult, the same
+frame_error_trans_m  # a column of frames.csv
+frame_error_rot_deg  # a column of frames.csv
+pose_error_trans_m  # a column of frames.csv
+pose_error_rot_deg  # a column of frames.csv
+reward_m  # a column of frames.csv

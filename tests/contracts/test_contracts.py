@@ -1,0 +1,87 @@
+"""The room of contracts: complete, light, and the same objects as in the rooms that use them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynslam_bench import contracts
+from dynslam_bench.contracts import Frame, TrackResult, Trajectory
+from dynslam_bench.contracts.checks import STATES, blemishes, check_result, faults, trajectory_faults
+from dynslam_bench.features.registry import FeatureSpec
+from dynslam_bench.flow.registry import FlowSpec
+from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
+from dynslam_bench.sequences import DatasetSpec
+
+HEAVY = ("torch", "cv2", "numba", "scipy", "gymnasium", "optuna", "pandas")
+PROMISED = """Tracker TrackerSpec TrackerContext Provenance TrackResult MapOutputs KeyframeRecord Segmenter Instances
+SegmenterSpec FlowEstimator FlowResult FlowSpec FeatureExtractor Keypoints FeatureSpec DynamicFilter FilterResult
+FilterState FrameBundle Need Sequence Frame FrameMasks MaskSource DatasetSpec Camera Trajectory""".split()
+FRAME = Frame(3, 0.1, np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), np.float32))
+
+
+def test_importing_the_contracts_loads_nothing_heavy() -> None:
+    code = f"import sys, dynslam_bench.contracts; print([name for name in {HEAVY} if name in sys.modules])"
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_all_that_a_plug_in_needs_is_exported() -> None:
+    assert set(PROMISED) <= set(contracts.__all__)
+    assert all(getattr(contracts, name) is not None for name in contracts.__all__)
+
+
+@pytest.mark.parametrize("spec", [FeatureSpec, FlowSpec, SegmenterContext, SegmenterSpec, DatasetSpec])
+def test_the_rooms_hand_on_the_same_class(spec: type) -> None:
+    assert getattr(contracts, spec.__name__) is spec
+
+
+def given(**changes: object) -> TrackResult:
+    return TrackResult(**{"T_world_cam": np.eye(4), "state": "ok", **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("result", "words"),
+    [
+        (np.eye(4), "a ndarray, not a TrackResult"),
+        (given(state="fine"), "state 'fine'"),
+        (given(T_world_cam=None), "state 'ok' without a pose"),
+        (given(T_world_cam=np.eye(3)), "an array of shape (3, 3) as pose"),
+        (given(T_world_cam=np.full((4, 4), np.nan)), "a pose with 16 values that are not finite"),
+        (given(T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0])), "a pose that is no rigid transformation"),
+        (given(dynamic_mask=np.zeros((4, 4), bool)), "a dynamic mask of shape (4, 4)"),
+    ],
+)
+def test_faults(result: object, words: str) -> None:
+    assert [fault.found[: len(words)] for fault in faults(result, FRAME)] == [words]
+
+
+@pytest.mark.parametrize(
+    ("result", "words"),
+    [
+        (given(stats={"n": float("nan")}), "stats with values"),
+        (given(timings={"t": "soon"}), "timings with values"),
+        (given(timings={"t": -1.0}), "a timing that is negative"),
+        (given(dynamic_mask=np.zeros((4, 6), np.uint8)), "a dynamic mask of type uint8"),
+        (given(keypoints_xy=np.zeros(4, np.float32)), "keypoints_xy of shape (4,)"),
+        (given(keypoints_keep=np.ones(3, bool)), "keypoints_keep that does not fit"),
+    ],
+)
+def test_blemishes_are_no_faults(result: TrackResult, words: str) -> None:
+    assert not list(faults(result, FRAME))
+    assert [fault.found[: len(words)] for fault in blemishes(result)] == [words]
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_a_good_result_has_neither(state: str) -> None:
+    result = given(state=state, stats={"matches": 3}, timings={"all": 0.01})
+    assert not list(faults(result, FRAME)) and not list(blemishes(result))
+    assert check_result(result, FRAME, "mine").stats == {"matches": 3.0}
+
+
+def test_a_final_trajectory_is_one() -> None:
+    assert [fault.found for fault in trajectory_faults(np.eye(4))] == ["a ndarray, not a Trajectory"]
+    assert not list(trajectory_faults(Trajectory(np.array([0.0, 1.0]), np.stack([np.eye(4)] * 2))))

@@ -1,0 +1,129 @@
+"""Habits of the tests themselves: no test may pass without asserting; private names are asked for with a reason."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Sequence
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parents[1]
+FILES = [file for file in sorted(TESTS.rglob("*.py")) if not {"fixtures", "benchmarks"} & set(file.parts)]
+CERTAIN = {
+    "test_exp_is_the_matrix_exponential": "it walks over the five twists that it makes",
+    "test_replay_gives_the_files_poses": "it walks over the poses that it writes",
+}
+"""Tests with assertions in loops only, over what cannot be empty although the checker does not see it."""
+PRIVATE = {
+    "culling/test_culling_baselines.py": ({"_moving_corners"}, "where a paper's box has its corners decides the rule"),
+    "envs/envs_toys.py": ({"_exit"}, "os._exit: a process that dies at once"),
+    "flow/test_flow_maps.py": ({"_binomial"}, "exact weights, before they are folded into a kernel"),
+    "flow/test_flow_sparse.py": ({"_runner"}, "counts the threads' work, which no result shows"),
+    "runs/hostile.py": ({"_exit"}, "os._exit: a process that dies at once"),
+    "segmentation/test_segmentation_torchvision.py": ({"_dynamo"}, "torch._dynamo must not be loaded"),
+    "sequences/test_synthetic_geometry.py": ({"_geometry", "_tiles"}, "the exact scene behind a rendered frame"),
+    "trackers/test_adapter_orbslam3.py": ({"_process", "_program"}, "kills the program behind the adapter's back"),
+    "trackers/test_adapter_programs.py": (
+        {"_command", "_exchange", "_process", "_program"},
+        "kills the program, or looks for what it left on the disk",
+    ),
+    "trackers/test_method_page.py": ({"_flow"}, "the flow that the page promises is the one that runs"),
+    "trackers/test_steering.py": ({"_built", "_steering"}, "which part took a setting, before any frame shows it"),
+    "trackers/test_systems.py": ({"_filters", "_masks"}, "what a system is composed of"),
+    "trackers/test_systems_bridging.py": ({"_filters", "_masks"}, "puts known masks in place of a network's"),
+    "trackers/test_systems_lost_flow.py": ({"_filters", "_flow"}, "puts a flow that fails in place of the system's"),
+}
+"""Private names that a test may use, each file with its reason."""
+
+
+def private_names(tree: ast.Module) -> set[str]:
+    """Names with one leading underscore that a file takes from elsewhere."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            found |= {alias.name for alias in node.names} | set((node.module or "").split("."))
+        elif isinstance(node, ast.Attribute) and not (isinstance(node.value, ast.Name) and node.value.id == "self"):
+            found.add(node.attr)
+    return {name for name in found if name.startswith("_") and not name.startswith("__")}
+
+
+def sure(node: ast.expr, known: set[str]) -> bool:
+    """Whether a loop over the expression surely runs."""
+    match node:
+        case ast.List(elts=items) | ast.Tuple(elts=items) | ast.Set(elts=items):
+            return any(not isinstance(item, ast.Starred) or sure(item.value, known) for item in items)
+        case ast.Dict(keys=keys):
+            return bool(keys)
+        case ast.Name(id=name) | ast.Attribute(attr=name):
+            return name.isupper() or name in known
+        case ast.Subscript(value=value):
+            return sure(value, known)
+        case ast.Call(func=ast.Name(id="range")):
+            return True
+        case ast.Call(func=ast.Name(id="enumerate" | "sorted" | "zip" | "list" | "tuple"), args=args, keywords=words):
+            strict = any(word.arg == "strict" for word in words)
+            return (any if strict else all)([sure(item, known) for item in args])
+        case ast.Call(func=ast.Attribute(value=value, attr="items" | "values" | "keys")):
+            return sure(value, known)
+    return False
+
+
+def asserts(statement: ast.stmt) -> bool:
+    """Whether the statement itself is an assertion."""
+    match statement:
+        case ast.Assert():
+            return True
+        case ast.Expr(value=ast.Call(func=called)):
+            return any(word in ast.unparse(called) for word in ("assert", "check", "raise", "fail"))
+        case ast.With(items=items):
+            return any(word in ast.unparse(item.context_expr) for item in items for word in ("raises", "warns"))
+    return False
+
+
+def certain(body: Sequence[ast.stmt], known: set[str]) -> bool:
+    """Whether some assertion of the statements surely runs."""
+    for statement in body:
+        match statement:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value) if sure(value, known):
+                known = known | {name}
+            case _ if asserts(statement):
+                return True
+            case ast.With(body=inner) | ast.Try(body=inner) if certain(inner, known):
+                return True
+            case ast.For(iter=over, body=inner) if sure(over, known) and certain(inner, known):
+                return True
+            case ast.If(body=yes, orelse=no) if certain(yes, known) and certain(no, known):
+                return True
+    return False
+
+
+def test_no_test_may_pass_without_an_assertion() -> None:
+    assert len(FILES) > 100
+    doubtful = []
+    for file in FILES:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and node.name not in CERTAIN:
+                if any(isinstance(inner, ast.Assert) for inner in ast.walk(node)) and not certain(node.body, set()):
+                    doubtful.append(f"{file.relative_to(TESTS)}: {node.name}")
+    assert doubtful == []
+
+
+def test_the_checker_sees_what_it_is_for() -> None:
+    empty = ast.parse("for row in rows():\n    assert row")
+    assert not certain(empty.body, set())
+    assert certain(ast.parse("rows = [1, 2]\nfor row in rows:\n    assert row").body, set())
+    assert not certain(ast.parse("if found:\n    assert found").body, set())
+    assert certain(ast.parse("if found:\n    assert found\nelse:\n    assert not found").body, set())
+
+
+def test_private_names_are_asked_for_with_a_reason() -> None:
+    found = {str(file.relative_to(TESTS)): private_names(ast.parse(file.read_text(encoding="utf-8"))) for file in FILES}
+    beyond = {file: names - PRIVATE.get(file, (set(), ""))[0] for file, names in found.items()}
+    assert {file: names for file, names in beyond.items() if names} == {}
+    assert all(reason for _, reason in PRIVATE.values())
+
+
+def test_every_exception_for_dead_code_has_a_reason() -> None:
+    text = (TESTS.parent / ".ci" / "vulture_whitelist.py").read_text(encoding="utf-8")
+    entries = [line for line in text.splitlines() if line and not line.startswith(("#", '"'))]
+    assert len(entries) > 10
+    assert [line for line in entries if "  # " not in line] == []

@@ -1,0 +1,51 @@
+"""What the pages and the template of a new tracker import from this package: contracts, settings and errors."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from documented_names import PAGES, ROOT
+
+from dynslam_bench import contracts
+from dynslam_bench.testing.template import write_tracker_template
+
+OPEN = {"dynslam_bench.contracts", "dynslam_bench.core.settings", "dynslam_bench.core.errors"}
+COMPOSING = "dynslam_bench.trackers.systems.composition"
+"""Puts filters on our back end: the one thing that a plug-in may take from us that is no contract."""
+
+
+def imports(code: str) -> list[tuple[str, str]]:
+    """Module and name of everything that a text takes from this package."""
+    nodes = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
+    taken = [(node.module or "", alias.name) for node in nodes for alias in node.names]
+    return [(module, name) for module, name in taken if module.startswith("dynslam_bench")]
+
+
+def blocks(page: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.S | re.M)
+
+
+def test_plug_ins_of_the_page_import_from_the_contracts_only() -> None:
+    found = [each for code in blocks(ROOT / "docs" / "plugins.md") for each in imports(code)]
+    assert len(found) > 10
+    assert {module for module, _ in found} <= OPEN | {COMPOSING}
+    assert [name for module, name in found if module == COMPOSING] == ["SystemSettings", "compose"]
+
+
+def test_the_template_imports_from_the_contracts_only(tmp_path: Path) -> None:
+    found = imports(write_tracker_template("my-slam", tmp_path).read_text())
+    assert ("dynslam_bench.contracts", "TrackerSpec") in found
+    assert {module for module, _ in found} <= OPEN
+
+
+def test_every_page_takes_a_contract_from_the_contracts() -> None:
+    found = [(page.name, *each) for page in PAGES for code in blocks(page) for each in imports(code)]
+    assert len({page for page, _, _ in found}) > 2
+    assert [each for each in found if each[2] in contracts.__all__ and each[1] != "dynslam_bench.contracts"] == []
+
+
+@pytest.mark.parametrize("name", sorted(contracts.__all__))
+def test_every_contract_says_what_it_is(name: str) -> None:
+    value = getattr(contracts, name)
+    assert not isinstance(value, type) or (value.__doc__ or "").strip()
