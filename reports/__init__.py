@@ -7,7 +7,7 @@ a row of a pandas frame, and `make_board` orders rows into the board that tables
 from .build_report import ReportPaths, build_report
 from .compare_runs import Comparison, compare
 from .model.board import Board, make_board
-from .model.frame import load_board, load_frame
+from .model.load import load_board, load_frame
 from .model.report_data import ReportData
 from .model.row import RunRow
 

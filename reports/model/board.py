@@ -11,6 +11,7 @@ from dynslam_bench.core.errors import ReportError, did_you_mean
 
 from .cell import Cell, make_cell
 from .columns import name_columns, shortened
+from .frame import rows_frame
 from .labels import make_labels
 from .row import RunRow
 from .rows import check_one_protocol
@@ -93,8 +94,6 @@ class Board:
 
     def frame(self) -> pd.DataFrame:
         """All rows as a pandas frame; see `rows_frame` for its columns and units."""
-        from .frame import rows_frame
-
         return rows_frame(self.rows, self.columns, self.labels)
 
     def lacking(self, key: str) -> list[str]:

@@ -3,17 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.runs.storage.store import RunStore
-
-from .board import DEFAULT_REFERENCE, Board, On, make_board
-from .columns import name_columns
-from .labels import make_labels
 from .row import RunRow
-from .rows import load_runs, open_stores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,47 +16,6 @@ _WHOLE = ["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"]
 _FLAGS = ["ranked", "failed", "cached"]
 _NUMBERS = ["coverage", "score_m", "held_ate_m", "final_ate_m", "never_move_m", "frame_ms", "real_time_factor"]
 _NUMBERS += ["peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
-
-
-def load_frame(
-    results: Sequence[Path] | Sequence[str] | RunStore | Path | str, protocol: Protocol | str = "tum-rgbd/v1"
-) -> pd.DataFrame:
-    """All runs of some results folders, scored under one protocol, one row a run.
-
-    Args:
-        results: Results folders, or a store.
-        protocol: How to evaluate; SLAM is never run again for it.
-
-    Returns:
-        The frame that `rows_frame` describes.
-
-    Raises:
-        ReportError: There are no runs.
-    """
-    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
-    return rows_frame(rows, name_columns(rows), make_labels(rows))
-
-
-def load_board(
-    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
-    protocol: Protocol | str = "tum-rgbd/v1",
-    *,
-    reference: str = DEFAULT_REFERENCE,
-    on: On = "common",
-) -> Board:
-    """The board of some results folders: all runs, ordered and ranked as in a report.
-
-    Args:
-        results: Results folders, or a store.
-        protocol: How to evaluate; SLAM is never run again for it.
-        reference: As in `make_board`.
-        on: As in `make_board`.
-
-    Raises:
-        ReportError: As `make_board`.
-    """
-    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
-    return make_board(rows, reference, on)
 
 
 def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..settings import MotionSettings
+from ..settings import MotionModelSettings
 from .motion_model import MotionState, pose_covariance
 from .tracking import Tracked
 
@@ -38,18 +38,18 @@ class CameraMotion:
         due = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval
         return last.timestamp + self._interval if due else timestamp
 
-    def predicted(self, last: Tracked, timestamp: float, settings: MotionSettings) -> Array:
+    def predicted(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> Array:
         """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
         ahead = self._ahead(last, timestamp, settings)
         return last.T_cam_world if ahead is None else ahead.T_cam_world
 
-    def covariance(self, last: Tracked, timestamp: float, settings: MotionSettings) -> Array | None:
+    def covariance(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> Array | None:
         """How far the motion since the last frame may be from the predicted one (`MotionState.motion_covariance`)."""
         dt = self._known_gap(last, timestamp, settings)
         return None if dt is None or self._state is None else self._state.motion_covariance(dt, settings)
 
     def filtered(
-        self, last: Tracked, timestamp: float, measured: Array, information: Array, settings: MotionSettings
+        self, last: Tracked, timestamp: float, measured: Array, information: Array, settings: MotionModelSettings
     ) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.
 
@@ -72,11 +72,11 @@ class CameraMotion:
         self._state = ahead.updated(measured, covariance)
         return self._state.T_cam_world if settings.filter else measured
 
-    def _ahead(self, last: Tracked, timestamp: float, settings: MotionSettings) -> MotionState | None:
+    def _ahead(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> MotionState | None:
         dt = self._known_gap(last, timestamp, settings)
         return None if dt is None or self._state is None else self._state.predicted(dt, settings)
 
-    def _known_gap(self, last: Tracked, timestamp: float, settings: MotionSettings) -> float | None:
+    def _known_gap(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> float | None:
         """Seconds since the last frame; None where the motion model says nothing of them."""
         dt = timestamp - last.timestamp
         return dt if self._state is not None and 0 < dt <= settings.max_gap_s else None
