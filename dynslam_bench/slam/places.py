@@ -51,9 +51,12 @@ def most_alike(world: Map, keyframes: NDArray[np.int64], seen: Observations, cou
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _count(
-    pieces: Pieces, kf_point: NDArray[np.int32], kf_count: NDArray[np.int64], keyframes: NDArray[np.int64],
+    pieces: Pieces,
+    kf_point: NDArray[np.int32],
+    kf_count: NDArray[np.int64],
+    keyframes: NDArray[np.int64],
     wanted: NDArray[np.int32],
-) -> int:  # fmt: skip
+) -> int:
     """Add up in `wanted` ``[P, VALUES]`` how often each piece that is not -1 occurs; the sum of all."""
     total = 0
     for keyframe in keyframes:
@@ -70,9 +73,12 @@ def _count(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _scores(
-    pieces: Pieces, kf_point: NDArray[np.int32], kf_count: NDArray[np.int64], keyframes: NDArray[np.int64],
+    pieces: Pieces,
+    kf_point: NDArray[np.int32],
+    kf_count: NDArray[np.int64],
+    keyframes: NDArray[np.int64],
     weight: NDArray[np.float32],
-) -> NDArray[np.float64]:  # fmt: skip
+) -> NDArray[np.float64]:
     """Sum ``[S]`` of the weights of each keyframe's pieces, over the root of its points: a crowd has more by chance."""
     score = np.zeros(keyframes.shape[0])
     for row in range(keyframes.shape[0]):

@@ -13,25 +13,48 @@ class TrackingSettings(Settings):
     """Finding the pose of a frame against the map."""
 
     radius_px: float = tunable(
-        15.0, low=5.0, high=40.0, limits=(1.0, 300.0), unit="px", online=True,
+        15.0,
+        low=5.0,
+        high=40.0,
+        limits=(1.0, 300.0),
+        unit="px",
+        online=True,
         meaning="search window around the predicted position of a feature of the last frame, at octave 0",
-    )  # fmt: skip
+    )
     map_radius_px: float = tunable(
-        4.0, low=1.5, high=12.0, limits=(0.5, 100.0), unit="px", online=True,
+        4.0,
+        low=1.5,
+        high=12.0,
+        limits=(0.5, 100.0),
+        unit="px",
+        online=True,
         meaning="search window around the projection of a map point, at octave 0",
-    )  # fmt: skip
+    )
     mapped_matches: int = tunable(
-        100, low=20, high=400, limits=(1, 10000), online=True,
+        100,
+        low=20,
+        high=400,
+        limits=(1, 10000),
+        online=True,
         meaning="so many matches with map points of the last frame make points from its depth alone unnecessary",
-    )  # fmt: skip
+    )
     max_distance: int = tunable(
-        90, low=40, high=120, limits=(1, 256), unit="bits", online=True,
+        90,
+        low=40,
+        high=120,
+        limits=(1, 256),
+        unit="bits",
+        online=True,
         meaning="largest Hamming distance of a match by projection",
-    )  # fmt: skip
+    )
     ratio: float = tunable(
-        0.85, low=0.6, high=1.0, limits=(0.1, 1.0), online=True,
+        0.85,
+        low=0.6,
+        high=1.0,
+        limits=(0.1, 1.0),
+        online=True,
         meaning="nearest over second nearest descriptor distance allowed when map points are searched",
-    )  # fmt: skip
+    )
     min_inliers: int = tunable(
         25, low=10, high=60, limits=(6, 1000), meaning="fewer inliers after the last optimisation mean lost"
     )
@@ -39,17 +62,31 @@ class TrackingSettings(Settings):
         "all", meaning="search all map points in view, or only those of covisible keyframes"
     )
     close_factor: float = tunable(
-        40.0, low=20.0, high=80.0, limits=(1.0, 1000.0), unit="baselines",
+        40.0,
+        low=20.0,
+        high=80.0,
+        limits=(1.0, 1000.0),
+        unit="baselines",
         meaning="points nearer than this many stereo baselines are close: their depth is trusted at once",
-    )  # fmt: skip
+    )
     right_sigma_px: float = tunable(
-        1.5, low=0.3, high=3.0, limits=(0.05, 50.0), scale="log", unit="px",
+        1.5,
+        low=0.3,
+        high=3.0,
+        limits=(0.05, 50.0),
+        scale="log",
+        unit="px",
         meaning="standard deviation of the right coordinate at octave 0, beside the depth sensor's noise",
-    )  # fmt: skip
+    )
     depth_noise: float = tunable(
-        0.0025, low=0.0005, high=0.02, limits=(0.0, 1.0), scale="log", unit="1/m",
+        0.0025,
+        low=0.0005,
+        high=0.02,
+        limits=(0.0, 1.0),
+        scale="log",
+        unit="1/m",
         meaning="standard deviation of the depth over its square",
-    )  # fmt: skip
+    )
 
 
 class KeyframeSettings(Settings):
@@ -59,25 +96,41 @@ class KeyframeSettings(Settings):
         0, low=0, high=10, limits=(0, 1000), unit="frames", meaning="frames between keyframes, at least"
     )
     max_gap: int = tunable(
-        30, low=10, high=90, limits=(1, 100000), unit="frames",
+        30,
+        low=10,
+        high=90,
+        limits=(1, 100000),
+        unit="frames",
         meaning="after so many frames a keyframe is made if it shows anything new",
-    )  # fmt: skip
+    )
     tracked_share: float = tunable(
-        0.75, low=0.4, high=0.95, limits=(0.0, 1.0), online=True,
+        0.75,
+        low=0.4,
+        high=0.95,
+        limits=(0.0, 1.0),
+        online=True,
         meaning="a keyframe is made when fewer points are tracked than this share of the reference keyframe's "
         "established ones, or of the most since the last keyframe if the view has moved",
-    )  # fmt: skip
+    )
     established: int = tunable(
         3, low=1, high=5, limits=(1, 100), meaning="keyframes that observe an established point, at least"
     )
     view_share: float = tunable(
-        0.9, low=0.5, high=0.98, limits=(0.0, 1.0), online=True,
+        0.9,
+        low=0.5,
+        high=0.98,
+        limits=(0.0, 1.0),
+        online=True,
         meaning="a keyframe is made when less than this share of the last keyframe's points lies in the image",
-    )  # fmt: skip
+    )
     moved_share: float = tunable(
-        0.97, low=0.8, high=1.0, limits=(0.0, 1.0), online=True,
+        0.97,
+        low=0.8,
+        high=1.0,
+        limits=(0.0, 1.0),
+        online=True,
         meaning="the view has moved when less than this share of the last keyframe's points lies in the image",
-    )  # fmt: skip
+    )
     min_close: int = tunable(
         100, low=30, high=300, limits=(0, 10000), meaning="a keyframe is made when fewer close points are tracked"
     )
@@ -85,9 +138,12 @@ class KeyframeSettings(Settings):
         70, low=20, high=200, limits=(0, 10000), meaning="and when at least so many close features are not in the map"
     )
     redundant_share: float = tunable(
-        0.9, low=0.7, high=1.0, limits=(0.1, 1.0),
+        0.9,
+        low=0.7,
+        high=1.0,
+        limits=(0.1, 1.0),
         meaning="a keyframe goes when this share of its points is seen by three others at the same scale or finer",
-    )  # fmt: skip
+    )
     maximum: int = tunable(
         600, low=50, high=2000, limits=(10, 100000), scale="log", meaning="keyframes kept at most; bounds the memory"
     )
@@ -111,13 +167,19 @@ class MappingSettings(Settings):
         1.0, low=0.2, high=3.0, limits=(0.01, 30.0), unit="deg", meaning="smallest parallax of a triangulated point"
     )
     min_found_ratio: float = tunable(
-        0.25, low=0.1, high=0.6, limits=(0.0, 1.0),
+        0.25,
+        low=0.1,
+        high=0.6,
+        limits=(0.0, 1.0),
         meaning="a point goes when it is found in fewer than this share of the frames that should see it",
-    )  # fmt: skip
+    )
     min_observations: int = tunable(
-        2, low=1, high=4, limits=(1, 10),
+        2,
+        low=1,
+        high=4,
+        limits=(1, 10),
         meaning="a point goes when, three keyframes after its creation, fewer keyframes observe it",
-    )  # fmt: skip
+    )
 
 
 class BundleAdjustmentSettings(Settings):
@@ -132,9 +194,13 @@ class BundleAdjustmentSettings(Settings):
         6, low=1, high=20, limits=(0, 100), meaning="further keyframes that see the same points and stay where they are"
     )
     observations: int = tunable(
-        6000, low=1000, high=20000, limits=(100, 1000000), scale="log",
+        6000,
+        low=1000,
+        high=20000,
+        limits=(100, 1000000),
+        scale="log",
         meaning="observations used at most: the budget that bounds the keyframe's step",
-    )  # fmt: skip
+    )
     iterations: int = tunable(3, low=1, high=10, limits=(1, 100), meaning="Levenberg-Marquardt iterations")
 
 
@@ -142,9 +208,12 @@ class RelocalisationSettings(Settings):
     """Finding the pose again after tracking was lost."""
 
     searched: int = tunable(
-        10, low=3, high=40, limits=(1, 100000),
+        10,
+        low=3,
+        high=40,
+        limits=(1, 100000),
         meaning="keyframes that are matched feature by feature: those that look most alike; bounds the time of a frame",
-    )  # fmt: skip
+    )
     candidates: int = tunable(
         5, low=1, high=20, limits=(1, 1000), meaning="keyframes with the most descriptor matches that PnP is tried on"
     )

@@ -257,11 +257,12 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     count = len(problem.points)
     start = np.searchsorted(problem.obs_point, np.arange(count + 1)).astype(np.int64)
     chi2 = np.zeros(len(problem.obs_pose))
+    guess = np.ascontiguousarray(problem.poses), problem.variable, np.ascontiguousarray(problem.points)
+    measured = problem.uv, problem.right, problem.info, problem.info_right
+    lens = c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m
     poses, points, before, after = _adjust(
-        np.ascontiguousarray(problem.poses), problem.variable, np.ascontiguousarray(problem.points), problem.obs_pose,
-        problem.obs_point, start, problem.uv, problem.right, problem.info, problem.info_right,
-        c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, iterations, chi2,
-    )  # fmt: skip
+        *guess, problem.obs_pose, problem.obs_point, start, *measured, *lens, iterations, chi2
+    )
     limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
     return BundleResult(poses, points, chi2 <= limit, before, after)
 
@@ -270,8 +271,7 @@ def reprojection_chi2(problem: BundleProblem, poses: Array, points: Array) -> tu
     """Huber cost and chi-square of each observation ``[N]`` at given poses and points; inf behind the camera."""
     c = problem.camera
     chi2 = np.zeros(len(problem.obs_pose))
-    cost = _cost(
-        np.ascontiguousarray(poses), np.ascontiguousarray(points), problem.obs_pose, problem.obs_point, problem.uv,
-        problem.right, problem.info, problem.info_right, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2,
-    )  # fmt: skip
+    guess, seen = (np.ascontiguousarray(poses), np.ascontiguousarray(points)), (problem.obs_pose, problem.obs_point)
+    measured = problem.uv, problem.right, problem.info, problem.info_right
+    cost = _cost(*guess, *seen, *measured, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2)
     return float(cost), chi2

@@ -96,6 +96,15 @@ def observe(
     column = np.clip(np.rint(keypoints.xy[:, 0]).astype(np.int64), 0, frame.rgb.shape[1] - 1)
     row = np.clip(np.rint(keypoints.xy[:, 1]).astype(np.int64), 0, frame.rgb.shape[0] - 1)
     return Observations(
-        keypoints, xy, z, right, octave, keypoints.angle.astype(np.float64), as_words(keypoints.descriptors), info,
-        info_right, CellGrid.of(xy, camera.width, camera.height), frame.rgb[row, column],
-    )  # fmt: skip
+        keypoints,
+        xy,
+        z,
+        right,
+        octave,
+        keypoints.angle.astype(np.float64),
+        as_words(keypoints.descriptors),
+        info,
+        info_right,
+        CellGrid.of(xy, camera.width, camera.height),
+        frame.rgb[row, column],
+    )

@@ -276,10 +276,9 @@ def optimise_pose(
     """
     if len(points) < 6:
         return PoseEstimate(T_cam_world, np.zeros(len(points), bool), float("nan"), np.zeros((6, 6)))
-    pose, inliers, error, h = _optimise(
-        np.ascontiguousarray(T_cam_world, np.float64), np.ascontiguousarray(points), np.ascontiguousarray(uv),
-        np.ascontiguousarray(right), np.ascontiguousarray(info), np.ascontiguousarray(info_right),
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m, rounds, iterations,
-    )  # fmt: skip
+    start = np.ascontiguousarray(T_cam_world, np.float64)
+    rows = [np.ascontiguousarray(each) for each in (points, uv, right, info, info_right)]
+    lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
+    pose, inliers, error, h = _optimise(start, *rows, *lens, rounds, iterations)
     residual = float(np.median(error[inliers])) if inliers.any() else float("nan")
     return PoseEstimate(pose, inliers, residual, h)

@@ -96,9 +96,13 @@ def _inliers(pose: Array, position: Array, xy: Array, info: Array, camera: Camer
 
 
 def locate(
-    world: Map, keyframes: list[int], seen: Observations, settings: RelocalisationSettings, rng: np.random.Generator,
+    world: Map,
+    keyframes: list[int],
+    seen: Observations,
+    settings: RelocalisationSettings,
+    rng: np.random.Generator,
     min_inliers: int,
-) -> Relocalised | None:  # fmt: skip
+) -> Relocalised | None:
     """The best pose that any of the keyframes supports.
 
     Args:

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
 
+MARGIN_PX = 8.0
+"""So far outside the image a point of the last frame is still looked for."""
 ENOUGH_FIRST = 20
 """Matches with the last frame that make a second, wider search unnecessary (ORB-SLAM2's number)."""
 
@@ -66,16 +68,19 @@ class Matches:
 
     def joined(self, other: Matches) -> Matches:
         """These matches, then the others."""
-        return Matches(
-            np.concatenate([self.feature, other.feature]), np.concatenate([self.point, other.point]),
-            np.concatenate([self.position, other.position]),
-        )  # fmt: skip
+        pairs = ((self.feature, other.feature), (self.point, other.point), (self.position, other.position))
+        return Matches(*(np.concatenate(pair) for pair in pairs))
 
 
 def match_last_frame(
-    world: Map, last: Tracked, seen: Observations, T_cam_world: Array, radius_px: float, close_m: float,
+    world: Map,
+    last: Tracked,
+    seen: Observations,
+    T_cam_world: Array,
+    radius_px: float,
+    close_m: float,
     max_distance: int,
-) -> Matches:  # fmt: skip
+) -> Matches:
     """Look for the last frame's points around their projections into the new frame.
 
     Beside map points these are points that only the last frame's depth gives, nearer than `close_m`.
@@ -103,18 +108,19 @@ def match_last_frame(
     local = se3.transform(T_cam_world, position)
     ahead = local[:, 2] > 0.05
     uv = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-    margin = 8.0
     inside = (
-        ahead & (uv[:, 0] >= -margin) & (uv[:, 0] < camera.width + margin) & (uv[:, 1] >= -margin)
-        & (uv[:, 1] < camera.height + margin)
-    )  # fmt: skip
+        ahead
+        & (uv >= -MARGIN_PX).all(axis=1)
+        & (uv < (camera.width + MARGIN_PX, camera.height + MARGIN_PX)).all(axis=1)
+    )
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
     octave = last.seen.octave[rows]
+    free, words = np.ones(len(seen), bool), last.seen.words[rows]
+    right = uv[:, 0] - camera.fx * camera.baseline_m / depth
+    windows, octaves = (uv, right, radius_px * world.scales[octave]), (octave - 1, octave + 1)
     found, _ = search_in_radius(
-        seen.grid, seen.arrays, np.ones(len(seen), bool),
-        (uv, uv[:, 0] - camera.fx * camera.baseline_m / depth, radius_px * world.scales[octave]),
-        (octave - 1, octave + 1), last.seen.words[rows], max_distance=max_distance, ratio=0.9,
-    )  # fmt: skip
+        seen.grid, seen.arrays, free, windows, octaves, words, max_distance=max_distance, ratio=0.9
+    )
     hit = found >= 0
     rows, position, found = rows[hit], position[hit], found[hit]
     steady = rotation_consistent(last.seen.angle[rows], seen.angle[found])
@@ -122,9 +128,14 @@ def match_last_frame(
 
 
 def match_map(
-    world: Map, seen: Observations, T_cam_world: Array, known: Matches, candidates: Slots, settings: TrackingSettings,
+    world: Map,
+    seen: Observations,
+    T_cam_world: Array,
+    known: Matches,
+    candidates: Slots,
+    settings: TrackingSettings,
     widen: float = 1.0,
-) -> tuple[Matches, Slots]:  # fmt: skip
+) -> tuple[Matches, Slots]:
     """Look for map points in view among the features that have no match yet.
 
     Args:
@@ -147,10 +158,9 @@ def match_map(
     rest = ~taken[points]
     radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
     wanted = points[rest]
-    found, _ = search_in_radius(
-        seen.grid, seen.arrays, free, (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1),
-        world.words[wanted], max_distance=settings.max_distance, ratio=settings.ratio,
-    )  # fmt: skip
+    windows, octaves = (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1)
+    words, bits, ratio = world.words[wanted], settings.max_distance, settings.ratio
+    found, _ = search_in_radius(seen.grid, seen.arrays, free, windows, octaves, words, max_distance=bits, ratio=ratio)
     hit = found >= 0
     return Matches(found[hit], wanted[hit], world.position[wanted[hit]]), points
 
@@ -158,10 +168,8 @@ def match_map(
 def solve(world: Map, seen: Observations, matches: Matches, T_cam_world: Array, *, rounds: int = 4) -> PoseEstimate:
     """The pose that fits the matches, starting from a given one."""
     f = matches.feature
-    return optimise_pose(
-        T_cam_world, matches.position, seen.xy[f], seen.right[f], seen.info[f], seen.info_right[f], world.camera,
-        rounds=rounds,
-    )  # fmt: skip
+    measured = seen.xy[f], seen.right[f], seen.info[f], seen.info_right[f]
+    return optimise_pose(T_cam_world, matches.position, *measured, world.camera, rounds=rounds)
 
 
 @dataclass(frozen=True, eq=False)

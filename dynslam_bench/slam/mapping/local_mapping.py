@@ -150,14 +150,11 @@ class LocalMapper:
             return
         xy = world.kf_xy[keyframe, :n]
         grid = CellGrid.of(xy, world.camera.width, world.camera.height)
-        arrays = (
-            xy, world.kf_right[keyframe, :n], world.kf_octave[keyframe, :n].astype(np.int64),
-            world.kf_words[keyframe, :n],
-        )  # fmt: skip
-        found, _ = search_in_radius(
-            grid, arrays, np.ones(n, bool), (uv, right, 3.0 * world.scales[octave]), (octave - 1, octave + 1),
-            world.words[points], max_distance=50,
-        )  # fmt: skip
+        levels = world.kf_octave[keyframe, :n].astype(np.int64)
+        arrays = xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n]
+        windows, octaves = (uv, right, 3.0 * world.scales[octave]), (octave - 1, octave + 1)
+        free, words = np.ones(n, bool), world.words[points]
+        found, _ = search_in_radius(grid, arrays, free, windows, octaves, words, max_distance=50)
         hit = found >= 0
         points, found = points[hit], found[hit]
         residual = ((xy[found] - uv[hit]) ** 2).sum(axis=1) / world.scales[arrays[2][found]] ** 2

@@ -250,10 +250,8 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
-        kernels.refresh(
-            points, self.position, self.normal, self.far, self.words, self.obs_kf, self.obs_ft, self.n_obs,
-            self.kf_words, self.kf_octave, self.kf_centre, self.scales,
-        )  # fmt: skip
+        of_points = self.position, self.normal, self.far, self.words, self.obs_kf, self.obs_ft, self.n_obs
+        kernels.refresh(points, *of_points, self.kf_words, self.kf_octave, self.kf_centre, self.scales)
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nobody holds them any more."""
@@ -281,8 +279,6 @@ class Map:
 
     def redundancy(self, slot: int, close_m: float, others: int = 3) -> tuple[int, int]:
         """A keyframe's close points, and how many of them `others` keyframes see at the same scale or finer."""
-        total, redundant = kernels.redundancy(
-            slot, int(self.kf_count[slot]), self.kf_point, self.kf_octave, self.kf_z, close_m, self.obs_kf,
-            self.obs_ft, self.n_obs, others,
-        )  # fmt: skip
+        keyframes, seen = (self.kf_point, self.kf_octave, self.kf_z), (self.obs_kf, self.obs_ft, self.n_obs)
+        total, redundant = kernels.redundancy(slot, int(self.kf_count[slot]), *keyframes, close_m, *seen, others)
         return int(total), int(redundant)

@@ -51,11 +51,10 @@ def write_ply(path: Path, outputs: MapOutputs, *, binary: bool = True) -> None:
     for i, name in enumerate(("red", "green", "blue")):
         rows[name] = outputs.colours[:, i]
     rows["n"] = outputs.observations
-    header = [
-        "ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0", f"element vertex {len(rows)}",
-        "property float x", "property float y", "property float z", "property uchar red", "property uchar green",
-        "property uchar blue", "property int observations", "end_header",
-    ]  # fmt: skip
+    kinds = {"float": ("x", "y", "z"), "uchar": ("red", "green", "blue"), "int": ("observations",)}
+    properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
+    coding = "binary_little_endian" if binary else "ascii"
+    header = ["ply", f"format {coding} 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
     head = ("\n".join(header) + "\n").encode()
     if binary:
         write_atomic(path, head + rows.tobytes())

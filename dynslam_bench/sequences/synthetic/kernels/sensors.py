@@ -13,6 +13,7 @@ Depth model, in the order of the physics of a Kinect-like sensor:
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from .compiled import kernel
 
 
 @kernel
-def _hash(a, b):  # type: ignore[no-untyped-def]
+def _hash(a: Any, b: Any) -> Any:
     """A 64-bit hash (splitmix64 finaliser) of two 64-bit integers."""
     z = np.uint64(a) + np.uint64(0x9E3779B97F4A7C15) * (np.uint64(b) + np.uint64(1))
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -29,7 +30,7 @@ def _hash(a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _normal(h):  # type: ignore[no-untyped-def]
+def _normal(h: Any) -> float:
     """About normal with variance 1: the centred sum of the four 16-bit parts of a hash."""
     m = np.uint64(0xFFFF)
     total = float(h & m) + float((h >> np.uint64(16)) & m) + float((h >> np.uint64(32)) & m) + float(h >> np.uint64(48))
@@ -37,7 +38,7 @@ def _normal(h):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _uniform(h):  # type: ignore[no-untyped-def]
+def _uniform(h: Any) -> float:
     return float(h >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
