@@ -13,7 +13,7 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report
-from dynslam_bench.reports import compare_runs as compare
+from dynslam_bench.reports import compare
 from dynslam_bench.reports.figures.sequence import broken
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import shortened
