@@ -12,8 +12,7 @@ from reports_fake_store import add_run, fill, truth_of
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import ReportData, build_report
-from dynslam_bench.reports import compare_runs as compare
+from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.figures.sequence import broken
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import shortened

@@ -7,8 +7,7 @@ import pytest
 from reports_fake_store import add_run
 
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import build_report, load_frame
-from dynslam_bench.reports import compare_runs as compare
+from dynslam_bench.reports import build_report, compare, load_frame
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import name_columns
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
