@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..model.board import Board
+from ..model.statistics import Interval
 from ..tables.leaderboard import CACHED_MARK, timed
 from .style import COLOURS, GRID, Figure, axis, colours, guide, layout_of, log_axis, rounded, safe, significant, wrapped
 
@@ -106,25 +107,21 @@ def speed_figure(board: Board) -> Figure | None:
                 "hovertemplate": "%{fullData.name}<br>%{x:.2f} × real time<br>ratio %{y:.3f}<extra></extra>",
             }
         )
-    layout = layout_of(
+    return {"data": traces, "layout": _speed_layout([(speed, ratio) for _, speed, ratio, _ in points])}
+
+
+def _speed_layout(points: Sequence[tuple[float, Interval]]) -> dict[str, Any]:
+    ends = [end for _, ratio in points for end in (ratio.value, ratio.low, ratio.high)]
+    note = {"x": 0, "xref": "x", "y": 1, "yref": "paper", "text": "real time", "showarrow": False}
+    note |= {"xanchor": "left", "yanchor": "top", "xshift": 5, "font": {"size": 11, "color": "#6b7280"}}
+    speeds = "× real time: frame interval over mean frame time (right is better)"
+    return layout_of(
         height=max(460, 120 + 21 * len(points)),
-        xaxis=log_axis(
-            "× real time: frame interval over mean frame time (right is better)",
-            [1.0, *(speed for _, speed, _, _ in points)],
-        ),
-        yaxis=log_axis(
-            "ATE ratio (down is better)",
-            [1.0, *(end for _, _, ratio, _ in points for end in (ratio.value, ratio.low, ratio.high))],
-        ),
+        xaxis=log_axis(speeds, [1.0, *(speed for speed, _ in points)]),
+        yaxis=log_axis("ATE ratio (down is better)", [1.0, *ends]),
         shapes=[guide(x=1.0), guide(y=1.0)],
-        annotations=[
-            {
-                "x": 0, "xref": "x", "y": 1, "yref": "paper", "text": "real time", "showarrow": False,
-                "xanchor": "left", "yanchor": "top", "xshift": 5, "font": {"size": 11, "color": "#6b7280"},
-            }
-        ],
-    )  # fmt: skip
-    return {"data": traces, "layout": layout}
+        annotations=[note],
+    )
 
 
 def repeat_figure(board: Board) -> Figure | None:

@@ -416,3 +416,13 @@ def test_tables_in_every_format():
     assert r"\caption{A \& B. 50 \% of\_it.}" in latex
     assert r"\multicolumn{2}{c}{G} \\ \cmidrule(lr){2-3}" in latex
     assert r"a\textbar{}b\_*~{\scriptsize imported} & \textbf{0.5}~{\scriptsize $\pm$0.1} &  \\" in latex
+
+
+def test_a_table_is_two_frames():
+    cells = [[TableCell("a"), TableCell("0.5", "±0.1", 0.51234), TableCell("3", value=3)]]
+    cells.append([TableCell("b"), TableCell("–"), TableCell()])
+    table = Table("t", "T", "c", [Column("name", numeric=False), Column("x"), Column("y")], cells)
+    assert table.rows == cells
+    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "float64", "y": "Int64"}
+    assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
+    assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"
