@@ -128,7 +128,7 @@ def published_values(names: Iterable[str], sequence: str) -> list[float]:
 
 def published_never_move() -> dict[str, float]:
     """ATE of a camera that never moves on recorded sequences, metres."""
-    text = (files("dynslam_bench.reports") / "data" / "never_move.csv").read_text(encoding="utf-8")
+    text = (files("dynslam_bench.reports.model") / "data" / "never_move.csv").read_text(encoding="utf-8")
     lines = csv.DictReader(text.splitlines())
     return {line["sequence"]: float(line["value"]) for line in lines if line["metric"] == "ape_rmse"}
 

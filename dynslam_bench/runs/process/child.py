@@ -115,7 +115,7 @@ def _prepare(job: dict[str, Any]) -> None:
 
 
 def limit_threads(threads: int) -> None:
-    """Give OpenCV, torch and numba that many threads; BLAS has one (see `forkserver.THREAD_VARIABLES`)."""
+    """Give OpenCV, torch and numba that many threads; BLAS has one (see `server.THREAD_VARIABLES`)."""
     import cv2
 
     cv2.setNumThreads(threads)
