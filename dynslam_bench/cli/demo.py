@@ -46,7 +46,7 @@ class DemoOutcome:
 
 
 def run_demo(results: Path | str = "results", *, frames: int = 300, jobs: int = 2, trials: int = 10) -> DemoOutcome:
-    """Render walking and sitting people, run the suite ``demo`` on them, report it, and tune `emfoa-oft`, our own system.
+    """Render walking and sitting people, run the suite ``demo`` on them, report it, and tune `emfoa-oft`.
 
     Args:
         results: Results folder; the report is ``report/index.html`` in it, the study lies in ``study``.

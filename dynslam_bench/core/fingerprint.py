@@ -162,7 +162,7 @@ def plugin_digest(entry_point: str) -> str:
     try:
         if module.endswith(".py"):
             folder = Path(module).expanduser().resolve().parent
-            return files_digest((file for file in folder.iterdir() if _is_code(file)), folder)
+            return files_digest(_code_below(folder), folder)
         if top == _OWN:
             return ""
         return digest([_folder_code(folder) for folder in _folders_of(top)])
@@ -193,6 +193,15 @@ def _folders_of(top: str) -> list[Path]:
             f"the code of '{top}' cannot be found, so its runs could not be told apart", "is it installed?"
         )
     return [Path(spec.origin)]
+
+
+def _code_below(folder: Path) -> Iterator[Path]:
+    """The code of a folder and of its packages and folders, but for hidden ones and virtual environments."""
+    for entry in sorted(folder.iterdir()):
+        if _is_code(entry):
+            yield entry
+        elif entry.is_dir() and not entry.name.startswith((".", "__")) and not (entry / "pyvenv.cfg").is_file():
+            yield from _code_below(entry)
 
 
 def _is_code(file: Path) -> bool:

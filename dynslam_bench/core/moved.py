@@ -41,7 +41,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """Fill the old module."""
         homes = MOVED[module.__name__]
         room = CONTRACTS if homes[0].startswith(f"{CONTRACTS}.") else homes[0]
-        message = f"'{module.__name__}' has moved and will be gone in 0.3; import from '{room}'"
+        message = f"'{module.__name__}' has moved and will be gone in 0.2; import from '{room}'"
         warnings.warn(message, DeprecationWarning, stacklevel=2)
         for home in reversed(homes):
             found = importlib.import_module(home)

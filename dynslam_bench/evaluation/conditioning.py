@@ -32,10 +32,13 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
         rotation: The rotation found from all of them ``[3, 3]``.
 
     Returns:
-        None for fewer positions than two a block.
+        From half-paths where there are two positions a block, else by leaving out one position at a time (the
+        jackknife); None for fewer than three positions.
     """
-    if len(source) < 2 * BLOCKS:
+    if len(source) < 3:
         return None
+    if len(source) < 2 * BLOCKS:
+        return _left_out(source, target, rotation)
     blocks = np.array_split(np.arange(len(source)), BLOCKS)
     source, target = source - source.mean(axis=0), target - target.mean(axis=0)
     weights = _HALVES.astype(np.float64)
@@ -44,8 +47,21 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
     target_sums = weights @ np.array([target[block].sum(axis=0) for block in blocks])
     products = np.einsum("kb,bij->kij", weights, np.array([target[block].T @ source[block] for block in blocks]))
     covariances = products - np.einsum("ki,kj->kij", target_sums, sums) / count[:, None, None]
+    return float(np.sqrt((_turned_deg(covariances, rotation) ** 2).mean()))
+
+
+def _left_out(source: Array, target: Array, rotation: Array) -> float:
+    """The jackknife's standard error in degrees: every position is left out once."""
+    kept = ~np.eye(len(source), dtype=bool)
+    pairs = [(source[rows], target[rows]) for rows in kept]
+    covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
+    squares = _turned_deg(covariances, rotation) ** 2
+    return float(np.sqrt((len(source) - 1) / len(source) * squares.sum()))
+
+
+def _turned_deg(covariances: Array, rotation: Array) -> Array:
+    """Angles in degrees ``[K]`` between the rotations that covariances ``[K, 3, 3]`` stand for and `rotation`."""
     u, _, vt = np.linalg.svd(covariances)
     u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
     turned = np.einsum("kii->k", (u @ vt) @ rotation.T)
-    angles = np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
-    return float(np.sqrt((angles**2).mean()))
+    return np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))

@@ -90,7 +90,8 @@ def test_the_uncertainty_is_that_of_repetition() -> None:
 
 def test_an_exact_estimate_and_a_short_one() -> None:
     assert align(straight(0.05), straight(0.05), "se3").uncertainty_deg == pytest.approx(0.0, abs=1e-5)
-    assert align(straight(0.05, 23), straight(0.05, 23), "se3").uncertainty_deg is None
+    assert align(straight(0.05, 23), straight(0.05, 23), "se3").uncertainty_deg == pytest.approx(0.0, abs=1e-5)
+    assert align(straight(0.05, 2), straight(0.05, 2), "se3").uncertainty_deg is None
     assert align(straight(0.05), straight(0.05), "origin").uncertainty_deg is None
 
 
@@ -98,3 +99,22 @@ def _pose(rotation: np.ndarray) -> np.ndarray:
     pose = np.eye(4)[None].copy()
     pose[0, :3, :3] = rotation
     return pose
+
+
+def test_a_short_straight_path_is_marked_too() -> None:
+    generator = np.random.default_rng(0)
+    along = np.linspace(0.0, 1.0, 20)
+
+    def stated(side: float) -> list[float]:
+        truth = np.tile(np.eye(4), (20, 1, 1))
+        truth[:, :3, 3] = np.c_[along, side * np.sin(3 * along), side * np.cos(5 * along)]
+        found = []
+        for _ in range(20):
+            estimate = truth.copy()
+            estimate[:, :3, 3] += generator.normal(0.0, 0.005, (20, 3))
+            uncertainty = align(estimate, truth, "se3").uncertainty_deg
+            assert uncertainty is not None
+            found.append(uncertainty)
+        return found
+
+    assert min(stated(0.001)) > RELIABLE_DEG > max(stated(0.2))
