@@ -28,7 +28,8 @@ def check_steering(
     """Check the contract of `core.steering.Steerable` on a tracker.
 
     Steered from before the first frame, an episode has to be that of a tracker built with the same settings; the one
-    after it, unsteered, that of a fresh tracker.
+    after it, unsteered, that of a fresh tracker. Where settings show in the second half of an episode, steering in
+    its middle has to show there with one of them at least.
 
     Args:
         build: Constructs the tracker with settings.
@@ -46,13 +47,12 @@ def check_steering(
         raise NotApplicable("the tracker has no online settings")
     tracker = build(settings)
     names = ", ".join(parameter.name for parameter in online[:4]) + (", ..." if len(online) > 4 else "")
-    require(
-        isinstance(tracker, Steerable),
-        f"marked online: {names}; but a {type(tracker).__name__} has no configure(settings)",
-        "implement it (see core.steering), or take online=True away",
-    )
+    found = f"marked online: {names}; but a {type(tracker).__name__} has no configure(settings)"
+    require(isinstance(tracker, Steerable), found, "implement it (see core.steering), or take online=True away")
     fresh = _episode(tracker, camera, frames, seed)
+    half = len(frames) // 2
     shown = False
+    late: list[Settings] = []
     for ends in _ends(online):
         changed = apply_overrides(settings, ends)
         try:
@@ -75,6 +75,12 @@ def check_steering(
             "remember the settings that it was built with, and put them into force in reset()",
         )
         shown = shown or bool(first_difference(fresh, static))
+        late += [changed] if first_difference(fresh[half:], static[half:]) else []
+    obeyed = any(first_difference(fresh, _episode(tracker, camera, frames, seed, changed, at=half)) for changed in late)
+    cause = "the settings are read once, at the start; read them on every frame"
+    require(
+        obeyed or not late, f"configure() in mid-episode changes nothing, although building with {names} does", cause
+    )
     if not shown:
         raise NotApplicable(f"{names} change nothing on this scene, at either end of their ranges")
 
@@ -89,12 +95,15 @@ def _ends(online: Sequence[Parameter]) -> Iterator[dict[str, Any]]:
 
 
 def _episode(
-    tracker: Any, camera: Camera, frames: Sequence[Frame], seed: int, settings: Settings | None = None
+    tracker: Any, camera: Camera, frames: Sequence[Frame], seed: int, settings: Settings | None = None, at: int = 0
 ) -> Episode:
     tracker.reset(camera, rng=np.random.default_rng(seed))
-    if settings is not None:
-        tracker.configure(settings)
-    return [tracker.track(frame) for frame in frames]
+    results = []
+    for number, frame in enumerate(frames):
+        if settings is not None and number == at:
+            tracker.configure(settings)
+        results.append(tracker.track(frame))
+    return results
 
 
 def first_difference(first: Episode, second: Episode) -> str:

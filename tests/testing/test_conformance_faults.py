@@ -346,6 +346,18 @@ class Late(Steered):
         self.seen = self.settings
 
 
+class Once(Steered):
+    """Reads its settings on the first frame and never again."""
+
+    def track(self, frame):
+        self.seen = self.settings if self.seen is None else self.seen
+        return replace(Good.track(self, frame), stats={"shift": self.seen.shift})
+
+    def reset(self, camera, *, rng):
+        super().reset(camera, rng=rng)
+        self.seen = None
+
+
 class Inert(Steered):
     def track(self, frame):
         return Good.track(self, frame)
@@ -367,6 +379,7 @@ def steering_of(tracker):
         (Deaf, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
         (Leaky, "failed", "reset.. does not bring back the settings: frame 0, shift"),
         (Late, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (Once, "failed", "configure.. in mid-episode changes nothing, although building with shift does"),
         (Inert, "skipped", "shift change nothing on this scene"),
     ],
 )
