@@ -62,7 +62,7 @@ class Study:
             One line a trial, in order. ``Int64``: trial (0 is the default), runs (that it was evaluated on).
             ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned
             or failed; missing else). ``boolean``: feasible (all constraints hold; missing where nothing was measured).
-            ``float64``, nan where unknown: one column ``value_OBJECTIVE`` for each objective, as Optuna was told it
+            ``float64``, nan where unknown: one column for each objective, named after ``value_``, as told to Optuna
             (accuracy: mean natural logarithm of the ATE ratio to the default settings, less is better; speed:
             real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is better than the default;
             nan if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second), duration_s (seconds from

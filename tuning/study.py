@@ -33,6 +33,7 @@ from .samplers import build_pruner, build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
 from .splits import check_splits
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
+from .stored_identity import as_stored, difference, same
 from .study_file import StudySpec
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
@@ -75,7 +76,7 @@ class Tuner:
     """
 
     def __init__(self, spec: StudySpec, results: str | Path = "results", *, reading: bool = False) -> None:
-        self.spec = spec = _as_stored(spec, study_folder(Path(results), spec) / "study.json") if reading else spec
+        self.spec = spec = as_stored(spec, study_folder(Path(results), spec) / "study.json") if reading else spec
         self.results = Path(results)
         self.reading = reading
         self.tracker = TRACKERS.get(spec.tracker)
@@ -317,9 +318,9 @@ class Tuner:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
                 study.set_metric_names(list(self.spec.objectives))
-        elif not _same(stored, identity, but=CODE if self.reading else ()):
+        elif not same(stored, identity, but=CODE if self.reading else ()):
             raise StudyError(
-                f"study '{self.spec.name}' is stored with other {_difference(stored, identity)}",
+                f"study '{self.spec.name}' is stored with other {difference(stored, identity)}",
                 f"give the study another name, or delete {self.folder}",
             )
         if not self.spec.storage:
@@ -361,35 +362,6 @@ def run_study(
     tuner = Tuner(spec, results)
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner
-
-
-def _as_stored(spec: StudySpec, file: Path) -> StudySpec:
-    """A study that is only read, with the start offsets that it had: one of before there were any began at frame 0."""
-    if "offsets" in spec.model_fields_set or not file.is_file():
-        return spec
-    stored = json.loads(file.read_text())
-    return spec if "offsets" in stored else spec.model_copy(update={"offsets": (0,)})
-
-
-def _same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:
-    return all(_of(stored, key) == _of(now, key) for key in (stored.keys() | now.keys()) - set(but))
-
-
-def _of(identity: dict[str, Any], key: str) -> Any:
-    """A part of a study's identity; studies from before there were start offsets had none."""
-    return identity.get(key, [0] if key == "offsets" else None)
-
-
-def _difference(stored: dict[str, Any], now: dict[str, Any]) -> str:
-    changed = [key for key in now if _of(stored, key) != now[key]]
-    first = changed[0] if changed else next(iter(stored.keys() - now.keys()), "content")
-    more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"{first}{more}: {_short(stored.get(first))} there, {_short(now.get(first))} here"
-
-
-def _short(value: Any, limit: int = 80) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def _describe(result: list[float], spec: StudySpec, found: Configuration) -> str:

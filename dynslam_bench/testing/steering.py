@@ -57,17 +57,14 @@ def check_steering(
         changed = apply_overrides(settings, ends)
         try:
             static = _episode(build(changed), camera, frames, seed)
-        except DynslamError:  # the ends do not go together
-            continue
+        except DynslamError:
+            continue  # the ends do not go together
         steered = _episode(tracker, camera, frames, seed, changed)
         again = _episode(tracker, camera, frames, seed)
         what = ", ".join(f"{name}={value}" for name, value in list(ends.items())[:4])
         at = first_difference(static, steered)
-        require(
-            not at,
-            f"configure() with {what} gives another result than building with it: {at}",
-            "configure() does not reach the part that uses the setting, or only later",
-        )
+        found = f"configure() with {what} gives another result than building with it: {at}"
+        require(not at, found, "configure() does not reach the part that uses the setting, or only later")
         at = first_difference(fresh, again)
         require(
             not at,

@@ -14,23 +14,32 @@ CERTAIN = {
 }
 """Tests with assertions in loops only, over what cannot be empty although the checker does not see it."""
 PRIVATE = {
-    "culling/test_culling_baselines.py": ({"_moving_corners"}, "where a paper's box has its corners decides the rule"),
+    "culling/blocks/test_culling_moving_vote.py": (
+        {"_moving_corners"},
+        "a box's corners decide the rule",
+    ),
     "envs/envs_toys.py": ({"_exit"}, "os._exit: a process that dies at once"),
     "flow/test_flow_maps.py": ({"_binomial"}, "exact weights, before they are folded into a kernel"),
     "flow/test_flow_sparse.py": ({"_runner"}, "counts the threads' work, which no result shows"),
     "runs/hostile.py": ({"_exit"}, "os._exit: a process that dies at once"),
     "segmentation/test_segmentation_torchvision.py": ({"_dynamo"}, "torch._dynamo must not be loaded"),
     "sequences/test_synthetic_geometry.py": ({"_geometry", "_tiles"}, "the exact scene behind a rendered frame"),
-    "trackers/test_adapter_orbslam3.py": ({"_process", "_program"}, "kills the program behind the adapter's back"),
-    "trackers/test_adapter_programs.py": (
+    "trackers/adapters/test_adapter_orbslam3.py": (
+        {"_process", "_program"},
+        "kills the program behind it",
+    ),
+    "trackers/adapters/test_adapter_program_faults.py": (
         {"_command", "_exchange", "_process", "_program"},
         "kills the program, or looks for what it left on the disk",
     ),
-    "trackers/test_method_page.py": ({"_flow"}, "the flow that the page promises is the one that runs"),
+    "trackers/systems/test_method_page.py": ({"_flow"}, "the flow that the page promises is the one that runs"),
     "trackers/test_steering.py": ({"_built", "_steering"}, "which part took a setting, before any frame shows it"),
-    "trackers/test_systems.py": ({"_filters", "_masks"}, "what a system is composed of"),
-    "trackers/test_systems_bridging.py": ({"_filters", "_masks"}, "puts known masks in place of a network's"),
-    "trackers/test_systems_lost_flow.py": ({"_filters", "_flow"}, "puts a flow that fails in place of the system's"),
+    "trackers/systems/test_systems.py": ({"_filters", "_masks"}, "what a system is composed of"),
+    "trackers/systems/test_systems_bridging.py": ({"_filters", "_masks"}, "puts known masks in place of a network's"),
+    "trackers/systems/test_systems_lost_flow.py": (
+        {"_filters", "_flow"},
+        "puts a flow that fails in its place",
+    ),
 }
 """Private names that a test may use, each file with its reason."""
 
@@ -120,6 +129,7 @@ def test_private_names_are_asked_for_with_a_reason() -> None:
     beyond = {file: names - PRIVATE.get(file, (set(), ""))[0] for file, names in found.items()}
     assert {file: names for file, names in beyond.items() if names} == {}
     assert all(reason for _, reason in PRIVATE.values())
+    assert not {file: names for file, (names, _) in PRIVATE.items() if names - found.get(file, set())}, "no longer used"
 
 
 def test_every_exception_for_dead_code_has_a_reason() -> None:
