@@ -64,4 +64,4 @@ def _turned_deg(covariances: Array, rotation: Array) -> Array:
     u, _, vt = np.linalg.svd(covariances)
     u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
     turned = np.einsum("kii->k", (u @ vt) @ rotation.T)
-    return np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
+    return np.asarray(np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0))))

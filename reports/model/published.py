@@ -86,7 +86,7 @@ class ReportedCell:
 @cache
 def published() -> tuple[Published, ...]:
     """All published numbers."""
-    return tuple(Published(**{**line, "value": float(line["value"])}) for line in _lines("published.csv"))
+    return tuple(Published(**(line | {"value": float(line["value"])})) for line in _lines("published.csv"))  # type: ignore[arg-type]
 
 
 @cache

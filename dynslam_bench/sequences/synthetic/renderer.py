@@ -175,7 +175,7 @@ class Renderer:
         order = np.argsort(nearest, kind="stable")
         order = order[seen[order]].astype(np.int32)
         start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
-        return tiles_x, start, members, nearest
+        return tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
 
     def _geometry(
         self, snap: Snapshot, tiles: tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]

@@ -112,7 +112,7 @@ def cast_geometry(
 @kernel
 def shade_pixels(
     row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
-    local: Reals, shape: Reals, texture: Ints, uv: Reals, tint: Reals, facets: Reals, atlas: Reals, level_offset: Ints,
+    local: Reals, shape: Reals, texture: Ints, uv: Reals, tint: Reals, facets: Reals, atlas: Ints, level_offset: Ints,
     log2_size: Ints, lights: Reals, hit: Ints, depth: Reals, jitter: Reals, color: Reals, cosine: Reals,
 ) -> None:  # fmt: skip
     """Colour (float32, 0-255 scale) and cosine of incidence of rows.

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .compiled import kernel
+from .compiled import Intrinsics, Ints, Reals, kernel
 
 
 @kernel
@@ -43,7 +43,7 @@ def _uniform(h: Any) -> float:
 
 
 @kernel
-def _depths_around(depth, row, u, reach):  # type: ignore[no-untyped-def]
+def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, float]:
     """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
     height, width = depth.shape
     lowest, highest = depth[row, u], depth[row, u]
@@ -64,9 +64,10 @@ def _depths_around(depth, row, u, reach):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def measure_depth(  # type: ignore[no-untyped-def]
-    row0, row1, seed, fx, baseline, depth, cosine, color, disparity_noise, near, far, edge_px, dark, factor, out
-):
+def measure_depth(
+    row0: int, row1: int, seed: int, fx: float, baseline: float, depth: Reals, cosine: Reals, color: Reals,
+    disparity_noise: float, near: float, far: float, edge_px: float, dark: float, factor: float, out: Ints,
+) -> None:  # fmt: skip
     """Raw depth (uint16, `factor` units a metre, 0 = missing) of rows from the exact z-depth."""
     width = depth.shape[1]
     shadow_right = np.empty(width, np.bool_)
@@ -120,7 +121,10 @@ def measure_depth(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def dim(row0, row1, intrinsics, pose, depth, light, height, spots, color):  # type: ignore[no-untyped-def]
+def dim(
+    row0: int, row1: int, intrinsics: Intrinsics, pose: Reals, depth: Reals, light: Reals, height: float, spots: Reals,
+    color: Reals,
+) -> None:  # fmt: skip
     """Darken the colour of rows where a soft spot hides the lamp.
 
     Each pixel's surface point is followed towards the lamp (direction ``light`` in the world) up to the plane
@@ -149,7 +153,10 @@ def dim(row0, row1, intrinsics, pose, depth, light, height, spots, color):  # ty
 
 
 @kernel
-def expose(row0, row1, seed, color, gains, offset, read_noise, shot_noise, out):  # type: ignore[no-untyped-def]
+def expose(
+    row0: int, row1: int, seed: int, color: Reals, gains: Reals, offset: Reals, read_noise: float, shot_noise: float,
+    out: Ints,
+) -> None:  # fmt: skip
     """8-bit colours of rows: gain of each row and channel, shot and read noise, rounding, clipping."""
     width = color.shape[1]
     for row in range(row0, row1):
