@@ -52,7 +52,7 @@ def _never_changed(trials: Sequence[FrozenTrial], name: str, inert: set[str]) ->
 
 def _equal_values(trials: Sequence[FrozenTrial]) -> bool:
     values = [trial.values[0] for trial in trials]
-    return max(values) - min(values) <= _SAME * max(1.0, abs(values[0]))
+    return bool(max(values) - min(values) <= _SAME * max(1.0, abs(values[0])))
 
 
 def importances(study: optuna.Study, names: Iterable[str]) -> dict[str, float]:

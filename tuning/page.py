@@ -190,10 +190,10 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
 
 def _ratio_trace(name: str, points: list[tuple[str, Ratio]], colour: str, symbol: str) -> dict[str, Any]:
     ratios = [ratio for _, ratio in points]
-    bars = {"type": "data", "symmetric": False, "color": colour}
+    bars: dict[str, Any] = {"type": "data", "symmetric": False, "color": colour}
     bars["array"] = [0.0 if ratio.high is None else ratio.high - ratio.ratio for ratio in ratios]
     bars["arrayminus"] = [0.0 if ratio.low is None else ratio.ratio - ratio.low for ratio in ratios]
-    trace = {"type": "scatter", "mode": "markers", "name": name, "error_x": bars}
+    trace: dict[str, Any] = {"type": "scatter", "mode": "markers", "name": name, "error_x": bars}
     trace |= {"x": [ratio.ratio for ratio in ratios], "y": [label for label, _ in points]}
     return trace | {"marker": {"size": 11, "color": colour, "symbol": symbol}}
 

@@ -134,9 +134,10 @@ def fetch(
     entry, address = found.entry, url or found.entry.url
     archive = find_data_root(data_root) / ".downloads" / address.rpartition("/")[2]
     expected = entry.sha256 if checksum else None
-    how = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s}
     try:
-        sha256 = download(address, archive, sha256=expected, progress=progress, **how)
+        sha256 = download(
+            address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s, timeout_s=timeout_s
+        )
     except DownloadError as error:
         raise SequenceError(str(error.args[0]), error.hint) from error
     try:

@@ -93,7 +93,8 @@ class RgbdBackend:
         seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
         found = self._localise(frame, seen, self._last) if self._last is not None else self._initialise(frame, seen)
         tracking = perf_counter() - begin - sum(found.timings.values())
-        return replace(found, timings={"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0} | found.timings)
+        stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
+        return replace(found, timings={**stages, **found.timings})
 
     def _initialise(self, frame: FrameBundle, seen: Observations) -> Localised:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""

@@ -90,7 +90,7 @@ def pair_errors(
         scores = [make_cell(side).scores for side in sides]
         coverage = [sum(row.coverage for row in side) / len(side) for side in sides]
         if scores[0] and scores[1]:
-            found.append(Paired(columns[column], *scores, *coverage))
+            found.append(Paired(columns[column], scores[0], scores[1], coverage[0], coverage[1]))
     return sorted(found, key=lambda paired: paired.sequence)
 
 

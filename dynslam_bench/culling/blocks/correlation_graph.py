@@ -63,7 +63,7 @@ class CorrelationFilter(DynamicFilter):
         if state.T_world_pred is None or not len(past):
             return FilterResult.of(keep, stats)
         now = _in_world(local, state.T_world_pred)
-        known = np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1)
+        known = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
         rows = np.flatnonzero(known.any(axis=0))
         if len(rows) < MIN_POINTS:
             return FilterResult.of(keep, stats)

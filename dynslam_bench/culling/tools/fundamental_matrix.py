@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,7 +112,7 @@ def fundamental_matrix(first: Points, second: Points, estimator: Estimator) -> N
     return np.asarray(matrix, dtype=np.float64) if _usable(matrix) else None
 
 
-def _usable(matrix: NDArray[np.floating] | None) -> bool:
+def _usable(matrix: Any) -> bool:
     return matrix is not None and matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
 
 

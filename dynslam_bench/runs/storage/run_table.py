@@ -52,8 +52,9 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
     kinds |= dict.fromkeys((*_NUMBERS, *metrics), "Float64")
     lines = [_line(record, scored) for record, scored in pairs]
     frame = pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
-    started = pd.to_datetime([record.started or None for record, _ in pairs], utc=True, format="ISO8601")
-    return frame.assign(started=pd.Series(started, index=frame.index).astype("datetime64[us, UTC]"))
+    stamps = pd.Series([record.started or None for record, _ in pairs], dtype=object)
+    started = pd.to_datetime(stamps, utc=True, format="ISO8601")
+    return frame.assign(started=started.astype("datetime64[us, UTC]"))
 
 
 def _line(record: RunRecord, scored: MetricRecord | None) -> dict[str, Any]:

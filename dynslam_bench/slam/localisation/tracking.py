@@ -68,8 +68,9 @@ class Matches:
 
     def joined(self, other: Matches) -> Matches:
         """These matches, then the others."""
-        pairs = ((self.feature, other.feature), (self.point, other.point), (self.position, other.position))
-        return Matches(*(np.concatenate(pair) for pair in pairs))
+        feature = np.concatenate((self.feature, other.feature))
+        point = np.concatenate((self.point, other.point))
+        return Matches(feature, point, np.concatenate((self.position, other.position)))
 
 
 def match_last_frame(
