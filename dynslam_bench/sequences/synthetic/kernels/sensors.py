@@ -65,8 +65,8 @@ def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, f
 
 @kernel
 def measure_depth(
-    row0: int, row1: int, seed: int, fx: float, baseline: float, depth: Reals, cosine: Reals, color: Reals,
-    disparity_noise: float, near: float, far: float, edge_px: float, dark: float, factor: float, out: Ints,
+    row0: int, row1: int, seed: Any, fx: float, baseline: float, depth: Reals, cosine: Reals, color: Reals,
+    disparity_noise: float, near: float, far: float, edge_px: int, dark: float, factor: float, out: Ints,
 ) -> None:  # fmt: skip
     """Raw depth (uint16, `factor` units a metre, 0 = missing) of rows from the exact z-depth."""
     width = depth.shape[1]
@@ -154,7 +154,7 @@ def dim(
 
 @kernel
 def expose(
-    row0: int, row1: int, seed: int, color: Reals, gains: Reals, offset: Reals, read_noise: float, shot_noise: float,
+    row0: int, row1: int, seed: Any, color: Reals, gains: Reals, offset: Reals, read_noise: float, shot_noise: float,
     out: Ints,
 ) -> None:  # fmt: skip
     """8-bit colours of rows: gain of each row and channel, shot and read noise, rounding, clipping."""
