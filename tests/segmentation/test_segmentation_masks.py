@@ -246,7 +246,8 @@ def test_every_frame_every_nth_and_keyframes():
 
 def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
     segmenter = Square()
-    stage = MaskScheduler(SegmentationSettings(schedule="every_nth", n=10), segmenter)
+    settings = SegmentationSettings(schedule="every_nth", n=10)
+    stage = MaskScheduler(settings, segmenter)
     gray = scene(0)[0]
 
     def step(index):
@@ -256,9 +257,9 @@ def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
 
     step(0)
     step(1)
-    stage.settings = stage.settings.model_copy(update={"n": 1})
+    stage.configure(settings.model_copy(update={"n": 1}))
     step(2)
-    stage.settings = stage.settings.model_copy(update={"n": 10})
+    stage.configure(settings)
     step(3)
     assert segmenter.calls == [0, 2]
     stage.reset(None)

@@ -52,7 +52,7 @@ def test_filters(name):
 
 
 def test_every_filter_was_found():
-    assert {"SemanticFilter", "EpipolarFilter", "MotionFilter", "MultiViewFilter"} <= set(filters())
+    assert {"SemanticFilter", "EpipolarFilter", "RigidMotionFilter", "MultiViewFilter"} <= set(filters())
 
 
 def test_the_filter_scene_is_exact():

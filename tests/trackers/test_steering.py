@@ -60,7 +60,7 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     }),
 }  # fmt: skip
 """Where a setting shows on the excerpt, if not in the first tracker that has it: the tracker and what else is set."""
-UNSEEN: frozenset[str] = frozenset()
+UNSEEN = frozenset({"class_rule.depth_m"})
 """Settings that change nothing on the excerpt, built with or steered: nothing is proved of them here."""
 
 

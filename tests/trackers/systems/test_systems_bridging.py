@@ -84,7 +84,8 @@ def test_a_missed_person_is_bridged_for_as_long_as_promised(
     if not any({"masks", "boxes"} & each.needs for each in tracker._filters):  # the vote of objects has its own way
         stage = tracker._masks
         assert stage is not None
-        found = [select(stage.masks_for(each, each.rgb[:, :, 0], keyframe=False), stage.settings) for each in frames]
+        own = spec.settings().segmentation
+        found = [select(stage.masks_for(each, each.rgb[:, :, 0], keyframe=False), own) for each in frames]
         assert [len(each) for each in found] == [1] * (SEEN + promised) + [0] * (FRAMES - SEEN - promised)
         return
     counts = seen_by_filters(tracker)
