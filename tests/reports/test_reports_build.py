@@ -423,6 +423,6 @@ def test_a_table_is_two_frames():
     cells.append([TableCell("b"), TableCell("–"), TableCell()])
     table = Table("t", "T", "c", [Column("name", numeric=False), Column("x"), Column("y")], cells)
     assert table.rows == cells
-    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "float64", "y": "Int64"}
+    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "Float64", "y": "Int64"}
     assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
     assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"
