@@ -19,7 +19,7 @@ from .formats import percent
 from .table import Column, Emphasis, Table, TableCell, number
 
 _PROVENANCE = {
-    "own": "parts of it are in no paper",
+    "own": "put together in this project: no one paper or program describes the whole",
     "faithful-code": "follows the published code",
     "faithful-paper": "follows the paper",
     "inspired": "follows an abstract or a survey; constants are ours",
@@ -27,7 +27,7 @@ _PROVENANCE = {
     "external": "not part of this project",
     "control": "a control, not a system",
 }
-_NAMES = {"own": "our own system"}
+_NAMES = {"own": "our composition"}
 CACHED_MARK = "†"
 CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 
