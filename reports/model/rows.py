@@ -11,6 +11,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.segmentation.training_set import seen_in_training
 
 from .row import RunRow, Which
 from .row_values import (
@@ -142,6 +143,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         peak_memory_mb=record.peak_memory_mb,
         mask_iou=record.mask_iou,
         segmentation=record.segmentation,
+        seen_in_training=seen_in_training(record.segmentation, sequence.id),
         started=record.started,
         log=str(store.folder(record.run_id) / "log.txt"),
         command=command_line(record.command),

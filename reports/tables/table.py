@@ -13,6 +13,7 @@ _LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
 _LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"}
 _LATEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"}
 _LATEX |= {"×": r"$\times$", "±": r"$\pm$", "≤": r"$\leq$", "≥": r"$\geq$", "°": r"$^\circ$", "²": r"$^2$"}
+_LATEX |= {"§": r"\S{}", "†": r"\dag{}", "‡": r"\ddag{}"}
 
 
 @dataclass(frozen=True)
