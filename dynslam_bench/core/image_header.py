@@ -36,7 +36,9 @@ def _pair(layout: str, data: bytes, position: int) -> tuple[int, int]:
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:
     """The largest of the sizes that the file states: decoders differ in which they take."""
-    found = [_pair(">HH", data, position + 5)[::-1] for position in _segments(data) if data[position + 1] in _JPEG_SIZES]
+    found = [
+        _pair(">HH", data, position + 5)[::-1] for position in _segments(data) if data[position + 1] in _JPEG_SIZES
+    ]
     return max(found, key=lambda size: size[0] * size[1], default=None)
 
 

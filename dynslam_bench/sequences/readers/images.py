@@ -24,7 +24,9 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
         SequenceError: The file is missing, empty, truncated, of another size, no image, or has more than 8 bits a
             channel.
     """
-    image = read_image(path, size=size, mismatch=mismatch, hint="name the right camera with --camera", kind=SequenceError)
+    image = read_image(
+        path, size=size, mismatch=mismatch, hint="name the right camera with --camera", kind=SequenceError
+    )
     if image.dtype != np.uint8:
         raise SequenceError(
             f"colour image {path} has {image.dtype.itemsize * 8} bits a channel, expected 8",
