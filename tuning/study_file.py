@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,13 +9,9 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
 from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.toml import read_toml
 from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
 PrunerName = Literal["none", "median", "hyperband", "wilcoxon"]
@@ -125,13 +120,17 @@ def read_study(path: str | Path) -> StudySpec:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    try:
-        values = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise StudyError(f"cannot read the study {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path} is not TOML: {error}") from error
+    values = read_toml(path, kind=StudyError)
     values.setdefault("name", path.stem)
+    return make_study(values, path)
+
+
+def make_study(values: Any, path: Path) -> StudySpec:
+    """Validate what a study's file holds.
+
+    Raises:
+        StudyError: An unknown key (with a did-you-mean) or an unfit value, in one line.
+    """
     try:
         return StudySpec.model_validate(values)
     except ValidationError as error:

@@ -16,7 +16,7 @@ LONGEST_NAME = 255
 
 
 def printable(text: str) -> str:
-    """The text with everything that a terminal would act upon shown as an escape, e.g. ``\\x1b``; newlines stay."""
+    r"""The text with everything that a terminal would act upon shown as an escape, e.g. ``\x1b``; newlines stay."""
     return _UNSEEN.sub(_escaped, text)
 
 

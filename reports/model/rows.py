@@ -36,7 +36,7 @@ class LoadedRun:
     store: RunStore
 
     def trajectory(self, which: Which) -> Trajectory | None:
-        """The run's ``online`` or ``final`` trajectory; None if there is none, no frame was tracked, or it is damaged."""
+        """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
         try:
             return self.store.trajectory(self.record.run_id, which)
         except DynslamError:
