@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
+from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.sequences.catalogue import entry_of
@@ -62,7 +63,8 @@ class StudySpec(_Part):
         sampler_seed: Seed of the sampler.
         pruner: Who ends hopeless trials early; several objectives are ended early by dominance instead.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
-            ``postgresql://``, ``grpc://host:port``).
+            ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
+            ``~/.pgpass``): it is in no file that is written.
         protocol: Protocol of the errors; lost frames are always held at the last pose.
         cache: Whether trials use the stage cache.
         threads: Threads of a run.
@@ -111,6 +113,10 @@ class StudySpec(_Part):
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
         free = {"trials", "timeout_s", "top", "storage"}
         return digest(self.model_dump(mode="json", exclude=free))
+
+    def for_others(self) -> dict[str, Any]:
+        """The study as it is written down beside its trials: without the password of its storage."""
+        return self.model_dump(mode="json") | {"storage": without_passwords(self.storage)}
 
 
 def read_study(path: str | Path) -> StudySpec:
