@@ -11,6 +11,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -269,7 +270,7 @@ class RunStore:
     def ground_truth(self, part: str) -> Trajectory | None:
         """The ground truth of a sequence's part; None if it has none."""
         path = self.root / "sequences" / part / "groundtruth.txt"
-        return read_tum(path) if path.is_file() else None
+        return _read_truth(path, path.stat().st_mtime_ns) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
         """Stamps in seconds of all input frames of a sequence's part.
@@ -296,6 +297,14 @@ class RunStore:
         with contextlib.suppress(OSError):  # a file system without links: the run is stored all the same
             fresh.symlink_to(target.relative_to(self.root))
             fresh.replace(link)
+
+
+@lru_cache(maxsize=64)
+def _read_truth(path: Path, _changed_ns: int) -> Trajectory:
+    """A ground truth, which many runs share; nobody may write into it."""
+    truth = read_tum(path)
+    truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
+    return truth
 
 
 def _abandoned(name: str) -> bool:
