@@ -55,7 +55,10 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             "which contradict themselves (see the audit)."
         )
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
-    return Table("per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators)
+    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
+    return Table(
+        "per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators, brief
+    )
 
 
 def final_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -97,6 +100,7 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
                 f"Relative pose error over {spec.describe()}: {name}",
                 f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
                 f"they tracked. {protocol.describe()}.",
+                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
                 text=mm if unit == "m" else significant_text,
             )
             if table is not None:
@@ -122,6 +126,7 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
         "ape_rotation",
         "Absolute rotational error",
         caption,
+        unit="RMSE, °",
         text=significant_text,
         doubt=_rotation_doubt,
     )
