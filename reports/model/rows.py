@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from dynslam_bench.core.errors import DynslamError, ReportError
@@ -66,6 +67,11 @@ class Loaded:
     superseded: int = 0
     stopped: int = 0
     unreadable: list[str] = field(default_factory=list)
+
+    @cached_property
+    def by_id(self) -> dict[str, LoadedRun]:
+        """The runs by their id."""
+        return {run.row.run_id: run for run in self.runs}
 
 
 def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
