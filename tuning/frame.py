@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,9 +10,10 @@ import optuna
 from optuna.trial import FrozenTrial
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.reading import read_json
 
 from .storage import open_storage, study_folder
-from .study_file import StudySpec, read_study
+from .study_file import StudySpec, make_study, read_study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,15 +59,14 @@ class Study:
         """All trials.
 
         Returns:
-            One line a trial, in order; whatever is missing is ``pd.NA``. ``Int64``: trial (0 is the default), runs (that
-            it was evaluated on).
-            ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned
+            One line a trial, in order; whatever is missing is ``pd.NA``. ``Int64``: trial (0 is the default), runs
+            (that it was evaluated on). ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned
             or failed; missing else). ``boolean``: feasible (all constraints hold; missing where nothing was measured).
             ``Float64``: one column for each objective, named after ``value_``, as told to Optuna
             (accuracy: mean natural logarithm of the ATE ratio to the default settings, less is better; speed:
             real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is better than the default;
-            missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second), duration_s (seconds from
-            the start of the trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
+            missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second), duration_s (seconds
+            from the start of the trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
             ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
         """
         import pandas as pd
@@ -110,7 +109,7 @@ def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, P
     path = Path(study).expanduser()
     stored = path / _SPEC_FILE
     if stored.is_file():
-        return StudySpec.model_validate(json.loads(stored.read_text(encoding="utf-8"))), path.absolute().parents[1]
+        return make_study(read_json(stored, kind=StudyError), stored), path.absolute().parents[1]
     if path.is_dir():
         raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
     return read_study(path), results
