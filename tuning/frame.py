@@ -60,14 +60,15 @@ class Study:
 
         Returns:
             One line a trial, in order; whatever is missing is ``pd.NA``. ``Int64``: trial (0 is the default), runs
-            (that it was evaluated on). ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned
-            or failed; missing else). ``boolean``: feasible (all constraints hold; missing where nothing was measured).
-            ``Float64``: one column for each objective, named after ``value_``, as told to Optuna
-            (accuracy: mean natural logarithm of the ATE ratio to the default settings, less is better; speed:
-            real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is better than the default;
-            missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second), duration_s (seconds
-            from the start of the trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
-            ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
+            (that it was evaluated on). ``string``: state (``complete``, ``pruned``, ``fail``, ``running``,
+            ``waiting``), reason (why it was pruned or failed; missing else). ``boolean``: feasible (all constraints
+            hold; missing where nothing was measured). ``Float64``: one column for each objective, named after
+            ``value_``, as told to Optuna (accuracy: mean natural logarithm of the ATE ratio to the default settings,
+            less is better; speed: real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is
+            better than the default; missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a
+            second), duration_s (seconds from the start of the trial to its end). Then a column ``params.NAME`` for
+            each tuned setting, in its own unit: ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its
+            condition did not hold.
         """
         import pandas as pd
 
