@@ -10,9 +10,7 @@ from pathlib import Path
 
 from documented_names import ROOMS, ROOT
 
-PATH = re.compile(
-    r"(?<![\w./-])dynslam_bench(?:\.[A-Za-z_]\w*)+|(?<![\w./-])(?:envs|reports|tuning)(?:\.[a-z_]\w*){2,}"
-)
+PATH = re.compile(r"(?<![\w./-])(?:dynslam_bench(?:\.[A-Za-z_]\w*)+|(?:envs|reports|tuning)(?:\.[a-z_]\w*){2,})")
 """Into the package, or into a room of the checkout's own by two names (one may be a file: `reports.csv`)."""
 FROM = re.compile(r"from (dynslam_bench[\w.]*) import (?:\(([\w,\s]+)\)|([\w, ]+))")
 

@@ -26,7 +26,8 @@ def test_every_path_leads_somewhere() -> None:
 
 
 def test_the_search_sees_what_it_is_for() -> None:
-    code = 'SCRIPT = """\nfrom dynslam_bench.runs import gone, run_one\nx = tuning.old.name\n"""\nimport dynslam_bench.lost\n'
+    script = "from dynslam_bench.runs import gone, run_one\nx = tuning.old.name\n"
+    code = f"SCRIPT = {script!r}\nimport dynslam_bench.lost\n"
     paths = [path for _, path in taken(code)]
     assert {"dynslam_bench.runs.gone", "dynslam_bench.runs.run_one", "tuning.old.name"} < set(paths)
     assert [path for path in paths if is_there(path)] == ["dynslam_bench.runs", "dynslam_bench.runs.run_one"]
