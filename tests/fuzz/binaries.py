@@ -58,8 +58,9 @@ def _odd_headers() -> list[bytes]:
     bitmap = b"BM" + bytes(12) + struct.pack("<IHH", 12, 16, 12) + bytes(99)
     jpeg = b"\xff\xd8\xff\xff\xd0\x00\xff\xc0\x00\x11\x08\xff\xff\xff\xff" + bytes(20)
     cut = _encoded(".png")[0][:-20]
-    return [start + struct.pack(">IIBB", 65535, 60000, 8, 2) + bytes(60) + b"IEND\xaeB`\x82", start[:20], bitmap, b"BM", jpeg,
-            b"II*\0\x08\0\0\0\0\0", b"P5 99999 99999 255\n", b"no image", cut]  # fmt: skip
+    huge = start + struct.pack(">IIBB", 65535, 60000, 8, 2) + bytes(60) + b"IEND\xaeB`\x82"
+    tiff, pnm = b"II*\0\x08\0\0\0\0\0", b"P5 99999 99999 255\n"
+    return [huge, start[:20], bitmap, b"BM", jpeg, tiff, pnm, b"no image", cut]
 
 
 def _depths() -> list[bytes]:
