@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from dynslam_bench.core.errors import DynslamError, ReportError
@@ -12,6 +13,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.segmentation.training_set import seen_in_training
 
 from .row import RunRow, Which
 from .row_values import (
@@ -65,6 +67,11 @@ class Loaded:
     superseded: int = 0
     stopped: int = 0
     unreadable: list[str] = field(default_factory=list)
+
+    @cached_property
+    def by_id(self) -> dict[str, LoadedRun]:
+        """The runs by their id."""
+        return {run.row.run_id: run for run in self.runs}
 
 
 def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
@@ -157,6 +164,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         peak_memory_mb=record.peak_memory_mb,
         mask_iou=record.mask_iou,
         segmentation=record.segmentation,
+        seen_in_training=seen_in_training(record.segmentation, sequence.id),
         started=record.started,
         log=str(store.folder(record.run_id) / "log.txt"),
         command=command_line(record.command),

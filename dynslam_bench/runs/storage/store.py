@@ -12,6 +12,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -298,7 +299,7 @@ class RunStore:
     def ground_truth(self, part: str) -> Trajectory | None:
         """The ground truth of a sequence's part; None if it has none."""
         path = self._part(part) / "groundtruth.txt"
-        return read_tum(path) if path.is_file() else None
+        return _read_truth(path, path.stat().st_mtime_ns) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
         """Stamps in seconds of all input frames of a sequence's part.
@@ -333,6 +334,14 @@ def _checked(name: str, what: str) -> str:
     if not _RUN_ID.fullmatch(name):
         raise RunError(f"{name[:100]!r} is not {what}: expected 16 hexadecimal digits")
     return name
+
+
+@lru_cache(maxsize=64)
+def _read_truth(path: Path, _changed_ns: int) -> Trajectory:
+    """A ground truth, which many runs share; nobody may write into it."""
+    truth = read_tum(path)
+    truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
+    return truth
 
 
 def _abandoned(name: str) -> bool:
