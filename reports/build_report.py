@@ -50,6 +50,7 @@ def build_report(
     protocol: Protocol | str = "tum-rgbd/v1",
     reference: str = DEFAULT_REFERENCE,
     on: On = "common",
+    rank_seen: bool = False,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
 ) -> ReportPaths:
@@ -64,6 +65,7 @@ def build_report(
         reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
             never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
 
@@ -75,8 +77,8 @@ def build_report(
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
     loaded = load_runs(stores, protocol)
-    board = make_board([run.row for run in loaded.runs], reference, on)
-    again = command or _command([store.root for store in stores], output, on)
+    board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
+    again = command or _command([store.root for store in stores], output, board)
     draft = Draft()
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_speed(draft, board)
@@ -97,10 +99,11 @@ def build_report(
     return _write(draft, board, output, data)
 
 
-def _command(roots: Sequence[Path], output: Path, on: On) -> str:
+def _command(roots: Sequence[Path], output: Path, board: Board) -> str:
     """The command that makes the report again."""
     words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
-    return shlex.join(words + (["--on", on] if on != "common" else []))
+    words += ["--on", board.on] if board.on != "common" else []
+    return shlex.join(words + ["--rank-seen"] * board.rank_seen)
 
 
 def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> ReportPaths:

@@ -39,7 +39,7 @@ from .options import (
     gather_settings,
 )
 from .output import SOME_RUNS_FAILED, note, progress
-from .run_rows import show_pictures, show_runs
+from .run_rows import seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunSpec
@@ -196,6 +196,8 @@ def finish(
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
     pictures = [name for name, asked in ((VIDEO_FILE, specs[0].video), (SHEET_FILE, specs[0].sheet)) if asked]
     show_pictures(records, store, pictures, as_json=as_json)
+    if seen := seen_note(records):
+        note(seen)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if any(record.failed for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)

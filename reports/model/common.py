@@ -22,7 +22,7 @@ def common_errors(
     brief = protocol.model_copy(update={"rpe": (), "segments_m": (), "lost_frames": "exclude"})
     for sequence in board.sequences:
         runs = successful(board, sequence, loaded)
-        pairs = [(run, run.store.trajectory(run.row.run_id, protocol.trajectory)) for run in runs]
+        pairs = [(run, run.trajectory(protocol.trajectory)) for run in runs]
         held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
         if len({run.row.variant_key for run, _ in held}) < 2:
             continue
@@ -34,7 +34,7 @@ def common_errors(
             if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # it is the error that is known
                 values.setdefault(run.row.variant_key, []).append(run.row.metrics["ate_rmse_m"])
                 continue
-            truth = run.store.ground_truth(run.record.sequence.part)
+            truth = run.ground_truth()
             if truth is None:
                 continue
             try:

@@ -13,13 +13,13 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
 from ..model.cell import Cell, mean_skipped
-from ..model.row import RunRow
+from ..model.row import SEEN, RunRow
 from ..model.statistics import FEWEST, Interval, Standing
 from .formats import percent
 from .table import Column, Emphasis, Table, TableCell, number
 
 _PROVENANCE = {
-    "own": "parts of it are in no paper",
+    "own": "put together in this project: no one paper or program describes the whole",
     "faithful-code": "follows the published code",
     "faithful-paper": "follows the paper",
     "inspired": "follows an abstract or a survey; constants are ours",
@@ -27,9 +27,13 @@ _PROVENANCE = {
     "external": "not part of this project",
     "control": "a control, not a system",
 }
-_NAMES = {"own": "our own system"}
+_NAMES = {"own": "our composition"}
 CACHED_MARK = "†"
 CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
+SEEN_NOTE = (
+    f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
+    "instances 0-99): its best case, no judgement."
+)
 
 
 def leaderboard(board: Board, protocol: Protocol) -> Table:
@@ -107,6 +111,9 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         parts.append("F skipped: frames on which an epipolar system did not use its fundamental matrix.")
     if any(row.cached for row in board.rows):
         parts.append(CACHED_NOTE)
+    if any(row.seen_in_training for row in board.rows):
+        rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
+        parts.append(f"{SEEN_NOTE} {rule} Instances 100-199 are held out.")
     return " ".join(parts)
 
 
