@@ -50,6 +50,11 @@ def complain(text: str) -> None:
     sys.stderr.write(printable(text) + "\n")
 
 
+def complain(text: str) -> None:
+    """Write a line to standard error, whoever watches: what was asked for and cannot be had."""
+    sys.stderr.write(text + "\n")
+
+
 def write_json(value: Any) -> None:
     """Write a value as JSON; pydantic models and paths included."""
     sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
