@@ -46,13 +46,8 @@ def note(text: str) -> None:
 
 
 def complain(text: str) -> None:
-    """Write a line to standard error, harmless as in `write`."""
+    """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
     sys.stderr.write(printable(text) + "\n")
-
-
-def complain(text: str) -> None:
-    """Write a line to standard error, whoever watches: what was asked for and cannot be had."""
-    sys.stderr.write(text + "\n")
 
 
 def write_json(value: Any) -> None:
