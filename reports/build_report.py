@@ -16,10 +16,12 @@ from dynslam_bench.runs.storage.store import RunStore
 from .html import sections
 from .html.draft import Draft
 from .html.page import render
+from .html.paper_section import add_paper
 from .model.board import DEFAULT_REFERENCE, Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
 from .model.rows import load_runs, open_stores
-from .tables.table import to_csv, to_latex, to_markdown
+from .tables.latex import to_latex
+from .tables.table import csv_text, prose, to_csv, to_markdown
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ def build_report(
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
+    add_paper(draft, board, protocol)
     sections.add_trajectories(draft, board, protocol, loaded)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
@@ -118,9 +121,11 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     page = render(draft.sections, draft.figures, title=data.title, protocol=data.protocol, facts=facts, footer=footer)
     for table in draft.tables:
         write_atomic(paths.csv[table.id], to_csv(table))
-    write_atomic(paths.csv["runs"], board.frame().to_csv(index=False))
+    write_atomic(paths.csv["runs"], csv_text(board.frame()))
     write_atomic(paths.markdown, _markdown(draft, data, facts) + f"\n{footer}\n")
-    latex = [to_latex(table) for table in draft.tables if table.id not in ("machines", "failures")]
+    latex = [
+        to_latex(table, board.rows[0].protocol_id) for table in draft.tables if table.id not in ("machines", "failures")
+    ]
     write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
     write_atomic(paths.data, data.to_json())
     write_atomic(paths.html, page)
@@ -141,6 +146,6 @@ def _facts(board: Board) -> list[tuple[str, str]]:
 def _markdown(draft: Draft, data: ReportData, facts: Sequence[tuple[str, str]]) -> str:
     """The whole report as Markdown."""
     counted = ", ".join(f"{value} {name}" for value, name in facts)
-    notes = "".join(f"> {note}\n\n" for section in draft.sections for note in section.notes)
+    notes = "".join(f"> {prose(note)}\n\n" for section in draft.sections for note in section.notes)
     tables = "\n".join(to_markdown(table) for table in draft.tables)
-    return f"# {data.title}\n\n{data.protocol}\n\n{counted}\n\n{notes}{tables}"
+    return f"# {prose(data.title)}\n\n{data.protocol}\n\n{counted}\n\n{notes}{tables}"

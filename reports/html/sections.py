@@ -124,8 +124,8 @@ def add_trajectories(draft: Draft, board: Board, protocol: Protocol, loaded: Loa
         estimates: dict[str, Trajectory] = {}
         truth = None
         for key, run in chosen.items():
-            trajectory = run.store.trajectory(run.row.run_id, protocol.trajectory)
-            truth = truth or run.store.ground_truth(run.record.sequence.part)
+            trajectory = run.trajectory(protocol.trajectory)
+            truth = truth or run.ground_truth()
             if trajectory is not None and run.row.metrics:
                 estimates[key] = trajectory
         if truth is None or not estimates:
@@ -175,6 +175,7 @@ def add_masks(draft: Draft, board: Board) -> None:
         "mask_iou",
         "Mask quality",
         "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        unit="IoU",
         text=significant_text,
         larger_is_better=True,
     )

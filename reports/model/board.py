@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Literal
 
@@ -78,17 +79,24 @@ class Board:
     incomplete: list[str] = field(default_factory=list)
     hopeless: list[str] = field(default_factory=list)
 
+    @cached_property
+    def _by_key(self) -> dict[str, list[RunRow]]:
+        found: dict[str, list[RunRow]] = {}
+        for row in self.rows:
+            found.setdefault(row.variant_key, []).append(row)
+        return found
+
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
         return self.columns[row.column_id]
 
     def runs(self, key: str) -> list[RunRow]:
         """All rows of a tracker."""
-        return [row for row in self.rows if row.variant_key == key]
+        return self._by_key[key]
 
     def first(self, key: str) -> RunRow:
         """Any row of a tracker, for what all its rows share."""
-        return next(row for row in self.rows if row.variant_key == key)
+        return self._by_key[key][0]
 
     def ranked_order(self) -> list[str]:
         """Ranked trackers from the best to the worst."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from typing import Any, Literal
 
 from pydantic import Field
@@ -146,7 +147,7 @@ class RunRow(Record):
         """Whether the trajectory comes from elsewhere."""
         return self.kind == "imported"
 
-    @property
+    @cached_property
     def variant_key(self) -> str:
         """Tracker and everything that sets its runs apart besides sequence and repeat."""
         return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)

@@ -50,7 +50,8 @@ def common_frames_table(
         "tracker gains nothing here by losing the hard frames. Failed runs take no part."
     )
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
-    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators)
+    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
+    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators, brief)
 
 
 def failure_rule_table(board: Board) -> Table | None:

@@ -51,7 +51,8 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         rows.append(cells)
     columns = _columns(board, epipolar)
     caption = _caption(board, protocol, epipolar)
-    return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators())
+    brief = f"Geometric mean of the ATE over that of {board.reference_name}, with 95 % intervals"
+    return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
 
 
 _MEANINGS = {
@@ -73,11 +74,18 @@ _MEANINGS = {
     "provenance": "",
 }
 _WORDS = ("tracker", "rows", "provenance")
+_ASIDE = ("mean rank", "MB", "F skipped", "rows", "provenance")
+"""What LaTeX has no room for."""
 
 
 def _columns(board: Board, epipolar: bool) -> list[Column]:
     return [
-        Column(name, numeric=name not in _WORDS, meaning=meaning.replace("{reference}", board.reference_name))
+        Column(
+            name,
+            numeric=name not in _WORDS,
+            meaning=meaning.replace("{reference}", board.reference_name),
+            latex=name not in _ASIDE,
+        )
         for name, meaning in _MEANINGS.items()
         if epipolar or name != "F skipped"
     ]

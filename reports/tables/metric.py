@@ -25,6 +25,7 @@ def metric_table(
     title: str,
     caption: str,
     *,
+    unit: str = "RMSE, mm",
     text: Callable[[float], str] = mm,
     larger_is_better: bool = False,
     trackers: Sequence[str] | None = None,
@@ -38,6 +39,7 @@ def metric_table(
         name: Id of the table.
         title: Heading.
         caption: How to read it.
+        unit: What the numbers are, in a word or two.
         text: How the number is written; metres become millimetres by default.
         larger_is_better: Which end is bold.
         trackers: Variant keys; the board's by default.
@@ -69,7 +71,8 @@ def metric_table(
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
     competing = sum(key in board.ranked for key in present)
     muted = [at for at, key in enumerate(present) if key not in board.ranked]
-    return Table(name, title, caption, columns, rows, muted, {competing} if 0 < competing < len(rows) else ())
+    separators = {competing} if 0 < competing < len(rows) else set()
+    return Table(name, title, caption, columns, rows, muted, separators, f"{title} ({unit})")
 
 
 def median_of(cell: Cell, value: Value) -> float | None:

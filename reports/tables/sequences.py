@@ -60,7 +60,10 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
         rows = [[*row, TableCell(_trained_on(board, board.trackers, at))] for at, row in enumerate(rows)]
         caption += f" {SEEN_NOTE}"
-    return Table("per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators)
+    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
+    return Table(
+        "per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators, brief
+    )
 
 
 def _trained_on(board: Board, keys: Sequence[str], at: int) -> str:
@@ -108,6 +111,7 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
                 f"Relative pose error over {spec.describe()}: {name}",
                 f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
                 f"they tracked. {protocol.describe()}.",
+                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
                 text=mm if unit == "m" else significant_text,
             )
             if table is not None:
@@ -133,6 +137,7 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
         "ape_rotation",
         "Absolute rotational error",
         caption,
+        unit="RMSE, °",
         text=significant_text,
         doubt=_rotation_doubt,
     )
