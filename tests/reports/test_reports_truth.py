@@ -11,7 +11,7 @@ from dynslam_bench.reports import build_report, compare, load_frame
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import name_columns
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
-from dynslam_bench.reports.model.published import is_excerpt, least_length_s
+from dynslam_bench.reports.model.published import is_excerpt
 from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.formats import mm, percent
@@ -245,15 +245,6 @@ def test_parts_get_no_published_rows(tmp_path):
     assert is_excerpt("tum/fr3/walking_xyz", 20.0)
     assert not is_excerpt("tum/fr3/walking_xyz", 28.5)
     assert not is_excerpt("synthetic/walking_xyz", 2.0)
-    assert least_length_s("bonn/balloon") is None and not is_excerpt("bonn/balloon", 1.0), "no source, no claim"
-
-
-def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):
-    store = RunStore(tmp_path / "r")
-    for name in ("bonn/balloon", "tum/fr3/walking_rpy"):
-        add_run(store, "orb-slam2", name, block=name, duration_s=30.6)
-    markdown = build_report(store, tmp_path / "report").markdown.read_text()
-    assert "Published numbers stand beside bonn/balloon, whose full length is not known here" in markdown
 
 
 def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
