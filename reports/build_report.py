@@ -15,7 +15,9 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
+from .html.explore import RUN_PAGE, write_explore
 from .html.page import render
+from .html.side_files import write_side
 from .model.board import DEFAULT_REFERENCE, Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
 from .model.rows import load_runs, open_stores
@@ -27,7 +29,8 @@ class ReportPaths:
     """The files of a report.
 
     Attributes:
-        html: The page, complete in one file.
+        html: The page; what it shows on demand lies in ``data/`` and ``frames/`` beside it.
+        run: The page that shows one run.
         markdown: The tables as Markdown.
         latex: The main tables as LaTeX.
         csv: The tables as CSV, by name.
@@ -35,6 +38,7 @@ class ReportPaths:
     """
 
     html: Path
+    run: Path
     markdown: Path
     latex: Path
     csv: dict[str, Path]
@@ -76,7 +80,9 @@ def build_report(
     board = make_board([run.row for run in loaded.runs], reference, on)
     again = command or _command([store.root for store in stores], output, on)
     draft = Draft()
+    explored = write_explore(board, loaded, protocol, output, title=title)
     sections.add_leaderboard(draft, board, protocol, loaded)
+    sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
     sections.add_trajectories(draft, board, protocol, loaded)
@@ -107,6 +113,7 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     names = [*(table.id for table in draft.tables), "runs"]
     paths = ReportPaths(
         html=output / "index.html",
+        run=output / RUN_PAGE,
         markdown=output / "report.md",
         latex=output / "report.tex",
         csv={name: output / "csv" / f"{name}.csv" for name in names},
@@ -120,6 +127,8 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     latex = [to_latex(table) for table in draft.tables if table.id not in ("machines", "failures")]
     write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
     write_atomic(paths.data, data.to_json())
+    for name, figures in draft.side_figures.items():
+        write_side(output, name, figures)
     write_atomic(paths.html, page)
     return paths
 

@@ -16,22 +16,24 @@ class Draft:
     Attributes:
         sections: In order.
         tables: Every table of the sections.
-        figures: Every figure of them, by its id.
+        figures: Every figure that the page itself holds, by its id.
+        side_figures: Figures by their ids, by the name of the side file that holds them.
     """
 
     sections: list[Section] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     figures: dict[str, Figure] = field(default_factory=dict)
+    side_figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
 
     def add(self, section: Section) -> None:
         """Append a section, unless it is empty."""
         if section.blocks or section.notes:
             self.sections.append(section)
 
-    def table(self, table: Table, title: str = "") -> Block:
+    def table(self, table: Table, title: str = "", *, folded: bool = False) -> Block:
         """A block that shows a table."""
         self.tables.append(table)
-        return Block(kind="table", title=title, table=table)
+        return Block(kind="table", title=title, table=table, folded=folded)
 
     def figure(self, name: str, figure: Figure, caption: str = "", title: str = "") -> Block:
         """A block that shows a figure."""
@@ -39,5 +41,5 @@ class Draft:
         return Block(kind="figure", title=title, figure=name, caption=caption)
 
     def titled(self, table: Table | None) -> list[Block]:
-        """A block that shows a table below its own title; none for no table."""
-        return [] if table is None else [self.table(table, table.title)]
+        """A block that shows a table behind its own title, closed at first; none for no table."""
+        return [] if table is None else [self.table(table, table.title, folded=True)]

@@ -22,6 +22,7 @@ from ..tables import sequences as sequence_tables
 from ..tables.formats import significant_text
 from ..tables.metric import metric_table
 from .draft import Draft
+from .explore import Explored
 from .page import Block, Section
 
 _MOST_NOTES = 60
@@ -63,6 +64,14 @@ def _leaderboard_notes(board: Board, loaded: Loaded) -> list[str]:
     if any(count for count, _ in left):
         notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
     return notes
+
+
+def add_explore(draft: Draft, explored: Explored) -> None:
+    """The table that leads to every run."""
+    section = Section("explore", "Explore", "Explore", blocks=[Block("explore")])
+    if explored.note:
+        section.notes.append(f"Frames without a picture: {explored.note}.")
+    draft.add(section)
 
 
 def add_speed(draft: Draft, board: Board) -> None:
@@ -122,7 +131,7 @@ def add_trajectories(draft: Draft, board: Board, protocol: Protocol, loaded: Loa
         if truth is None or not estimates:
             continue
         paths, errors = sequence_figures(board, truth, estimates, protocol)
-        draft.figures |= {f"path-{position}": paths, f"error-{position}": errors}
+        draft.side_figures[f"figures-{position}"] = {f"path-{position}": paths, f"error-{position}": errors}
         caption = (
             f"The run with the median error of each tracker, aligned ({protocol.alignment}), seen along the three "
             "axes. Lines are broken where a gap exceeds twice the median interval. Click a name to show or hide it."
@@ -135,6 +144,7 @@ def add_trajectories(draft: Draft, board: Board, protocol: Protocol, loaded: Loa
                 small=", ".join(filter(None, (board.groups[sequence], f"{len(estimates)} trackers"))),
                 open=position == 0,
                 figures=[(f"path-{position}", caption), (f"error-{position}", over_time)],
+                side=f"figures-{position}",
             )
         )
     draft.add(section)
