@@ -17,7 +17,6 @@ from .html import sections
 from .html.draft import Draft
 from .html.explore import RUN_PAGE, write_explore
 from .html.page import render
-from .html.side_files import write_side
 from .model.board import DEFAULT_REFERENCE, Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
 from .model.rows import load_runs, open_stores
@@ -85,7 +84,7 @@ def build_report(
     sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
-    sections.add_trajectories(draft, board, protocol, loaded)
+    sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
     sections.add_failures(draft, board, output)
@@ -127,8 +126,6 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     latex = [to_latex(table) for table in draft.tables if table.id not in ("machines", "failures")]
     write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
     write_atomic(paths.data, data.to_json())
-    for name, figures in draft.side_figures.items():
-        write_side(output, name, figures)
     write_atomic(paths.html, page)
     return paths
 

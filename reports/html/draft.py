@@ -16,14 +16,12 @@ class Draft:
     Attributes:
         sections: In order.
         tables: Every table of the sections.
-        figures: Every figure that the page itself holds, by its id.
-        side_figures: Figures by their ids, by the name of the side file that holds them.
+        figures: Every figure of them, by its id.
     """
 
     sections: list[Section] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     figures: dict[str, Figure] = field(default_factory=dict)
-    side_figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
 
     def add(self, section: Section) -> None:
         """Append a section, unless it is empty."""

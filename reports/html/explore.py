@@ -76,9 +76,8 @@ def write_explore(
     for done, run in enumerate(sorted(loaded.runs, key=lambda run: run.row.run_id not in shown)):
         frames = read_frames(run, shares.get(run.row.column_id, {}))
         write_side(output, f"run-{run.row.run_id}", run_content(run, frames, protocol, truths.of(run)))
-        if not frames.table.empty:
-            errors = frames.table["frame_error_trans_m"].to_numpy(float)
-            sums.add(run.row, errors, frames.share, frames.share_source == "exact masks")
+        if len(frames):
+            sums.add(run.row, frames.errors_m, frames.share, frames.share_source == "exact masks")
         if run.row.run_id in shown:
             book.add(run, frames)
         if progress is not None:

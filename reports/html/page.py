@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
-from typing import Literal
+from typing import Any, Literal
 
 from jinja2 import Environment, FunctionLoader, select_autoescape
 from markupsafe import Markup, escape
@@ -17,7 +17,7 @@ from .side_files import to_script
 
 _STYLES = ("report.css", "figures.css")
 _CHARTS = ("scales.js", "marks.js", "chart.js", "hover.js", "store.js", "page.js")
-_EXPLORE = ("explore.js", "explore_figures.js")
+_EXPLORE = ("explore.js", "explore_figures.js", "tracks.js")
 _RUN = ("run.js", "run_figures.js", "space.js", "looks.js")
 
 
@@ -33,15 +33,14 @@ class Block:
         caption: Below the figure.
         text: For ``code``.
         entries: For ``list``.
-        summary: For ``details``: what is seen when it is closed.
+        summary: For ``tracks``: what is seen when it is closed.
         small: Behind the summary.
         open: Whether it is open at first.
-        figures: Ids and captions, for ``details``.
-        side: Side file that holds these figures, loaded when it opens; empty if the page itself holds them.
-        folded: Whether a table is closed at first, behind its title.
+        tracks: For ``tracks``: the runs to draw, each with its name and colour and whether it is shown at first.
+        folded: Whether a table or list is closed at first, behind its title.
     """
 
-    kind: Literal["table", "figure", "code", "list", "details", "explore"]
+    kind: Literal["table", "figure", "code", "list", "caption", "tracks", "explore"]
     title: str = ""
     table: Table | None = None
     figure: str = ""
@@ -51,8 +50,7 @@ class Block:
     summary: str = ""
     small: str = ""
     open: bool = False
-    figures: list[tuple[str, str]] = field(default_factory=list)
-    side: str = ""
+    tracks: list[dict[str, Any]] = field(default_factory=list)
     folded: bool = False
 
 

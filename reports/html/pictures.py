@@ -54,7 +54,7 @@ class PictureBook:
 
     def add(self, run: LoadedRun, frames: RunFrames) -> None:
         """Draw the frames that a run shows and write what was seen on them as ``data/looks-<run id>.js``."""
-        if frames.table.empty:
+        if not len(frames):
             return
         size, shots = read_snapshots(run.store.folder(run.row.run_id))
         began = time.perf_counter()
@@ -64,9 +64,9 @@ class PictureBook:
         known = [look for look in looks if look.get("image") or look.get("points")]
         if not known:
             return
-        errors = dict(zip(frames.table["index"], 1000 * frames.table["frame_error_trans_m"], strict=True))
+        errors = dict(zip(frames.columns["index"].tolist(), (1000 * frames.errors_m).tolist(), strict=True))
         for look in known:
-            look["error_mm"] = significant(float(errors.get(look["index"], np.nan)))
+            look["error_mm"] = significant(errors.get(look["index"]))
         write_side(self.output, f"looks-{run.row.run_id}", {"looks": known, "stored": bool(shots)})
         self.runs.add(run.row.run_id)
 
@@ -132,13 +132,13 @@ def _open(run: LoadedRun) -> Sequence:
 
 def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
     """Frames to show: some spread over the run, and the worst; of those that the run has stored, if it has any."""
-    table = frames.table
-    known = table.dropna(subset=["frame_error_trans_m"]).sort_values("frame_error_trans_m", ascending=False)["index"]
+    indices = frames.columns["index"]
+    order = np.argsort(-np.nan_to_num(frames.errors_m, nan=-1.0), kind="stable")
+    bad = [int(indices[at]) for at in order if np.isfinite(frames.errors_m[at])]
     if not stored:
-        return sorted({*spread(len(table), EVEN), *known.iloc[:WORST].tolist()})
+        return sorted({int(indices[at]) for at in spread(len(frames), EVEN)} | set(bad[:WORST]))
     even = {stored[at] for at in spread(len(stored), EVEN)}
-    worst = [int(index) for index in known if int(index) in set(stored)][:WORST]
-    return sorted(even | set(worst))
+    return sorted(even | set([index for index in bad if index in set(stored)][:WORST]))
 
 
 def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:

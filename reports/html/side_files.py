@@ -38,18 +38,28 @@ def write_side(output: Path, name: str, value: Any) -> Path:
 
 
 def packed(values: ArrayLike) -> list[float | str]:
-    """Numbers in 16 bits each between their smallest and their largest; what is no number stays missing.
+    """One series of numbers ``[N]`` as `packed_rows` writes it."""
+    return packed_rows([values])[0]
+
+
+def packed_rows(rows: ArrayLike) -> list[list[float | str]]:
+    """Series of numbers in 16 bits each between their smallest and their largest; what is no number stays missing.
 
     Args:
-        values: Numbers ``[N]``.
+        rows: Numbers ``[K, N]``.
 
     Returns:
-        Smallest value, step, and the counts of steps in base64; a page shows them to a 65 000th of their range.
+        Of each series its smallest value, the step, and the counts of steps in base64; a page shows them to a 65 000th
+        of their range.
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = np.atleast_2d(np.asarray(rows, dtype=np.float64))
     known = np.isfinite(array)
-    low, high = (float(array[known].min()), float(array[known].max())) if known.any() else (0.0, 0.0)
-    step = (high - low) / (_MISSING - 1) or 1.0
-    steps = np.full(len(array), _MISSING, dtype="<u2")
-    steps[known] = ((array[known] - low) / step).round()
-    return [low, step, base64.b64encode(steps.tobytes()).decode()]
+    low = np.min(array, axis=1, where=known, initial=np.inf)
+    high = np.max(array, axis=1, where=known, initial=-np.inf)
+    low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
+    step = np.where(high > low, (high - low) / (_MISSING - 1), 1.0)
+    counts = np.where(known, (array - low[:, None]) / step[:, None], _MISSING).round().astype("<u2")
+    return [
+        [float(f"{first:.9g}"), float(f"{width:.9g}"), base64.b64encode(row.tobytes()).decode()]
+        for first, width, row in zip(low, step, counts, strict=True)
+    ]

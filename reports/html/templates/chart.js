@@ -14,6 +14,13 @@ function wrapTo(text, room) {
   return lines;
 }
 
+/** A text cut to a width in pixels. */
+function fitted(text, room) {
+  let cut = text;
+  while (cut && widthOf(cut) > room) cut = cut.slice(0, -1);
+  return cut === text ? text : `${cut.slice(0, -1).trim()}…`;
+}
+
 const write = (lines, x, y, more = {}) => {
   const text = svg("text", { x, y, ...more });
   lines.forEach((line, at) => text.append(svg("tspan", { x, dy: at ? "1.2em" : 0 }, line)));
@@ -30,7 +37,7 @@ function panelsOf(figure) {
     found.get(key).traces.push(trace);
   }
   return [...found.values()].map((panel) => ({
-    ...panel, xSpec: figure.layout[`xaxis${panel.x}`] ?? {}, ySpec: figure.layout[`yaxis${panel.y}`] ?? {},
+    ...panel, grouped: figure.layout.barmode === "group", xSpec: figure.layout[`xaxis${panel.x}`] ?? {}, ySpec: figure.layout[`yaxis${panel.y}`] ?? {},
   }));
 }
 
@@ -40,7 +47,7 @@ const spreads = (trace, axis) => {
     values.push(value);
     if (typeof value === "number" && error?.array?.[at] != null)
       values.push(value + error.array[at], value - (error.arrayminus?.[at] ?? error.array[at]));
-    if (trace.type === "bar" && trace.base && typeof value === "number") values.push(trace.base[at] + value, trace.base[at]);
+    if (trace.type === "bar" && trace.base && (axis === "x") === (trace.orientation === "h")) values.push(trace.base[at] + value, trace.base[at]);
   });
   if (trace.quartiles && axis === "y") values.push(...trace.quartiles.flat());
   if (trace.type === "box" && axis === (trace.orientation === "h" ? "y" : "x") && !trace.quartiles) return [trace.name];
@@ -53,6 +60,22 @@ function scalesOf(panel, shown) {
   const gather = (axis) => (panel[`${axis}Spec`].type === "category" ? panel.traces : all).flatMap((trace) => spreads(trace, axis));
   panel.sx = makeScale(panel.xSpec, gather("x"), zero("x"));
   panel.sy = makeScale(panel.ySpec, gather("y"), zero("y"));
+}
+
+/** Names below the axis: broken at their signs where they are too long, tilted where that does not help either. */
+function nameBelow(panel) {
+  const room = panel.width / panel.sx.categories.length - 8, names = new Map();
+  for (const name of panel.sx.categories) {
+    const lines = [""];
+    for (const piece of plain(name).split(/(?=[@?\[ _])/)) {
+      if (lines.at(-1) && widthOf(lines.at(-1) + piece) > room) lines.push(piece.trim()); else lines[lines.length - 1] += piece;
+    }
+    names.set(name, lines);
+  }
+  const widest = Math.max(0, ...[...names.values()].flat().map(widthOf));
+  panel.tilted = widest > room;
+  panel.names = panel.tilted ? new Map([...names.keys()].map((name) => [name, [plain(name)]])) : names;
+  panel.foot = panel.tilted ? 20 + 0.8 * Math.min(150, Math.max(...[...names.keys()].map((name) => widthOf(plain(name))))) : 8 + 15 * Math.max(...[...names.values()].map((lines) => lines.length));
 }
 
 /** Where the panels lie, for a width in pixels: side by side, or below each other where that is too narrow. */
@@ -78,11 +101,9 @@ function arrange(panels, layout, width) {
       const equal = panel.ySpec.scaleanchor !== undefined;
       const wanted = named ? Math.max(layout.height - 100, (panel.inside ? 44 : 30) * panel.sy.categories.length) : Math.min((layout.height ?? 420) - 100, narrow ? 250 : 400);
       panel.height = equal ? panel.width : Math.max(wanted, 90);
-      const tilted = panel.sx.kind === "category" && Math.max(0, ...panel.sx.categories.map((name) => widthOf(plain(name)))) > panel.width / panel.sx.categories.length - 8;
-      panel.tilted = tilted;
-      const foot = tilted ? Math.min(110, 16 + 0.6 * Math.max(...panel.sx.categories.map((name) => widthOf(plain(name))))) : 22;
-      bottom = Math.max(bottom, panel.top + panel.height + foot + (panel.xTitle[0] ? 18 * panel.xTitle.length : 0) + 6);
-      panel.foot = foot;
+      panel.foot = 22;
+      if (panel.sx.kind === "category") nameBelow(panel);
+      bottom = Math.max(bottom, panel.top + panel.height + panel.foot + (panel.xTitle[0] ? 18 * panel.xTitle.length : 0) + 6);
     });
     top = bottom + 4;
   }
@@ -101,8 +122,8 @@ function axesOf(panel) {
     const room = width / sx.categories.length;
     for (const name of sx.categories) {
       const x = left + sx.at(name) * width;
-      const turn = panel.tilted ? { transform: `rotate(-38 ${x} ${bottom + 12})`, "text-anchor": "end" } : { "text-anchor": "middle" };
-      group.append(write([plain(name)], x, bottom + 16, turn));
+      const turn = panel.tilted ? { transform: `rotate(-52 ${x} ${bottom + 12})`, "text-anchor": "end" } : { "text-anchor": "middle" };
+      group.append(write(panel.names.get(name), x, bottom + 16, turn));
       if (room > 24) group.append(svg("path", { d: `M${x + room / 2} ${top}V${bottom}`, class: "grid" }));
     }
   } else
@@ -114,7 +135,7 @@ function axesOf(panel) {
     for (const name of sy.categories) {
       const y = reversed ? top + sy.at(name) * height : bottom - sy.at(name) * height, lines = linesOf(name);
       group.append(svg("path", { d: `M${left} ${y}H${left + width}`, class: "grid" }));
-      group.append(panel.inside ? write([lines.join(" ")], left, y - 9, { class: "inside" })
+      group.append(panel.inside ? write([fitted(lines.join(" "), width)], left, y - 9, { class: "inside" })
         : write(lines, left - 8, y + 4 - 7 * (lines.length - 1), { "text-anchor": "end", class: "name" }));
     }
   } else
@@ -144,13 +165,17 @@ function guidesOf(panel, layout) {
   return group;
 }
 
+const chartIsGrouped = (panel) => panel.grouped && panel.traces.every((trace) => trace.type === "bar");
+
 function marksOf(panel, shown) {
   const { left, top, width, height, place, sx, sy } = panel, group = svg("g");
   const clip = `clip-${marksOf.count = (marksOf.count ?? 0) + 1}`;
   group.append(svg("clipPath", { id: clip }, svg("rect", { x: left - 7, y: top - 7, width: width + 14, height: height + 14 })));
   const inner = svg("g", { "clip-path": `url(#${clip})` });
   const room = sy.kind === "category" ? height / sy.categories.length : sx.kind === "category" ? width / sx.categories.length : width / Math.max(1, ...panel.traces.map((t) => t.x?.length ?? 1));
-  for (const trace of panel.traces.filter(shown)) {
+  const visible = panel.traces.filter(shown);
+  if (chartIsGrouped(panel)) visible.forEach((trace, at) => Object.assign(trace, { width: 0.8 / visible.length, shift: ((at + 0.5) / visible.length - 0.5) * 0.8 }));
+  for (const trace of visible) {
     if (trace.type === "bar") inner.append(...barMarks(trace, place, room));
     else if (trace.type === "box") inner.append(...boxMarks(trace, place, room));
     else {

@@ -210,6 +210,7 @@ class Explore {
 }
 
 async function startExplore() {
+  startTracks();
   try {
     const explore = new Explore(await side("explore"));
     explore.wire();

@@ -102,10 +102,14 @@ function addCompare(place, look) {
   const slider = make("input", { type: "range", min: 0, max: 100, value: 50, ariaLabel: "Divider between before and after culling" });
   after.style.position = "absolute";
   after.style.inset = "0";
-  const move = () => { after.style.clipPath = `inset(0 0 0 ${slider.value}%)`; };
+  const divider = make("div", { className: "divider" });
+  const move = () => {
+    after.style.clipPath = `inset(0 0 0 ${slider.value}%)`;
+    divider.style.left = `calc(${slider.value}% - 1px)`;
+  };
   slider.addEventListener("input", move);
   move();
-  const pair = make("div", {}, before, after);
+  const pair = make("div", {}, before, after, divider);
   pair.style.position = "relative";
   place.append(make("h3", { textContent: "Before and after culling" }), pair, slider,
     make("p", { className: "caption", textContent: `Left of the divider all features, right of it those that were kept; ${words(look)}.` }));

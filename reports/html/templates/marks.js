@@ -124,11 +124,11 @@ function barMarks(trace, place, room) {
     const value = (across ? trace.x : trace.y)[at], base = trace.base?.[at] ?? 0;
     const from = across ? place(base, name) : place(name, base), to = across ? place(base + value, name) : place(name, base + value);
     if (from === null || to === null) return "";
-    const half = (trace.width ? trace.width * room : room * 0.7) / 2;
+    const half = (trace.width ? trace.width * room : room * 0.7) / 2, shift = (trace.shift ?? 0) * room;
     const [x, y, w, h] = across
-      ? [Math.min(from[0], to[0]), from[1] - half, Math.abs(to[0] - from[0]), 2 * half]
-      : [from[0] - half, Math.min(from[1], to[1]), 2 * half, Math.abs(to[1] - from[1])];
+      ? [Math.min(from[0], to[0]), from[1] - half + shift, Math.abs(to[0] - from[0]), 2 * half]
+      : [from[0] - half + shift, Math.min(from[1], to[1]), 2 * half, Math.abs(to[1] - from[1])];
     const style = `--c: ${inkOf(each(trace.marker?.color, at))}`;
-    return svg("rect", { x: x.toFixed(1), y: y.toFixed(1), width: Math.max(w, 0.5).toFixed(1), height: h.toFixed(1), class: "bar", style });
+    return svg("rect", { x: x.toFixed(1), y: y.toFixed(1), width: Math.max(w, 0.5).toFixed(1), height: h.toFixed(1), class: "bar", style, opacity: trace.marker?.opacity });
   });
 }

@@ -37,7 +37,7 @@ function useTheme() {
 
 function draw(element) {
   if (element.dataset.drawn) return;
-  const figure = (globalThis.FIGURES ?? {})[element.id];
+  const figure = FIGURES[element.id];
   if (!figure) return;
   element.dataset.drawn = "1";
   drawChart(element, figure);
@@ -46,16 +46,6 @@ function draw(element) {
 const inSight = new IntersectionObserver((entries) => {
   for (const entry of entries) if (entry.isIntersecting) { draw(entry.target); inSight.unobserve(entry.target); }
 }, { rootMargin: "500px" });
-
-/** Figures of a part of a recording lie in a side file: fetched when their fold opens. */
-async function openFold(fold) {
-  if (!fold.dataset.side || fold.dataset.loaded) return;
-  fold.dataset.loaded = "1";
-  try {
-    Object.assign(FIGURES, await side(fold.dataset.side));
-    fold.querySelectorAll(".figure").forEach(draw);
-  } catch (error) { fold.append(make("p", { className: "note", textContent: error.message })); }
-}
 
 function sortBy(table, column, header) {
   const body = table.tBodies[0], up = header.getAttribute("aria-sort") !== "ascending";
@@ -84,6 +74,7 @@ function makeSortable(table) {
 
 /** Everything is drawn and unfolded for print; tables that are too wide for the sheet are made smaller. */
 function preparePrint() {
+  document.querySelectorAll("main details:not(.toolbar details, .tracks)").forEach((fold) => { if (!fold.open) { fold.open = true; fold.dataset.shut = "1"; } });
   document.querySelectorAll(".figure").forEach(draw);
   const room = 1045;  // the inner width of A4 across, in CSS pixels
   for (const table of document.querySelectorAll("main table")) table.style.zoom = String(Math.min(1, room / Math.max(table.scrollWidth, 1)));
@@ -92,13 +83,12 @@ function preparePrint() {
 function startPage() {
   useTheme();
   document.querySelectorAll(".figure").forEach((element) => inSight.observe(element));
-  document.querySelectorAll("details[data-side]").forEach((fold) => {
-    fold.addEventListener("toggle", () => { if (fold.open) openFold(fold); });
-    if (fold.open) openFold(fold);
-  });
   document.querySelectorAll("main table").forEach(makeSortable);
   addEventListener("beforeprint", preparePrint);
-  addEventListener("afterprint", () => document.querySelectorAll("main table").forEach((table) => { table.style.zoom = ""; }));
+  addEventListener("afterprint", () => {
+    document.querySelectorAll("main table").forEach((table) => { table.style.zoom = ""; });
+    document.querySelectorAll("details[data-shut]").forEach((fold) => { fold.open = false; delete fold.dataset.shut; });
+  });
   const links = [...document.querySelectorAll("nav a[href^='#']")];
   for (const link of links)
     link.addEventListener("click", (event) => {

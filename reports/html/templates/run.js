@@ -13,12 +13,6 @@ const table = (heads, rows) => {
   return make("div", { className: "scroll", tabIndex: 0 }, made);
 };
 
-/** Numbers that were packed, at any depth. */
-function unpacked(value) {
-  if (Array.isArray(value)) return value.length === 3 && typeof value[0] === "number" && typeof value[2] === "string" ? unpack(value) : value.map(unpacked);
-  return value && typeof value === "object" ? Object.fromEntries(Object.entries(value).map(([key, part]) => [key, unpacked(part)])) : value;
-}
-
 /** Choices that lead to the other runs of this tracker and this sequence, and to the same cell of others. */
 function addChoices(all, id) {
   const here = all.runs.find((run) => run[0] === id);
@@ -39,7 +33,7 @@ function addChoices(all, id) {
 }
 
 function factsOf(run) {
-  const cards = run.facts.map(([name, value, unit]) => make("div", { className: "card" }, make("b", { textContent: `${digits(value)}${unit && ` ${unit}`}` }), make("span", { textContent: name })));
+  const cards = run.facts.map(([name, value, unit]) => make("div", { className: "card" }, make("b", { textContent: `${Number.isInteger(value) ? value : digits(value)}${unit && ` ${unit}`}` }), make("span", { textContent: name })));
   const parts = [make("div", { className: "cards" }, ...cards)];
   if (run.reason || run.ending) parts.unshift(make("p", { className: "note", textContent: [run.ending, run.reason].filter(Boolean).join(": ") }));
   if (run.command) parts.push(make("h3", { textContent: "Make it again" }), make("pre", { tabIndex: 0, textContent: run.command }));
@@ -68,7 +62,7 @@ function stagesOf(run) {
 function timeOf(run) {
   if (!run.frames.t && !run.track.t) return [];
   const share = run.frames.share ? `, and the share of the image that shows people (${run.frames.share_source})` : "";
-  return [section("s-time", "Over time", figure("over-time", `Errors frame by frame${share}; features and matches where the tracker tells them. Lost frames are shaded by gaps.`),
+  return [section("s-time", "Over time", figure("over-time", `Errors frame by frame${share}; features and matches where the tracker tells them. Lines have gaps where frames were lost.`),
     ...(run.track.xyz ? [figure("poses", "Position, and rotation from the first true pose; the truth in grey.")] : []))];
 }
 
@@ -80,7 +74,7 @@ function trackOf(run) {
   if (!run.track.xyz) return [section("s-track", "Track", make("p", { className: "waiting", textContent: run.track.reason ?? "Nothing was tracked." }))];
   const canvas = make("canvas", { className: "space", tabIndex: 0, ariaLabel: "The track in space, coloured by its error; arrow keys turn it" });
   canvas.setAttribute("role", "img");
-  const most = run.track.error_mm ? Math.max(quantile([...run.track.error_mm].sort((a, b) => a - b), 0.98), 1e-3) : 0;
+  const most = run.track.error_mm ? Math.max(quantile(run.track.error_mm.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 0;
   const ramp = make("span", { className: "ramp" });
   ramp.style.background = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(rampColour).join(", ")})`;
   const keys = run.track.error_mm ? [make("div", { className: "keys" }, "0", ramp, `${digits(most)} mm and more`, make("span", {}, "grey: true path"))] : [];
@@ -111,7 +105,7 @@ function startSpace(run) {
   const canvas = document.querySelector(".space");
   if (!canvas) return null;
   const errors = run.track.error_mm ?? null;
-  const space = new Space(canvas, run.track.xyz, run.track.true_xyz ?? null, errors, errors ? Math.max(quantile([...errors].sort((a, b) => a - b), 0.98), 1e-3) : 1);
+  const space = new Space(canvas, run.track.xyz, run.track.true_xyz ?? null, errors, errors ? Math.max(quantile(errors.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 1);
   space.draw();
   return space;
 }

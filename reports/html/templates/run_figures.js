@@ -8,7 +8,7 @@ function stacked(panels, layout = {}) {
   const data = [], made = { showlegend: true, ...layout };
   panels.filter((panel) => panel.traces.length).forEach(({ title, traces, axis }, at) => {
     const suffix = at ? String(at + 1) : "";
-    data.push(...traces.map((trace) => ({ mode: "lines", ...trace, xaxis: `x${suffix}`, yaxis: `y${suffix}` })));
+    data.push(...traces.map((trace) => ({ mode: "lines", showlegend: traces.length > 1, ...trace, xaxis: `x${suffix}`, yaxis: `y${suffix}` })));
     made[`xaxis${suffix}`] = { title: { text: "time (s)" }, ...axis };
     made[`yaxis${suffix}`] = { title: { text: title }, rangemode: "tozero" };
   });
@@ -27,7 +27,7 @@ function overTime(run) {
     { title: "frame-to-frame error (mm)", traces: [line("frame error", gapped(run, frames.frame_error_mm), "#8a5cc2")] },
     { title: `image that shows people (%)`, traces: frames.share ? [line("dynamic share", frames.share, "#c9970c", { fill: "tozeroy" })] : [] },
     { title: "features and matches", traces: counts },
-  ], { height: 300, columns: 2, showlegend: counts.length > 0 });
+  ], { height: 300, columns: 2 });
 }
 
 function poses(run) {

@@ -10,7 +10,7 @@ class Space {
   /** Tracks are lists of three lists of metres; `errors` in mm colours the first, up to `most`. */
   constructor(canvas, track, truth, errors, most) {
     Object.assign(this, { canvas, track, truth, errors, most, turn: -0.6, tilt: 0.45, at: track[0].length - 1 });
-    const all = truth ? track.map((list, axis) => [...list, ...truth[axis]]) : track;
+    const all = track.map((list, axis) => [...list, ...(truth?.[axis] ?? [])].filter((value) => value !== null));
     this.low = all.map((list) => Math.min(...list));
     this.high = all.map((list) => Math.max(...list));
     this.centre = this.low.map((low, axis) => (low + this.high[axis]) / 2);
@@ -46,6 +46,7 @@ class Space {
 
   line(points, colour, width) {
     const { pen } = this;
+    if (points.some((point) => point[0] === null)) return;
     pen.strokeStyle = colour;
     pen.lineWidth = width;
     pen.beginPath();
@@ -54,7 +55,7 @@ class Space {
   }
 
   draw() {
-    const { canvas } = this, ratio = devicePixelRatio || 1, style = getComputedStyle(document.documentElement);
+    const { canvas } = this, ratio = devicePixelRatio || 1;
     this.width = canvas.clientWidth;
     this.height = canvas.clientHeight;
     if (!this.width) return;
@@ -63,13 +64,15 @@ class Space {
     this.pen = canvas.getContext("2d");
     this.pen.scale(ratio, ratio);
     this.pen.lineCap = this.pen.lineJoin = "round";
-    const probe = getComputedStyle(canvas), soft = probe.color, grid = probe.outlineColor;
+    const probe = getComputedStyle(canvas), soft = probe.color, grid = probe.borderTopColor;
     this.floor(grid, soft);
     const points = (track) => track[0].map((_, at) => track.map((list) => list[at]));
-    if (this.truth) this.line(points(this.truth), soft, 1.2);
-    const path = points(this.track);
-    for (let at = 1; at < path.length; at++) this.line([path[at - 1], path[at]], this.errors ? rampColour(this.errors[at] / this.most) : style.getPropertyValue("--accent"), 2.6);
-    const [x, y] = this.project(...path[Math.min(this.at, path.length - 1)]);
+    const path = points(this.track), true_ = this.truth ? points(this.truth) : [];
+    for (let at = 1; at < true_.length; at++) this.line([true_[at - 1], true_[at]], soft, 1.2);
+    for (let at = 1; at < path.length; at++) this.line([path[at - 1], path[at]], this.errors ? rampColour(this.errors[at] / this.most) : soft, 2.6);
+    const here = path[Math.min(this.at, path.length - 1)];
+    if (here[0] === null) return;
+    const [x, y] = this.project(...here);
     this.pen.fillStyle = soft;
     this.pen.beginPath();
     this.pen.arc(x, y, 5, 0, 7);

@@ -25,3 +25,9 @@ function unpack([low, step, text]) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   return Array.from(new Uint16Array(bytes.buffer), (value) => (value === 65535 ? null : low + step * value));
 }
+
+/** Numbers that were packed, at any depth. */
+function unpacked(value) {
+  if (Array.isArray(value)) return value.length === 3 && typeof value[0] === "number" && typeof value[2] === "string" ? unpack(value) : value.map(unpacked);
+  return value && typeof value === "object" ? Object.fromEntries(Object.entries(value).map(([key, part]) => [key, unpacked(part)])) : value;
+}
