@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,9 +10,10 @@ import optuna
 from optuna.trial import FrozenTrial
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.reading import read_json
 
 from .storage import open_storage, study_folder
-from .study_file import StudySpec, read_study
+from .study_file import StudySpec, make_study, read_study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,7 +109,7 @@ def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, P
     path = Path(study).expanduser()
     stored = path / _SPEC_FILE
     if stored.is_file():
-        return StudySpec.model_validate(json.loads(stored.read_text(encoding="utf-8"))), path.absolute().parents[1]
+        return make_study(read_json(stored, kind=StudyError), stored), path.absolute().parents[1]
     if path.is_dir():
         raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
     return read_study(path), results

@@ -111,13 +111,10 @@ def read_settings(file: Path) -> dict[str, Any]:
     Raises:
         SettingsError: The file cannot be read, or is no TOML.
     """
-    from dynslam_bench.core.errors import SequenceError, SettingsError
+    from dynslam_bench.core.errors import SettingsError
     from dynslam_bench.core.toml import read_toml
 
-    try:
-        document = read_toml(file.expanduser())
-    except SequenceError as error:
-        raise SettingsError(str(error)) from None
+    document = read_toml(file.expanduser(), kind=SettingsError)
     values = document.get("settings", document)
     if not isinstance(values, dict):
         raise SettingsError(f"'settings' in {file} is {values!r}, not a table")

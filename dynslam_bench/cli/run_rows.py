@@ -46,7 +46,23 @@ def show_runs(
     write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
 
 
+def seen_note(records: Sequence[RunRecord]) -> str:
+    """One line on the runs whose network was trained on what it judged; empty without any."""
+    from dynslam_bench.segmentation.training_set import seen_in_training
+
+    seen = [r.sequence.id for r in records if seen_in_training(r.segmentation, r.sequence.id)]
+    if not seen:
+        return ""
+    return (
+        f"{len(seen)} of {len(records)} runs have masks of a network that was trained on their scene, the first on "
+        f"{seen[0]}: a best case, which reports mark and do not rank; instances 100-199 are held out, e.g. "
+        f"{seen[0].partition('?')[0].partition('@')[0]}@100"
+    )
+
+
 def _row(record: RunRecord, store: RunStore, protocol: str) -> dict[str, Any]:
+    from dynslam_bench.segmentation.training_set import seen_in_training
+
     metrics = {} if record.status == "stopped" else store.score(record, protocol).metrics
     return {
         "run": record.run_id,
@@ -64,6 +80,7 @@ def _row(record: RunRecord, store: RunStore, protocol: str) -> dict[str, Any]:
         "coverage": record.coverage,
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "masks": record.segmentation,
+        "seen_in_training": seen_in_training(record.segmentation, record.sequence.id),
         "reason": record.reason,
         "protocol": protocol,
         "folder": str(store.folder(record.run_id)),

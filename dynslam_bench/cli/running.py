@@ -39,7 +39,7 @@ from .options import (
     gather_settings,
 )
 from .output import SOME_RUNS_FAILED, note, progress
-from .run_rows import show_runs
+from .run_rows import seen_note, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunSpec
@@ -192,6 +192,8 @@ def finish(
     reused: set[str] = set()
     records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
+    if seen := seen_note(records):
+        note(seen)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if any(record.failed for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)

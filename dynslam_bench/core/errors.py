@@ -8,9 +8,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from .passwords import without_passwords
+
 
 class DynslamError(Exception):
-    """Base of all errors that the user of the toolkit can cause and cure.
+    """Base of all errors that the user of the toolkit can cause and cure; the passwords of addresses are left out.
 
     Args:
         message: One line with the measured numbers and the expectation.
@@ -18,8 +20,8 @@ class DynslamError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        super().__init__(message)
-        self.hint = hint
+        super().__init__(without_passwords(str(message)))
+        self.hint = without_passwords(hint)
 
     def __str__(self) -> str:
         message = str(self.args[0])

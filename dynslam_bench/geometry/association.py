@@ -33,6 +33,8 @@ def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: boo
     if not max_dt >= 0:
         raise TrajectoryError(f"the largest time difference is {max_dt!r}, not a number of seconds >= 0")
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
+    if (np.diff(candidate_a) > 0).all() and (np.diff(candidate_b) > 0).all():  # nobody has two to choose from
+        return order_a[candidate_a], order_b[candidate_b]
     free_a = np.ones(len(a), dtype=bool).tolist()
     free_b = np.ones(len(b), dtype=bool).tolist()
     matched: list[tuple[int, int]] = []

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.reading import parse_json, read_lines
 from dynslam_bench.geometry import se3
 
 if TYPE_CHECKING:
@@ -106,11 +108,58 @@ class FrameRow:
         return json.dumps(vars(self)) + "\n"
 
 
-def read_log(path: Path) -> list[FrameRow]:
-    """Read the child's log; a line that a dying process left unfinished is not taken, and no file is no frames."""
+def read_log(path: Path) -> tuple[list[FrameRow], str]:
+    """Read the child's log; no file is no frames.
+
+    Returns:
+        The rows up to the first that is damaged, and what is wrong with that, empty for none. A line that a dying
+        process left unfinished is not taken, and no damage.
+    """
+    rows: list[FrameRow] = []
     if not path.is_file():
-        return []
-    return [FrameRow(**json.loads(line)) for line in path.read_text().split("\n")[:-1]]
+        return rows, ""
+    try:
+        for line in read_lines(path, kind=RunError):
+            if line.endswith("\n"):
+                row = _from_json(line)
+                if rows and round(row.timestamp, 6) <= round(rows[-1].timestamp, 6):
+                    raise ValueError(f"stamp {row.timestamp:.6f} after {rows[-1].timestamp:.6f}")
+                rows.append(row)
+    except (DynslamError, LookupError, TypeError, ValueError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:200]
+        return rows, f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})"
+    return rows, ""
+
+
+def _from_json(line: str) -> FrameRow:
+    values = parse_json(line, "it", kind=RunError)
+    if not isinstance(values, dict) or not set(values) <= set(FrameRow.__dataclass_fields__):
+        raise ValueError("it is no frame")
+    pose = values.get("pose")
+    if pose is not None:
+        pose = [float(number) for number in pose]
+        if len(pose) != 7 or not all(map(math.isfinite, pose)) or math.hypot(*pose[3:]) < 1e-8:
+            raise ValueError("it holds no pose")
+    numbers = {name: _number(values[name]) for name in FIXED[3:] if values.get(name) is not None}
+    timestamp = float(values["timestamp"])
+    if not math.isfinite(timestamp):
+        raise ValueError(f"stamp {timestamp}")
+    return FrameRow(
+        index=int(values["index"]),
+        timestamp=timestamp,
+        state=_state(values["state"]),
+        **numbers,
+        timings={str(name): _number(number) for name, number in dict(values.get("timings", {})).items()},
+        stats={str(name): _number(number) for name, number in dict(values.get("stats", {})).items()},
+        pose=pose,
+    )
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{str(value)[:40]!r} is no number")
+    float(value)  # an integer may be too large for one
+    return value
 
 
 def column_names(rows: Iterable[FrameRow]) -> list[str]:
@@ -139,16 +188,15 @@ def read_csv(path: Path) -> list[FrameRow]:
     """
     rows: list[FrameRow] = []
     try:
-        with path.open(newline="") as file:
-            rows.extend(_parse(line) for line in csv.DictReader(file))
-    except OSError as error:
-        raise RunError(f"cannot read {path}: {error.strerror}") from error
-    except (KeyError, TypeError, ValueError) as error:
+        rows.extend(_parse(line) for line in csv.DictReader(read_lines(path, kind=RunError)))
+    except (LookupError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({error!r})") from error
     return rows
 
 
 def _parse(line: Mapping[str, str]) -> FrameRow:
+    if None in line or None in line.values():
+        raise ValueError("another number of cells than the heading has")
     cells = {name: float(text) for name, text in line.items() if text and name not in FIXED[:3]}
     stats = {name[len(_STAT) :]: value for name, value in cells.items() if name.startswith(_STAT)}
     timings = {
@@ -172,7 +220,7 @@ def _parse(line: Mapping[str, str]) -> FrameRow:
     )
 
 
-def _state(text: str) -> FrameState:
+def _state(text: object) -> FrameState:
     for known in STATES:
         if text == known:
             return known

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
@@ -72,10 +70,10 @@ def write_explore(
     book, sums = PictureBook(output, picture_seconds), FrameSums()
     shown = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
     shown |= {row.run_id for row in board.rows if row.failed}
-    shares, truths = _shares(loaded), _Truths()
+    shares = _shares(loaded)
     for done, run in enumerate(sorted(loaded.runs, key=lambda run: run.row.run_id not in shown)):
         frames = read_frames(run, shares.get(run.row.column_id, {}))
-        write_side(output, f"run-{run.row.run_id}", run_content(run, frames, protocol, truths.of(run)))
+        write_side(output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth()))
         if len(frames):
             sums.add(run.row, frames.errors_m, frames.share, frames.share_source == "exact masks")
         if run.row.run_id in shown:
@@ -85,19 +83,6 @@ def write_explore(
     write_side(output, "explore", explore_content(board, protocol, sums, book.runs))
     write_atomic(output / RUN_PAGE, render_run_page(title))
     return Explored(len(loaded.runs), len(book.runs), book.note())
-
-
-class _Truths:
-    """Ground truth by part of a sequence, read once."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[Any, ...], Trajectory | None] = {}
-
-    def of(self, run: LoadedRun) -> Trajectory | None:
-        key = (run.store.root, run.record.sequence.part)
-        if key not in self._known:
-            self._known[key] = run.store.ground_truth(run.record.sequence.part)
-        return self._known[key]
 
 
 def _shares(loaded: Loaded) -> dict[str, dict[int, float]]:

@@ -42,7 +42,7 @@ class PictureBook:
 
     Attributes:
         runs: Runs that have pictures.
-        missing: Why there are none, with the number of runs that it concerns.
+        missing: Why some frames have none, with their number.
     """
 
     output: Path
@@ -56,7 +56,11 @@ class PictureBook:
         """Draw the frames that a run shows and write what was seen on them as ``data/looks-<run id>.js``."""
         if not len(frames):
             return
-        size, shots = read_snapshots(run.store.folder(run.row.run_id))
+        try:
+            size, shots = read_snapshots(run.store.folder(run.row.run_id))
+        except DynslamError as error:
+            self._miss(str(error))
+            return
         began = time.perf_counter()
         by_index = {shot.index: shot for shot in shots}
         looks = [self._look(run, index, by_index.get(index), size) for index in _chosen(frames, sorted(by_index))]
@@ -70,6 +74,9 @@ class PictureBook:
         write_side(self.output, f"looks-{run.row.run_id}", {"looks": known, "stored": bool(shots)})
         self.runs.add(run.row.run_id)
 
+    def _miss(self, reason: str) -> None:
+        self.missing[reason] = self.missing.get(reason, 0) + 1
+
     def note(self) -> str:
         """Why some runs have no pictures; empty if all have them."""
         return "; ".join(f"{count} frames: {reason}" for reason, count in self.missing.items())
@@ -78,7 +85,7 @@ class PictureBook:
         try:
             look: dict[str, Any] = {"index": index, "image": self._image(run, index)}
         except DynslamError as error:
-            self.missing[str(error)] = self.missing.get(str(error), 0) + 1
+            self._miss(str(error))
             look = {"index": index}
         return look if shot is None else look | _seen(shot, size)
 

@@ -41,11 +41,13 @@ class RunFrames:
         columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an imported trajectory.
         share: Share of the pixels that show people ``[N]``, nan where it is not known.
         share_source: Where that comes from, in words; empty where nothing is known.
+        fault: Why there are no frames though there is a table; empty otherwise.
     """
 
     columns: dict[str, NDArray[Any]]
     share: Array
     share_source: str
+    fault: str = ""
 
     def __len__(self) -> int:
         return len(self.share)
@@ -66,10 +68,13 @@ def read_frames(run: LoadedRun, exact: Mapping[int, float]) -> RunFrames:
     path = run.store.folder(run.row.run_id) / CSV_FILE
     if not path.is_file() or not path.stat().st_size:
         return RunFrames({}, np.zeros(0), "")
-    table = pd.read_csv(path, usecols=_is_shown)
+    try:
+        table = pd.read_csv(path, usecols=_is_shown)
+    except (ValueError, OSError) as error:
+        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} is damaged: {error}")
     columns = {str(name): table[name].to_numpy() for name in table}
     if not len(table) or not _NEEDED <= set(columns):
-        return RunFrames({}, np.zeros(0), "")
+        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} holds no frames")
     if exact:
         share = np.array([exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()])
         return RunFrames(columns, share, "exact masks")
@@ -120,7 +125,7 @@ def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Tr
         "protocol": protocol.describe(),
         "started": row.started,
         "machine": row.machine,
-        "notes": row.notes,
+        "notes": [*row.notes, *filter(None, [frames.fault])],
         "command": run_command(row),
         "asked": row.command,
         "log": _log(run),
@@ -197,7 +202,7 @@ def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict
     Where the time between two poses exceeds twice the median interval, all series have a gap.
     """
     try:
-        estimate = run.store.trajectory(run.row.run_id, run.row.trajectory)
+        estimate = run.trajectory(run.row.trajectory)
         if estimate is None or len(estimate) < 2:
             return {}
         if truth is None or not run.row.metrics:

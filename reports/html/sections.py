@@ -164,6 +164,7 @@ def add_masks(draft: Draft, board: Board) -> None:
         "mask_iou",
         "Mask quality",
         "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        unit="IoU",
         text=significant_text,
         larger_is_better=True,
     )

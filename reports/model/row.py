@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from typing import Any, Literal
 
 from pydantic import Field
@@ -13,6 +14,8 @@ from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
 Kind = Literal["run here", "imported"]
 Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
+SEEN = "§"
+"""Behind trackers and numbers whose masks come from a network that was trained on the scene."""
 
 
 class RunRow(Record):
@@ -64,6 +67,8 @@ class RunRow(Record):
         peak_memory_mb: Largest resident memory, None if unknown.
         mask_iou: Overlap of the dynamic mask with the exact one, None if unknown.
         segmentation: Source of the masks.
+        seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
+            does not rank unless that is asked for.
         started: UTC, ISO 8601.
         log: Path of the run's log.
         command: Command line that made it.
@@ -114,6 +119,7 @@ class RunRow(Record):
     peak_memory_mb: float | None = None
     mask_iou: float | None = None
     segmentation: str = ""
+    seen_in_training: bool = False
     started: str = ""
     log: str = ""
     command: str = ""
@@ -143,7 +149,7 @@ class RunRow(Record):
         """Whether the trajectory comes from elsewhere."""
         return self.kind == "imported"
 
-    @property
+    @cached_property
     def variant_key(self) -> str:
         """Tracker and everything that sets its runs apart besides sequence and repeat."""
         return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 
 from ..tools.coherence import coherent
 from ..tools.ego_motion import rigid_flow
@@ -20,7 +21,6 @@ from ..tools.fundamental_matrix import (
     rotation_residual,
 )
 from .epipolar_settings import EpipolarSettings
-from .semantic import inside
 
 RIGID_PX = 2.0
 """Nearer than this to where the camera's motion puts it, a point moves with the static world."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_dense import quick
 
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
@@ -25,7 +26,6 @@ from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, S
 FRAMES = 9
 SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)]
 IDENTITY = {"orb-slam2"}
-QUICK_DENSE = {"flow.dense_budget": 16, "flow.dense_sweeps": 1, "flow.dense_candidates": 2}
 SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
 """Need five keyframes, or a window of frames, before they judge."""
 
@@ -39,8 +39,7 @@ def run(spec: TrackerSpec, sequence, seed: int = 0, **settings: object) -> list[
     semantic = issubclass(spec.settings, SemanticSystemSettings)
     if semantic and spec.settings().segmentation.source == "auto":
         settings.setdefault("segmentation.source", "oracle")
-    if "flow" in spec.settings.model_fields and spec.settings().flow.mode == "dense":
-        settings = QUICK_DENSE | settings
+    settings = quick(spec.settings) | settings
     tracker = build_tracker(spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
     tracker.reset(sequence.camera, rng=np.random.default_rng(seed))
     return [tracker.track(sequence[index]) for index in range(FRAMES)]
