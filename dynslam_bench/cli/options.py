@@ -62,7 +62,7 @@ Degrade = Annotated[
     ),
 ]
 Cache = Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")]
-Video = Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")]
+Video = Annotated[bool, typer.Option("--video", help="Write video.webm beside the run.")]
 Sheet = Annotated[
     bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
 ]

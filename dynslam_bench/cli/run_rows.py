@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
-from .output import write_json, write_table
+from .output import complain, write, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunStore
@@ -44,6 +45,18 @@ def show_runs(
     names |= {name: title for name, title in WHERE_SAID.items() if any(row[name] for row in rows)}
     cells = [[row[name] for name in names] for row in rows]
     write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
+
+
+def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> None:
+    """Where the pictures of runs lie; on standard error for which runs there are none, and why."""
+    by_id = {record.run_id: record for record in records}
+    for (run_id, record), name in product(by_id.items(), names):
+        path = store.folder(run_id) / name
+        if not path.is_file():
+            ended = f"no {name}: the run ended early, {record.status}"
+            complain(f"{next((text for text in record.notes if text.startswith(f'no {name}')), ended)} ({run_id})")
+        elif not as_json:
+            write(str(path))
 
 
 def seen_note(records: Sequence[RunRecord]) -> str:

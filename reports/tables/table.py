@@ -87,6 +87,7 @@ class Table:
         title: Heading.
         caption: Everything a reader needs, including the protocol.
         columns: The columns.
+        rows: What is displayed, by row.
         shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
         values: The numbers behind it with all their digits, in the units that the caption and the headings name
             (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
@@ -116,15 +117,11 @@ class Table:
         self.id, self.title, self.caption, self.brief = id, title, caption, brief or title
         self.columns = list(columns)
         self.muted_rows, self.separators = set(muted_rows), set(separators)
-        self.shown = pd.DataFrame([list(row) for row in rows], columns=range(len(self.columns)), dtype=object)
+        self.rows = [list(row) for row in rows]
+        self.shown = pd.DataFrame(self.rows, columns=range(len(self.columns)), dtype=object)
         series = [_values(column, self.shown[at]) for at, column in enumerate(self.columns)]
         self.values = pd.concat(series, axis=1)
         self.shown.columns = self.values.columns = pd.Index([column.key for column in self.columns])
-
-    @property
-    def rows(self) -> list[list[TableCell]]:
-        """What is displayed, by row."""
-        return [list(row) for row in self.shown.itertuples(index=False, name=None)]
 
     def frame(self) -> pd.DataFrame:
         """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
