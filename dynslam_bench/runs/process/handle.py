@@ -12,6 +12,8 @@ import time
 from abc import ABC, abstractmethod
 from multiprocessing.connection import Connection, Pipe, wait
 
+from dynslam_bench.core.temporary import sweep
+
 from .family import end_family, family
 from .server import SERVER, child_environment
 
@@ -27,11 +29,13 @@ class Child(ABC):
     Args:
         connection: The parent's end.
         pid: Its process id, 0 until it is known.
+        lost: Why nothing is known of its end, if that is so: who was to report it has died itself.
     """
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         self.pid = 0
+        self.lost = ""
 
     def wait_handle(self) -> int | None:
         """A file descriptor that becomes readable when the child ends, if there is one."""
@@ -81,7 +85,7 @@ class ForkedChild(Child):
             except BlockingIOError:
                 break
             if not data:  # the server is gone, and its children with it
-                self._exit = -signal.SIGKILL
+                self._exit, self.lost = -signal.SIGKILL, self.lost or "the fork server was ended from outside"
                 break
             self._buffer += data
             *lines, self._buffer = self._buffer.split(b"\n")
@@ -89,6 +93,7 @@ class ForkedChild(Child):
                 message = json.loads(line)
                 self.pid = message.get("pid", self.pid)
                 self._exit = message.get("exit", self._exit)
+                self.lost = message.get("refused", self.lost)
         return self._exit
 
     def close(self) -> None:
@@ -138,18 +143,19 @@ class FreshChild(Child):
             end_family(self.pid)
 
     def close(self) -> None:
-        """Kill it if it still runs, reap it, and end what is left of its process group."""
+        """Kill it if it still runs, reap it, end what is left of its process group, and remove its temporary files."""
         super().close()
         self._process.wait()
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
+        sweep()
 
 
 def start_child() -> Child:
     """Start a child that waits for its job.
 
     Raises:
-        RunError: The fork server cannot be started.
+        InfrastructureError: The fork server cannot be started.
     """
     how = os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
     return FreshChild() if how == "fresh" else ForkedChild()
