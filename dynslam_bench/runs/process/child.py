@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.temporary import TemporaryFolder, sweep
+from dynslam_bench.core.temporary import TemporaryFolder
 
 from .failures import describe_failure
-from .family import adopt_orphans, die_with_parent, end_descendants
+from .family import adopt_orphans, die_with_parent
 
 LOG_FILE = "log.txt"
 
@@ -137,34 +137,3 @@ def limit_threads(threads: int) -> None:
         os.environ["NUMBA_NUM_THREADS"] = str(threads)
     else:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-
-
-def keep(connection_fd: int) -> int:
-    """Make the run in a process below this one, which adopts and ends whatever the run leaves behind.
-
-    Returns:
-        The run's exit code; does not return if a signal ended the run, but ends by the same one.
-    """
-    if not adopt_orphans():
-        return main(Connection(connection_fd))
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            code = main(Connection(connection_fd))
-        finally:
-            os._exit(code)
-    os.close(connection_fd)
-    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    end_descendants()
-    sweep()
-    if code < 0:
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        if -code not in (signal.SIGKILL, signal.SIGSTOP):
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    return code
-
-
-if __name__ == "__main__":
-    os._exit(keep(int(sys.argv[1])))  # threads that a tracker left running must not hold it up

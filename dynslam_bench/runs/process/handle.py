@@ -28,13 +28,15 @@ class Child(ABC):
 
     Args:
         connection: The parent's end.
-        pid: Its process id, 0 until it is known.
+        pid: Its process id, 0 until it is known; on Linux that of its keeper.
+        run_pid: That of the run itself, or 0 where it is not known.
         lost: Why nothing is known of its end, if that is so: who was to report it has died itself.
     """
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         self.pid = 0
+        self.run_pid = 0
         self.lost = ""
 
     def wait_handle(self) -> int | None:
@@ -92,6 +94,7 @@ class ForkedChild(Child):
             for line in lines:
                 message = json.loads(line)
                 self.pid = message.get("pid", self.pid)
+                self.run_pid = message.get("run", self.run_pid)
                 self._exit = message.get("exit", self._exit)
                 self.lost = message.get("refused", self.lost)
         return self._exit
@@ -108,11 +111,11 @@ class ForkedChild(Child):
 
 
 class FreshChild(Child):
-    """A child in an interpreter of its own; on Linux below a keeper, see `child.keep`."""
+    """A child in an interpreter of its own; on Linux below a keeper, see `keeper`."""
 
     def __init__(self) -> None:
         ours, theirs = Pipe()
-        command = [sys.executable, "-m", "dynslam_bench.runs.process.child", str(theirs.fileno())]
+        command = [sys.executable, "-m", "dynslam_bench.runs.process.keeper", str(theirs.fileno())]
         try:
             self._process = subprocess.Popen(
                 command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=child_environment()

@@ -23,7 +23,6 @@ import socket
 import subprocess
 import sys
 import threading
-from multiprocessing.connection import Connection
 from typing import NoReturn
 
 from dynslam_bench.core.errors import InfrastructureError
@@ -35,7 +34,7 @@ PRELOADED = (
     *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
     *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.build_flow"),
-    *("dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.child"),
+    *("dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.keeper"),
 )
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
@@ -51,7 +50,7 @@ class ForkServer:
         self._owner = 0
 
     def spawn(self, child_fd: int) -> int:
-        """Fork a child that runs `child.main` on a connection.
+        """Fork a child that makes a run over a connection, see `keeper`.
 
         Args:
             child_fd: The child's end of its connection; the caller closes it afterwards.
@@ -193,10 +192,10 @@ class _Server:
             return True
         if pid == 0:
             self.selector.close()
-            for inherited in (self.wake_read, self.wake_write, status_fd, *self.runs.values()):
+            for inherited in (self.wake_read, self.wake_write, *self.runs.values()):
                 os.close(inherited)
             self.control.close()
-            _become_child(connection_fd)
+            _become_keeper(connection_fd, status_fd)
         os.close(connection_fd)
         _tell(status_fd, {"pid": pid})
         self.runs[pid] = status_fd
@@ -223,18 +222,22 @@ def _tell(fd: int, message: dict[str, int] | dict[str, str]) -> None:
         os.write(fd, json.dumps(message).encode() + b"\n")
 
 
-def _become_child(connection_fd: int) -> NoReturn:
+def _become_keeper(connection_fd: int, status_fd: int) -> NoReturn:
     signal.set_wakeup_fd(-1)
     for number in (signal.SIGCHLD, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
+
+    def told(pid: int) -> None:
+        if pid:
+            _tell(status_fd, {"run": pid})
+        os.close(status_fd)
+
     code = 1
     try:
-        from .child import main
+        from .keeper import keep
 
-        code = main(Connection(connection_fd))
+        code = keep(connection_fd, told)
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
         os._exit(code)
 
 

@@ -212,7 +212,7 @@ class _Watch:
             return None
         self.next_look = now + _POLL_S
         self.tick()
-        used = memory_mb(self.child.pid) if self.child.pid else 0.0
+        used = memory_mb(pid) if (pid := self.child.run_pid or self.child.pid) else 0.0
         self.peak_mb = max(self.peak_mb, used)
         if self.memory_mb is not None and used > self.memory_mb:
             source = f" ({self.memory_source})" if self.memory_source else ""
