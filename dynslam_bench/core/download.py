@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import http.client
 import json
-import os
 import shutil
 import time
 import urllib.error
@@ -19,6 +17,7 @@ from typing import Any
 
 from .download_progress import Progress, Report, reporting
 from .errors import DownloadError
+from .locks import claimed
 
 __all__ = ["CHUNK", "Progress", "Report", "download", "file_sha256", "forget"]
 
@@ -62,23 +61,26 @@ def download(
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DownloadError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
-    with _only_one(part.with_name(part.name + ".lock"), url), reporting(target.name, progress) as report:
-        here = target if target.is_file() else part
-        if here is part:
-            _complete(url, part, report, attempts, wait_s, timeout_s)
-        found = file_sha256(here, report)
-        if sha256 is not None and not found.startswith(sha256):
-            size = here.stat().st_size
-            here.unlink()
-            forget(part)
-            raise DownloadError(
-                f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
-                "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
-            )
-        if here is part:
-            part.replace(target)
-            forget(part)
-        return found
+    try:
+        with _only_one(part.with_name(part.name + ".lock"), url), reporting(target.name, progress) as report:
+            here = target if target.is_file() else part
+            if here is part:
+                _complete(url, part, report, attempts, wait_s, timeout_s)
+            found = file_sha256(here, report)
+            if sha256 is not None and not found.startswith(sha256):
+                size = here.stat().st_size
+                here.unlink()
+                forget(part)
+                raise DownloadError(
+                    f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
+                    "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
+                )
+            if here is part:
+                part.replace(target)
+            forget(part)  # also what a process left that was killed between these two lines
+            return found
+    except OSError as error:
+        raise DownloadError(f"cannot write {target}: {error.strerror}", "make room, or name another folder") from error
 
 
 def forget(part: Path) -> None:
@@ -198,18 +200,10 @@ def _check_space(part: Path, total: int | None, start: int) -> None:
 
 @contextlib.contextmanager
 def _only_one(lock: Path, url: str) -> Iterator[None]:
-    """Hold a lock that the system releases when the process dies."""
-    with lock.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise DownloadError(f"another process is downloading {url}", "wait for it") from error
-        if not lock.exists() or lock.stat().st_ino != os.fstat(file.fileno()).st_ino:
-            raise DownloadError(f"another process has just downloaded {url}", "run the same command again")
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
+    with claimed(lock) as mine:
+        if not mine:
+            raise DownloadError(f"another process is downloading {url}", "wait for it, then run the same command again")
+        yield
 
 
 def _continues(content_range: str | None, start: int) -> bool:
