@@ -39,10 +39,9 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
     finally:
+        with contextlib.suppress(OSError):  # it has become `path`, or the disk takes nothing more
+            temporary.unlink()
         os.close(lock)
 
 

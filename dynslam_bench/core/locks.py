@@ -6,6 +6,7 @@ that share the file system see it, where that knows locks.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 from collections.abc import Iterator
@@ -38,7 +39,8 @@ def claimed(path: Path) -> Iterator[bool]:
             yield mine
         finally:
             if mine:  # while it is locked, so that nobody locks a file that goes away unseen
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # it is harmless if it stays
+                    path.unlink()
     finally:
         os.close(handle)
 

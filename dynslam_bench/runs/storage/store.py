@@ -84,6 +84,7 @@ class RunStore:
             for left in self.runs.glob(".*.claim"):
                 with claimed(left):  # held by nobody else, it goes
                     pass
+            self._unlink_dangling()
 
     @contextmanager
     def work_folder(self, run_id: str) -> Iterator[Path]:
@@ -155,9 +156,7 @@ class RunStore:
                 self.folder(run_id).rename(gone / run_id)
         except OSError as error:
             raise RunError(f"cannot remove run {run_id}: {error.strerror}") from error
-        latest = self.root / "latest"
-        if latest.is_symlink() and not latest.exists():
-            latest.unlink()
+        self._unlink_dangling()
 
     # -- reading ---------------------------------------------------------------------------------------------------
 
@@ -289,3 +288,8 @@ class RunStore:
             fresh = work / link.name
             fresh.symlink_to(target.relative_to(self.root))
             fresh.replace(link)
+
+    def _unlink_dangling(self) -> None:
+        latest = self.root / "latest"
+        if latest.is_symlink() and not latest.exists():
+            latest.unlink(missing_ok=True)
