@@ -11,6 +11,7 @@ import optuna
 
 from dynslam_bench.core.errors import StudyError
 
+from . import cmaes_state
 from .emfoa_sampler import EmfoaSampler
 from .study_file import StudySpec
 
@@ -48,6 +49,7 @@ def build_sampler(spec: StudySpec) -> optuna.samplers.BaseSampler:
     if spec.sampler == "cmaes":
         if find_spec("cmaes") is None:
             raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
+        cmaes_state.restrict()
         return optuna.samplers.CmaEsSampler(seed=spec.sampler_seed, n_startup_trials=_STARTUP_TRIALS)
     return EmfoaSampler(seed=spec.sampler_seed, n_trials=spec.trials)
 

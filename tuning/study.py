@@ -21,6 +21,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 import dynslam_bench
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.harmless import storable
+from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import apply_overrides, flatten
@@ -33,6 +35,7 @@ from .samplers import build_pruner, build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
 from .splits import check_splits
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
+from .storage_address import without_password
 from .stored_identity import as_stored, difference, same
 from .study_file import StudySpec
 
@@ -308,13 +311,14 @@ class Tuner:
                 load_if_exists=True,
             )  # fmt: skip
         except Exception as error:  # storages raise their drivers' errors
-            raise StudyError(f"cannot open study '{self.spec.name}': {error}") from error
+            said = without_password(f"cannot open study '{self.spec.name}': {error}", self.spec.storage)
+            raise StudyError(said) from None
         identity = self._identity()
         stored = study.user_attrs.get("identity")
         if stored is None:
             study.set_user_attr("identity", identity)
-            study.set_user_attr("spec", self.spec.model_dump(mode="json"))
-            study.set_user_attr("command", list(sys.argv))
+            study.set_user_attr("spec", self.spec.for_others())
+            study.set_user_attr("command", [without_passwords(word) for word in storable(sys.argv)])
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
                 study.set_metric_names(list(self.spec.objectives))
@@ -324,7 +328,7 @@ class Tuner:
                 f"give the study another name, or delete {self.folder}",
             )
         if not self.spec.storage:
-            write_atomic(self.folder / "study.json", json.dumps(self.spec.model_dump(mode="json"), indent=2) + "\n")
+            write_atomic(self.folder / "study.json", json.dumps(self.spec.for_others(), indent=2) + "\n")
         return study
 
     def _identity(self) -> dict[str, Any]:

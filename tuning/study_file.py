@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
+from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.toml import read_toml
 from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
 PrunerName = Literal["none", "median", "hyperband", "wilcoxon"]
@@ -67,7 +63,8 @@ class StudySpec(_Part):
         sampler_seed: Seed of the sampler.
         pruner: Who ends hopeless trials early; several objectives are ended early by dominance instead.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
-            ``postgresql://``, ``grpc://host:port``).
+            ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
+            ``~/.pgpass``): it is in no file that is written.
         protocol: Protocol of the errors; lost frames are always held at the last pose.
         cache: Whether trials use the stage cache.
         threads: Threads of a run.
@@ -117,6 +114,10 @@ class StudySpec(_Part):
         free = {"trials", "timeout_s", "top", "storage"}
         return digest(self.model_dump(mode="json", exclude=free))
 
+    def for_others(self) -> dict[str, Any]:
+        """The study as it is written down beside its trials: without the password of its storage."""
+        return self.model_dump(mode="json") | {"storage": without_passwords(self.storage)}
+
 
 def read_study(path: str | Path) -> StudySpec:
     """Read a study file.
@@ -125,13 +126,17 @@ def read_study(path: str | Path) -> StudySpec:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    try:
-        values = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise StudyError(f"cannot read the study {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path} is not TOML: {error}") from error
+    values = read_toml(path, kind=StudyError)
     values.setdefault("name", path.stem)
+    return make_study(values, path)
+
+
+def make_study(values: Any, path: Path) -> StudySpec:
+    """Validate what a study's file holds.
+
+    Raises:
+        StudyError: An unknown key (with a did-you-mean) or an unfit value, in one line.
+    """
     try:
         return StudySpec.model_validate(values)
     except ValidationError as error:

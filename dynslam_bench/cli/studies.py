@@ -113,6 +113,7 @@ def best(
 ) -> None:
     """Write the best settings as a preset that `run --settings` takes."""
     from dynslam_bench.core.errors import StudyError
+    from dynslam_bench.core.reading import read_text
     from dynslam_bench.core.records import write_atomic
     from dynslam_bench.tuning import Tuner, read_study
     from dynslam_bench.tuning.final_runs import best_trials
@@ -122,7 +123,7 @@ def best(
     spec = read_study(study)
     chosen = study_folder(results, spec) / "best.toml"
     if chosen.is_file():
-        text = chosen.read_text()
+        text = read_text(chosen, kind=StudyError)
     else:
         tuner = Tuner(spec, results, reading=True)
         found = best_trials(tuner.study, 1)

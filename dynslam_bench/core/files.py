@@ -1,4 +1,7 @@
-"""Files and folders written under another name, then renamed: no half of one is ever seen under its own name."""
+"""Files and folders written under another name, then renamed: no half of one is ever seen under its own name.
+
+What is written has the permissions that the user's umask gives.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,7 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     """
     try:
         with replacing(path) as temporary:
-            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+            temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
     except OSError as error:
         reason = f"cannot write {path}: {error.strerror}"
         raise DynslamError(reason, "check the permissions and the free space") from error
@@ -154,11 +157,13 @@ def temporary_folder(target: Path) -> Iterator[Path]:
 def atomic_folder(target: Path) -> Iterator[Path]:
     """A temporary folder beside `target` that becomes `target` when the block ends without an error.
 
-    An existing target is replaced. If the block raises, or the process dies, `target` is as it was.
+    An existing target is replaced. If the block raises, or the process dies, `target` is as it was; what a killed
+    process left is swept up by the next one.
 
     Raises:
         DynslamError: The parent folder cannot be written, or was removed meanwhile.
     """
+    sweep_temporary(target.parent)
     with temporary_folder(target) as work:
         yield work
         try:

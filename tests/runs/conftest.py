@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-for room in ("envs", "core"):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / room))
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / room) for room in ("envs", "core")]
 
 from envs_toys import write_folder
 

@@ -25,6 +25,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.core.plugin_probe import ISOLATED_VARIABLE
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.temporary import TemporaryFolder
 
@@ -115,7 +116,8 @@ def _redirect(log: Path) -> None:
 
 
 def _prepare(job: dict[str, Any]) -> None:
-    os.environ.update({name: text for name, text in job["environment"].items() if name != "TMPDIR"})
+    wanted = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
+    os.environ.update(wanted | {ISOLATED_VARIABLE: "1"})
     with contextlib.suppress(OSError):
         os.chdir(job["working_folder"])
     sys.path[:] = job["path"]

@@ -21,13 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.reading import parse_json
 
 _SET_PARENT_DEATH_SIGNAL = 1
 LOGGER = logging.getLogger(__name__)
 """Told, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
 
 LONGEST_LINE = 1 << 26
-"""Bytes of a line that a program may write: a trajectory of half a million poses."""
+"""Bytes of the longest line that is taken from a program: a final trajectory of half a million poses."""
 
 
 class Program:
@@ -119,16 +120,14 @@ class Program:
         line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
         text = self._exchange(line, timeout_s, doing)
         try:
-            answer = json.loads(text)
-        except ValueError as error:
+            answer = parse_answer(text)
+        except TrackerError as error:
             self.kill()
-            raise TrackerError(
-                f"{self.name} {doing}: answered no JSON: '{text[:80]}': {error}", "one JSON object a line"
-            ) from None
+            raise TrackerError(f"{self.name} {doing}: {error.args[0]}", "one JSON object a line") from None
         if answer.get("error"):
             raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
         self._refuse_surplus(doing)
-        return dict(answer)
+        return answer
 
     def _refuse_surplus(self, doing: str) -> None:
         """An answer that nobody asked for would be taken for the next one's: a pose of the wrong frame."""
@@ -196,10 +195,10 @@ class Program:
             if not data:
                 self._selector.unregister(key.fileobj)
             *lines, rest = (self._partial[channel] + data).split(b"\n")
+            self._partial[channel] = rest
             if len(rest) > LONGEST_LINE:
                 self.kill()
-                raise TrackerError(f"{self.name}: wrote a line of more than {LONGEST_LINE / 1e6:.0f} MB, killed")
-            self._partial[channel] = rest
+                raise TrackerError(f"{self.name}: wrote a line of more than {LONGEST_LINE >> 20} MB, killed")
             for raw in lines:
                 text = raw.decode(errors="replace")
                 if channel == "out" and text.lstrip().startswith("{"):
@@ -227,6 +226,18 @@ class Program:
         self.kill()
         said = f"; its last line: '{words}'" if words else "; it wrote no message"
         return TrackerError(f"{self.name} {doing}: the program {_describe(code)}{said}")
+
+
+def parse_answer(text: str) -> dict[str, Any]:
+    """A program's answer.
+
+    Raises:
+        TrackerError: It is no JSON object; the name of the program is still to be added.
+    """
+    answer = parse_json(text, f"its answer '{text[:80]}'", kind=TrackerError)
+    if not isinstance(answer, dict):
+        raise TrackerError(f"its answer '{text[:80]}' is no JSON object")
+    return answer
 
 
 class _Said:
