@@ -94,7 +94,7 @@ def build_report(
     sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
-    sections.add_failures(draft, board, output)
+    sections.add_failures(draft, board)
     sections.add_provenance(draft, board, again)
     data = ReportData(
         title=title,

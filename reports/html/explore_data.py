@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..figures.style import COLOURS, significant
 from ..model.board import Board
-from ..model.row import RunRow
+from ..model.row import SEEN, RunRow
 from ..tables.leaderboard import middle, rank_cell, timed
 
 Array = NDArray[np.float64]
@@ -83,6 +83,7 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
     for row in sorted(board.rows, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
         values = [significant(_value(row, metric), 5) for metric in metrics]
         flags = (row.run_id in kept) + 2 * (row.run_id in pictured) + 4 * (not row.rotation_reliable)
+        flags += 8 * (row.seen_in_training and not board.rank_seen)
         five = sums.quartiles.get(row.run_id)
         where = [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat]
         runs.append([*where, row.ending, flags, values, five or []])
@@ -91,6 +92,7 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
         tags.setdefault(board.sequence(row), set()).update(row.tags)
     return {
         "protocol": protocol.describe(),
+        "seen": SEEN,
         "reference": None if board.reference is None else place[board.reference],
         "referenceName": board.reference_name,
         "metrics": metrics,
