@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
+from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.records import Record, digest
-from dynslam_bench.sequences.catalogue import entry_of
-from dynslam_bench.sequences.synthetic import parse_synthetic_id
+
+from .blocks import Block, parse_blocks
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -19,7 +19,7 @@ else:
     import tomli as tomllib
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
-PrunerName = Literal["none", "median", "hyperband", "wilcoxon"]
+RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
 ObjectiveName = Literal["accuracy", "speed"]
 Offset = Annotated[int, Field(ge=0)]
 
@@ -48,24 +48,28 @@ class StudySpec(_Part):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        tune: Sequences that trials run on.
-        held_out: Sequences that decide at the end whether tuning helped; no trial sees them.
+        tune: Blocks that trials run on, see `blocks.parse_blocks`: ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
+        confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
+            for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
+        held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.
+        recorded: Blocks of recordings that the choice must not be worse on; None for the first frames of a held-out
+            recording where one is present.
         space: Which settings are tuned.
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
             other split; every table of the study then says so.
-        objectives: ``accuracy``: geometric mean over sequences and repeats of the ATE ratio to the default settings
-            (its logarithm is minimised); ``speed``: real-time factor (maximised).
+        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
+            minimised, see `statistics.by_scene`); ``speed``: real-time factor (maximised).
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
-        seeds: Seeds that every configuration runs with (common random numbers). A seed changes nothing for a tracker
-            that draws nothing from it.
-        offsets: Start offsets that every configuration runs with: so many leading frames are left out.
+        seeds: Seeds of the blocks that name none. A seed changes nothing for a tracker that draws nothing from it.
+        offsets: Start offsets of the blocks that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the default settings) included.
         timeout_s: No trial begins after this many seconds; None for no limit.
-        top: How many of the best configurations are run again with fresh repeats.
+        top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
-        pruner: Who ends hopeless trials early; several objectives are ended early by dominance instead.
+        race: How trials drop out: by sequential ``halving`` over growing sets of blocks, by successive ``rejection``
+            after every block, by ``wilcoxon``'s test against the best one, or ``none``.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``).
         protocol: Protocol of the errors; lost frames are always held at the last pose.
@@ -77,7 +81,9 @@ class StudySpec(_Part):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     tracker: str = "emfoa-oft"
     tune: tuple[str, ...] = Field(min_length=1)
+    confirm: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
+    recorded: tuple[str, ...] | None = None
     allow_overlap: bool = False
     space: SpaceSpec = SpaceSpec()
     objectives: tuple[ObjectiveName, ...] = Field(default=("accuracy",), min_length=1)
@@ -90,7 +96,7 @@ class StudySpec(_Part):
     top: int = Field(default=3, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
-    pruner: PrunerName = "median"
+    race: RaceName = "halving"
     storage: str = ""
     protocol: str = "tum-rgbd/v1"
     cache: bool = True
@@ -99,18 +105,27 @@ class StudySpec(_Part):
 
     @model_validator(mode="after")
     def _splits_are_apart(self) -> StudySpec:
-        for name, values in (("tune", self.tune), ("held_out", self.held_out), ("seeds", self.seeds),
-                             ("offsets", self.offsets), ("objectives", self.objectives)):  # fmt: skip
+        for name in ("tune", "confirm", "held_out", "recorded", "seeds", "offsets", "objectives"):
+            values = getattr(self, name) or ()
             twice = sorted({str(value) for value in values if list(values).count(value) > 1})
             if twice:
                 raise ValueError(f"{name} names '{twice[0]}' twice")
-        held_out = {_identity(name): name for name in reversed(self.held_out)}
-        both = [(name, held_out[_identity(name)]) for name in self.tune if _identity(name) in held_out]
+        judged = {block.scene: text for text in reversed(self.held_out) for block in self.blocks(text)}
+        both = {block.scene: text for text in (*self.tune, *self.confirm) for block in self.blocks(text)
+                if block.scene in judged}  # fmt: skip
         if both and not self.allow_overlap:
-            one, other = both[0]
-            spelled = "" if one == other else f", held out as '{other}'"
+            scene, one = next(iter(both.items()))
+            spelled = "" if one == judged[scene] else f", held out as '{judged[scene]}'"
             raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{one}'{spelled}")
         return self
+
+    def blocks(self, *texts: str) -> list[Block]:
+        """The blocks that texts of this study name.
+
+        Raises:
+            StudyError: One cannot be read.
+        """
+        return [block for text in texts for block in parse_blocks(text, offsets=self.offsets, seeds=self.seeds)]
 
     def digest(self) -> str:
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
@@ -143,17 +158,3 @@ def read_study(path: str | Path) -> StudySpec:
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{path}: {where + ': ' if where else ''}{text}") from None
 
-
-def _identity(name: str) -> str:
-    """What a name stands for, as far as the name alone tells (see `splits.check_splits` for the content).
-
-    The frames that are taken of a sequence, and the draw of its noise, make no other sequence.
-    """
-    if name.startswith("synthetic/"):
-        try:
-            parsed = parse_synthetic_id(name)
-        except SequenceError:
-            return name  # refused with a did-you-mean where it is opened
-        return f"{parsed.name}@{parsed.instance}"
-    entry = entry_of(name)
-    return entry.id if entry is not None else str(Path(name).expanduser().resolve())
