@@ -28,6 +28,8 @@ class Outcome:
         ate_m: ATE RMSE in metres, lost frames held at the last pose.
         coverage: Share of frames that were tracked.
         frame_s: Mean seconds a frame, segmentation included.
+        processor_s: Mean processor seconds of that, all threads together; `frame_s` where the work is done elsewhere (a
+            foreign program, a GPU). Unlike `frame_s` it hardly depends on what else the machine does.
         rtf: Real-time factor: duration of the block's frames over the time they took.
     """
 
@@ -36,7 +38,12 @@ class Outcome:
     ate_m: float
     coverage: float
     frame_s: float
+    processor_s: float
     rtf: float
+
+
+FOREIGN = "transfer"
+"""Stage that only trackers in another program have."""
 
 
 class BlockFailedError(StudyError):
@@ -114,7 +121,14 @@ def outcome(store: RunStore, record: RunRecord, block: Block, protocol: Protocol
     ate = never_moved_m(block, data_root) if evaluation is None else float(evaluation.metrics["ate_rmse_m"])
     total = record.timings["total"].mean_s
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
-    return Outcome(block, record.run_id, ate, record.coverage, total, period / total)
+    return Outcome(block, record.run_id, ate, record.coverage, total, processor_seconds(record), period / total)
+
+
+def processor_seconds(record: RunRecord) -> float:
+    """Mean processor seconds a frame of a run; its frame time where the work is not that of its own process."""
+    own = record.timings.get("processor")
+    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
+    return record.timings["total"].mean_s if own is None or elsewhere else own.mean_s
 
 
 def held_protocol(protocol: Protocol | str) -> Protocol:
