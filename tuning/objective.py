@@ -1,18 +1,14 @@
-"""What the outcomes of a configuration amount to: the objectives' values and the constraints."""
+"""What the outcomes of a configuration amount to beside its objectives: means, and the constraints."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from .blocks import Block
-from .evaluate import Outcome
-from .statistics import by_scene, centre
+from .objectives import ACCURACY, Outcomes
 from .study_file import StudySpec
-
-Outcomes = Mapping[Block, Outcome]
 
 
 def errors(outcomes: Outcomes) -> dict[Block, float]:
@@ -35,23 +31,20 @@ def real_time_factor(outcomes: Outcomes) -> float:
     return float(np.exp(np.mean([math.log(outcome.rtf) for outcome in outcomes.values()])))
 
 
-def objective_values(objectives: Iterable[str], outcomes: Outcomes, default: Outcomes) -> list[float]:
-    """The objectives' values, in their order.
+def violations(spec: StudySpec, outcomes: Outcomes, default: Outcomes | None = None) -> dict[str, float]:
+    """How far each constraint is violated, relatively; <= 0 is fulfilled.
 
     Args:
-        objectives: ``accuracy`` or ``speed``, see `StudySpec`.
-        outcomes: Of a configuration, on some blocks.
-        default: Of the default settings, at every place of those.
+        spec: The study. One without an objective of error must not pay for its gain with accuracy: its ATE ratio has to
+            stay below 1 + `StudySpec.ate_margin`.
+        outcomes: Of a configuration.
+        default: Of the default settings at the same places, for that ratio; None to leave it out.
     """
-    accuracy = centre(by_scene(errors(outcomes), errors(default)).values())
-    return [accuracy if objective == "accuracy" else real_time_factor(outcomes) for objective in objectives]
-
-
-def violations(spec: StudySpec, outcomes: Outcomes) -> dict[str, float]:
-    """How far each constraint is violated, relatively; <= 0 is fulfilled."""
     found = {}
     if spec.min_coverage is not None:
         found["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
         found["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
+    if default is not None and spec.at_equal_accuracy:
+        found["ate"] = ACCURACY.value(outcomes, default) - math.log1p(spec.ate_margin)
     return found

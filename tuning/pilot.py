@@ -1,8 +1,8 @@
 """Before a study: what its blocks could show at all, and what it would take to show more.
 
-How far two configurations differ on one block is mostly chaos: the same setting, begun a frame later, comes out otherwise.
-The pilot measures that spread with a few changed settings, and works out the smallest effect that the study could tell
-from nothing (one-sided 2.5 %, with 80 % of the studies finding it).
+How far two configurations differ on one block is mostly chaos: the same settings, begun a frame later, come out
+otherwise. The pilot measures that spread with a few changed settings, and works out the smallest effect that the study
+could tell from nothing (one-sided 2.5 %, with 80 % of the studies finding it).
 """
 
 from __future__ import annotations
@@ -171,9 +171,7 @@ def judge_pilot(
     for effect in EFFECTS:
         needed = scenes_needed(effect, within, between, starts)
         blocks = math.ceil(needed * starts)
-        needs.append(
-            Need(effect=effect, scenes=needed, blocks=blocks, minutes=math.ceil(blocks / jobs) * run_s / 60)
-        )
+        needs.append(Need(effect=effect, scenes=needed, blocks=blocks, minutes=math.ceil(blocks / jobs) * run_s / 60))
     return Pilot(
         objective=objective.what, configurations=len(pairs), scenes=len(judged), starts=round(starts, 2), within=within,
         between=between, run_s=run_s, detectable=detectable(within, between, len(judged), starts), needs=needs,

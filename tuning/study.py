@@ -30,7 +30,8 @@ from . import race
 from .blocks import Block
 from .design import design_of
 from .evaluate import BlockFailedError, CancelledError, Outcome, evaluate
-from .objective import coverage, errors, fps, objective_values, real_time_factor, violations
+from .objective import coverage, errors, fps, real_time_factor, violations
+from .objectives import Objective, Outcomes, find_objective
 from .samplers import build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
@@ -71,13 +72,23 @@ class Tuner:
         spec: The study.
         results: The results folder.
         reading: Only look at a stored study: one of another version of the code opens too, but runs nothing more.
+        objectives: In place of those that the study names, in their order.
+        sampler: In place of the one that the study names.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
             study's name; nothing has run then. With `reading` also when nothing is stored.
     """
 
-    def __init__(self, spec: StudySpec, results: str | Path = "results", *, reading: bool = False) -> None:
+    def __init__(
+        self,
+        spec: StudySpec,
+        results: str | Path = "results",
+        *,
+        reading: bool = False,
+        objectives: Sequence[Objective] | None = None,
+        sampler: optuna.samplers.BaseSampler | None = None,
+    ) -> None:
         self.spec = spec = as_stored(spec, study_folder(Path(results), spec) / "study.json") if reading else spec
         self.results = Path(results)
         self.reading = reading
@@ -88,7 +99,8 @@ class Tuner:
         if spec.race == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
                              "use halving, rejection or none")  # fmt: skip
-        sampler = build_sampler(spec)
+        self.objectives = [find_objective(each) for each in spec.objectives] if objectives is None else list(objectives)
+        sampler = build_sampler(spec) if sampler is None else sampler
         self.design = design_of(spec, accept=reading)
         self.steps = race.steps(spec.race, len(self.design.race))
         self.store = RunStore(self.results)
@@ -183,7 +195,7 @@ class Tuner:
         try:
             for position, step in enumerate(self.steps):
                 outcomes |= self.evaluate(settings, self.design.race[len(outcomes) : step])
-                result = objective_values(self.spec.objectives, outcomes, self._reference)
+                result = self.values(outcomes)
                 self._record(trial, outcomes)
                 if step < self.steps[-1]:
                     race.note(trial, step, result)
@@ -199,7 +211,16 @@ class Tuner:
             return TrialState.FAIL, None, f"failed: {error}"
         finally:
             trial.set_user_attr("wall_s", round(time.perf_counter() - started, 3))
-        return TrialState.COMPLETE, result, _describe(result, self.spec, outcomes)
+        return TrialState.COMPLETE, result, self._describe(result, outcomes)
+
+    def values(self, outcomes: Outcomes) -> list[float]:
+        """The objectives' values: natural logarithms of ratios to the default settings, less is better."""
+        return [each.value(outcomes, self._reference) for each in self.objectives]
+
+    def _describe(self, result: list[float], outcomes: Outcomes) -> str:
+        parts = [f"{each.what} x {math.exp(value):.3f}" for each, value in zip(self.objectives, result, strict=True)]
+        violated = [name for name, value in violations(self.spec, outcomes, self._reference).items() if value > 0]
+        return ", ".join(parts) + (f", violates {' and '.join(violated)}" if violated else "")
 
     def _drops(self, number: int, position: int, outcomes: Mapping[Block, Outcome]) -> bool:
         """Whether a trial leaves the race at a step."""
@@ -210,7 +231,7 @@ class Tuner:
         return race.leaves(trials, number, self.steps, position, self.study.directions)
 
     def _record(self, trial: optuna.Trial, outcomes: Mapping[Block, Outcome]) -> None:
-        set_constraints(trial, violations(self.spec, outcomes))
+        set_constraints(trial, violations(self.spec, outcomes, self._reference))
         trial.set_user_attr("coverage", coverage(outcomes))
         trial.set_user_attr("fps", fps(outcomes))
         trial.set_user_attr("rtf", real_time_factor(outcomes))
@@ -240,16 +261,13 @@ class Tuner:
             raise StudyError(absent, "dynslam-bench tune run STUDY.toml")
         storage = open_storage(self.results, self.spec)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        directions: list[Literal["minimize", "maximize"]] = [
-            "minimize" if objective == "accuracy" else "maximize" for objective in self.spec.objectives
-        ]
         how: dict[str, Any] = {"storage": storage, "study_name": name, "sampler": sampler}
         how["pruner"] = optuna.pruners.NopPruner()
         try:
             if self.reading:
                 study = optuna.load_study(**how)
             else:
-                study = optuna.create_study(directions=directions, **how)
+                study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
                 self._begin(study)
         except optuna.exceptions.DuplicatedStudyError:
             study = optuna.load_study(**how)
@@ -259,7 +277,9 @@ class Tuner:
             raise StudyError(f"cannot open study '{name}': {error}") from error
         stored, identity = _identity_of(study), self._identity()
         if stored is None:
-            raise StudyError(f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name")
+            raise StudyError(
+                f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name"
+            )
         if not same(stored, identity, but=CODE if self.reading else ()):
             raise StudyError(
                 f"study '{name}' is stored with other {difference(stored, identity)}",
@@ -322,14 +342,6 @@ def _identity_of(study: optuna.Study, wait_s: float = 10.0) -> dict[str, Any] | 
     while (found := study.user_attrs.get("identity")) is None and time.monotonic() < deadline:
         time.sleep(0.05)
     return None if found is None else dict(found)
-
-
-def _describe(result: list[float], spec: StudySpec, outcomes: Mapping[Block, Outcome]) -> str:
-    parts = []
-    for objective, value in zip(spec.objectives, result, strict=True):
-        parts.append(f"ATE x {math.exp(value):.3f}" if objective == "accuracy" else f"{value:.2f} x real time")
-    violated = [name for name, value in violations(spec, outcomes).items() if value > 0]
-    return ", ".join(parts) + (f", violates {' and '.join(violated)}" if violated else "")
 
 
 def _tell(

@@ -20,7 +20,8 @@ else:
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
 RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
-ObjectiveName = Literal["accuracy", "speed"]
+EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
+"""Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
 
 
@@ -58,7 +59,11 @@ class StudySpec(_Part):
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
             other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
-            minimised, see `statistics.by_scene`); ``speed``: real-time factor (maximised).
+            minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in the
+            worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost frames.
+        ate_margin: What a study without ``accuracy``, ``worst`` or ``robustness`` may lose of accuracy, as a share: the
+            upper bound of its ATE ratio must lie below 1 + this.
+        pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
         seeds: Seeds of the blocks that name none. A seed changes nothing for a tracker that draws nothing from it.
@@ -86,7 +91,9 @@ class StudySpec(_Part):
     recorded: tuple[str, ...] | None = None
     allow_overlap: bool = False
     space: SpaceSpec = SpaceSpec()
-    objectives: tuple[ObjectiveName, ...] = Field(default=("accuracy",), min_length=1)
+    objectives: tuple[str, ...] = Field(default=("accuracy",), min_length=1)
+    ate_margin: float = Field(default=0.05, gt=0, le=1)
+    pilot: bool = True
     min_coverage: float | None = Field(default=0.95, ge=0, le=1)
     min_fps: float | None = Field(default=None, gt=0)
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
@@ -127,6 +134,11 @@ class StudySpec(_Part):
         """
         return [block for text in texts for block in parse_blocks(text, offsets=self.offsets, seeds=self.seeds)]
 
+    @property
+    def at_equal_accuracy(self) -> bool:
+        """Whether a gain counts only at (nearly) the default's accuracy, as no objective holds the error."""
+        return not set(self.objectives) & set(EQUALLY_ACCURATE)
+
     def digest(self) -> str:
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
         free = {"trials", "timeout_s", "top", "storage"}
@@ -157,4 +169,3 @@ def read_study(path: str | Path) -> StudySpec:
             raise StudyError(f"{path}: unknown key '{where}'", did_you_mean(where, known)) from None
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{path}: {where + ': ' if where else ''}{text}") from None
-
