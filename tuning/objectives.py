@@ -75,9 +75,7 @@ OBJECTIVES = {
     for each in (
         Objective("accuracy", "ATE", lambda run: run.ate_m),
         Objective("speed", "processor time", lambda run: run.processor_s),
-        Objective(
-            "worst", "ATE in the worst quarter of the scenes", lambda run: run.ate_m, worst=True
-        ),
+        Objective("worst", "ATE in the worst quarter of the scenes", lambda run: run.ate_m, worst=True),
         Objective("robustness", "ATE on degraded blocks", lambda run: run.ate_m, degraded=True),
         Objective("coverage", "share of lost frames", lambda run: 1 - run.coverage + _LOST_FLOOR),
     )

@@ -8,7 +8,8 @@ could tell from nothing (one-sided 2.5 %, with 80 % of the studies finding it).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,12 @@ from scipy import stats
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.records import Record
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.core.settings import Parameter, Scalar
 
 from .blocks import Block, scenes
 from .objectives import Objective, Outcomes
+from .screening_plan import live, stepped, toward
 
 EFFECTS = (0.05, 0.10, 0.20)
 """Gains, as shares, of which the pilot says what they would take."""
@@ -26,6 +30,9 @@ HOPELESS = 0.5
 """A study that could not even tell a gain of half is refused."""
 DOUBTFUL = 0.2
 """One that could not tell a gain of a fifth is warned about."""
+CONFIGURATIONS = 2
+"""Changed settings that a pilot tries."""
+PILOT_SCENES, PILOT_STARTS = 6, 3
 FEWEST = 3
 """Scenes that a spread can be told from."""
 _LEVEL, _POWER = 0.975, 0.8
@@ -188,6 +195,56 @@ def refuse_hopeless(pilot: Pilot) -> None:
         raise StudyError(f"this study could show nothing: {pilot.sentence}; {pilot.way_out}", "or pilot = false to try")
 
 
+def run_pilot(
+    space: Sequence[Parameter],
+    base: Mapping[str, Any],
+    run: Callable[[Mapping[str, Any], Sequence[Block]], Outcomes],
+    blocks: Sequence[Block],
+    objective: Objective,
+    *,
+    seed: int = 0,
+    jobs: int = 1,
+    split: Sequence[Block] | None = None,
+) -> Pilot:
+    """Run the default and a few changed settings, and judge what they say.
+
+    Args:
+        space: The study's settings.
+        base: Default value of every setting, dotted name to value.
+        run: Gives the outcomes of values of the space on blocks, `jobs` at a time.
+        blocks: What the study tunes on; `some_of` them are run.
+        objective: See `judge_pilot`, as `split` is.
+        seed: Of the changes.
+        jobs: Runs at a time.
+        split: Blocks that the study would judge on.
+
+    Raises:
+        StudyError: See `judge_pilot`.
+    """
+    chosen = some_of(blocks)
+    default = run({}, chosen)
+    began, changed = time.perf_counter(), []
+    for number in range(CONFIGURATIONS):
+        changed.append(run(small_change(space, base, stream(seed, "pilot", number)), chosen))
+    run_s = (time.perf_counter() - began) * jobs / (CONFIGURATIONS * len(chosen))
+    return judge_pilot(objective, default, changed, run_s=run_s, jobs=jobs, split=split)
+
+
+def some_of(blocks: Sequence[Block]) -> list[Block]:
+    """The first starts of the first scenes: `PILOT_STARTS` of `PILOT_SCENES` at most."""
+    groups = list(scenes(blocks).values())[:PILOT_SCENES]
+    return [block for group in groups for block in group[:PILOT_STARTS]]
+
+
+def small_change(space: Sequence[Parameter], base: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Scalar]:
+    """Settings near the default: numbers part of the way to drawn ones; choices too where there are no numbers."""
+    usable = live(space, base)
+    found = {each.name: toward(each, base[each.name], rng) for each in usable}
+    if all(found[each.name] == base[each.name] for each in usable):
+        found = {each.name: stepped(each, base[each.name], rng) for each in usable}
+    return found
+
+
 def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict[Block, float]:
     """Log ratio on each block that both ran."""
     return {
@@ -195,22 +252,3 @@ def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict
         for block, outcome in outcomes.items()
         if block in default
     }
-
-
-def small_changes(draw: Mapping[str, Any], default: Mapping[str, Any], share: float) -> dict[str, Any]:
-    """A configuration part of the way from the default to a drawn one.
-
-    Args:
-        draw: Drawn values, dotted name to value.
-        default: The default's values, at least of those names.
-        share: How far numbers go; what is no number is left as the default has it.
-    """
-    found: dict[str, Any] = {}
-    for name, value in draw.items():
-        base = default[name]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not isinstance(base, int | float):
-            found[name] = base
-        else:
-            moved = base + share * (value - base)
-            found[name] = round(moved) if isinstance(base, int) and isinstance(value, int) else float(moved)
-    return found

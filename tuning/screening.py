@@ -1,7 +1,7 @@
 """Which settings matter, before any study: one at a time from several points (Morris 1991), with chaos taken off.
 
-A run changes with every setting that changes anything at all, by chance. What a setting does *on average over blocks* is
-no chance: the effects of one step on several blocks are compared with their own scatter.
+A run changes with every setting that changes anything at all, by chance. What a setting does *on average over blocks*
+is no chance: the effects of one step on several blocks are compared with their own scatter.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,34 +16,15 @@ from scipy import stats
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.records import Record
-from dynslam_bench.core.seeding import stream
-from dynslam_bench.core.settings import Parameter, Scalar
+from dynslam_bench.core.settings import Scalar
 
 from .evaluate import BlockFailedError
 from .objectives import Objective, Outcomes
+from .screening_plan import Point
 
 KEPT = 8
 """So many settings at most are worth a study."""
-STEP = 1 / 3
-"""How far a setting is moved, as a share of its range (of its logarithm where its scale is that)."""
-NEARNESS = 0.3
-"""How far from the default the further points lie, as a share of the way to a drawn one: broken systems tell little."""
 FEWEST_BLOCKS = 2
-
-Values = dict[str, Scalar]
-
-
-@dataclass(frozen=True)
-class Point:
-    """Where effects are measured from, and the steps from there.
-
-    Attributes:
-        base: Values of all screened settings.
-        steps: Value of each setting after its step.
-    """
-
-    base: Values
-    steps: Values
 
 
 class Effect(Record):
@@ -55,7 +34,7 @@ class Effect(Record):
         name: The setting.
         objective: In what: see `Objective.what`.
         size: Root mean square over the points of the mean log ratio that a third of the range makes, free of chance.
-        low: Lower end of its 95 % interval over blocks (jackknife); above 0 where the setting matters.
+        low: Lower end of its 90 % interval over blocks (jackknife); above 0 where the setting matters.
         high: Upper end.
         dead: It changed nothing, to the last bit, at any point on any block.
     """
@@ -88,39 +67,6 @@ class Screening(Record):
     points: int
     blocks: int
     runs: int
-
-
-def plan(space: Sequence[Parameter], base: Mapping[str, Any], points: int, seed: int) -> list[Point]:
-    """The points: the default first, then others near it; a step of each setting from each.
-
-    Settings that another one switches off at the default are no part of it: see `live`.
-    """
-    found = []
-    for number in range(points):
-        rng = stream(seed, "screening", number)
-        start = {p.name: base[p.name] if number == 0 else _toward(p, base[p.name], rng) for p in space}
-        if number > 0:  # what switches others off stays as it is
-            start |= {name: base[name] for p in space for name, _ in p.when if name in start}
-        found.append(Point(start, {p.name: stepped(p, start[p.name], rng) for p in space}))
-    return found
-
-
-def live(space: Sequence[Parameter], base: Mapping[str, Any]) -> list[Parameter]:
-    """The settings whose conditions hold at the default."""
-    return [p for p in space if all(base.get(name) in allowed for name, allowed in p.when)]
-
-
-def stepped(parameter: Parameter, value: Scalar, rng: np.random.Generator) -> Scalar:
-    """Another value, `STEP` of the range away; up or down as there is room, at random where there is for both."""
-    if parameter.kind in ("bool", "categorical"):
-        others = [choice for choice in parameter.choices if choice != value]
-        return others[int(rng.integers(len(others)))] if others else value
-    unit = _unit(parameter, value)
-    signs = [sign for sign in (-1, 1) if 0 <= unit + sign * STEP <= 1]
-    moved = _value(parameter, unit + STEP * (signs[int(rng.integers(len(signs)))] if signs else 1))
-    if moved == value and parameter.kind == "int":  # a short range
-        moved = int(value) + (1 if value < parameter.high else -1)  # type: ignore[operator]
-    return moved
 
 
 def screen(
@@ -183,7 +129,7 @@ def screen(
 
 
 def size_of(effects: NDArray[np.float64]) -> tuple[float, float, float]:
-    """How large the mean effect over blocks is, and its 95 % interval.
+    """How large the mean effect over blocks is, and its 90 % interval.
 
     The square of a mean holds the variance of the mean besides; that is taken off, so that a setting that does nothing
     but stir the chaos has 0 on average.
@@ -206,9 +152,8 @@ def size_of(effects: NDArray[np.float64]) -> tuple[float, float, float]:
         half = math.inf if effects.any() else 0.0
     else:
         left_out = np.array([square(np.delete(effects, index, axis=1)) for index in range(blocks)])
-        half = stats.t.ppf(0.975, blocks - 1) * math.sqrt(
-            (blocks - 1) / blocks * ((left_out - left_out.mean()) ** 2).sum()
-        )
+        scatter = (blocks - 1) / blocks * float(((left_out - left_out.mean()) ** 2).sum())
+        half = float(stats.t.ppf(0.95, blocks - 1)) * math.sqrt(scatter)
     ends = [math.sqrt(max(0.0, value)) if math.isfinite(value) else math.inf for value in (whole - half, whole + half)]
     return math.sqrt(max(0.0, whole)), 0.0 if math.isinf(half) else ends[0], ends[1]
 
@@ -235,34 +180,3 @@ def _effect_of(
         effect = Effect(name=name, objective=objective.what, size=size, low=low, high=high, dead=dead)
         best = effect if best is None or (effect.low, effect.size) > (best.low, best.size) else best
     return best
-
-
-def _toward(parameter: Parameter, value: Scalar, rng: np.random.Generator) -> Scalar:
-    """Part of the way to a drawn value; switches and choices stay."""
-    if parameter.kind in ("bool", "categorical"):
-        return value
-    unit = _unit(parameter, value)
-    return _value(parameter, unit + NEARNESS * (float(rng.uniform()) - unit))
-
-
-def _unit(parameter: Parameter, value: Scalar) -> float:
-    """Where in its range a number lies, 0 to 1."""
-    low, high, x = _scaled(parameter, float(value))
-    return min(max((x - low) / (high - low), 0.0), 1.0)
-
-
-def _value(parameter: Parameter, unit: float) -> Scalar:
-    low, high, _ = _scaled(parameter, 1.0)
-    x = low + min(max(unit, 0.0), 1.0) * (high - low)
-    value = math.exp(x) if parameter.scale == "log" else x
-    assert parameter.low is not None and parameter.high is not None
-    value = min(max(value, parameter.low), parameter.high)
-    return round(value) if parameter.kind == "int" else value
-
-
-def _scaled(parameter: Parameter, value: float) -> tuple[float, float, float]:
-    """Ends of the range and a value, as logarithms where the scale is that."""
-    assert parameter.low is not None and parameter.high is not None
-    if parameter.scale == "log":
-        return math.log(parameter.low), math.log(parameter.high), math.log(max(value, parameter.low))
-    return float(parameter.low), float(parameter.high), value

@@ -301,7 +301,7 @@ class Tuner:
 
     def _identity(self) -> dict[str, Any]:
         """What must be the same when a study is resumed."""
-        spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage"})
+        spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
         if not self.spec.allow_overlap:
             del spec["allow_overlap"]  # as in studies of before it was there
         defaults = apply_overrides(self.tracker.settings(), self.spec.space.fixed)

@@ -59,8 +59,9 @@ class StudySpec(_Part):
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
             other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
-            minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in the
-            worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost frames.
+            minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
+            the worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost
+            frames.
         ate_margin: What a study without ``accuracy``, ``worst`` or ``robustness`` may lose of accuracy, as a share: the
             upper bound of its ATE ratio must lie below 1 + this.
         pilot: Whether a pilot runs first and refuses a study that could show nothing.
@@ -141,7 +142,7 @@ class StudySpec(_Part):
 
     def digest(self) -> str:
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
-        free = {"trials", "timeout_s", "top", "storage"}
+        free = {"trials", "timeout_s", "top", "storage", "pilot"}
         return digest(self.model_dump(mode="json", exclude=free))
 
 
