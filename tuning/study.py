@@ -94,7 +94,9 @@ class Tuner:
         self.reading = reading
         self.tracker = TRACKERS.get(spec.tracker)
         defaults = apply_overrides(self.tracker.settings(), spec.space.fixed)
-        self.space = search_space(self.tracker.settings, spec.space)
+        self.space = search_space(
+            self.tracker.settings, spec.space, {block.sequence for block in spec.blocks(*spec.tune)}
+        )
         self.base = flatten(defaults)
         if spec.race == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
