@@ -13,7 +13,7 @@ from dynslam_bench.core.errors import StudyError, did_you_mean
 
 from .blocks import Block
 from .evaluate import Outcome
-from .statistics import by_scene, centre
+from .statistics import by_scene, by_start, centre
 
 Outcomes = Mapping[Block, Outcome]
 Cost = Callable[[Outcome], float]
@@ -40,6 +40,11 @@ class Objective:
     cost: Cost
     worst: bool = False
     degraded: bool = False
+
+    def by_start(self, outcomes: Outcomes, default: Outcomes) -> list[float]:
+        """Natural logarithm of the ratio on each block that counts and that both ran."""
+        own = {block: self.cost(outcome) for block, outcome in outcomes.items() if self._counts(block)}
+        return by_start(own, {block: self.cost(outcome) for block, outcome in default.items()})
 
     def ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[str, float]:
         """Natural logarithm of the ratio to the default by scene; empty without any block that counts."""
@@ -75,7 +80,9 @@ OBJECTIVES = {
     for each in (
         Objective("accuracy", "ATE", lambda run: run.ate_m),
         Objective("speed", "processor time", lambda run: run.processor_s),
-        Objective("worst", f"ATE in the worst {100 * WORST_SHARE:.0f} % of the scenes", lambda run: run.ate_m, worst=True),
+        Objective(
+            "worst", f"ATE in the worst {100 * WORST_SHARE:.0f} % of the scenes", lambda run: run.ate_m, worst=True
+        ),
         Objective("robustness", "ATE on degraded blocks", lambda run: run.ate_m, degraded=True),
         Objective("coverage", "share of lost frames", lambda run: 1 - run.coverage + _LOST_FLOOR),
     )

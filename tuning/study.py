@@ -28,15 +28,16 @@ from dynslam_bench.trackers import TRACKERS
 
 from . import race
 from .blocks import Block
+from .constraints import coverage, fps, violations
 from .design import design_of
 from .evaluate import BlockFailedError, CancelledError, Outcome, evaluate
-from .objective import coverage, errors, fps, objective_values, real_time_factor, violations
+from .objectives import find_objective
 from .samplers import build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
 from .stored_identity import as_stored, difference, same
 from .study_file import StudySpec
-from .trials import best_trials, errors_of
+from .trials import best_trials, errors_in, errors_of
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
 CODE = ("version", "source")
@@ -88,6 +89,7 @@ class Tuner:
         if spec.race == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
                              "use halving, rejection or none")  # fmt: skip
+        self.objectives = [find_objective(name) for name in spec.objectives]
         sampler = build_sampler(spec)
         self.design = design_of(spec, accept=reading)
         self.steps = race.steps(spec.race, len(self.design.race))
@@ -183,7 +185,7 @@ class Tuner:
         try:
             for position, step in enumerate(self.steps):
                 outcomes |= self.evaluate(settings, self.design.race[len(outcomes) : step])
-                result = objective_values(self.spec.objectives, outcomes, self._reference)
+                result = [each.value(outcomes, self._reference) for each in self.objectives]
                 self._record(trial, outcomes)
                 if step < self.steps[-1]:
                     race.note(trial, step, result)
@@ -205,15 +207,14 @@ class Tuner:
         """Whether a trial leaves the race at a step."""
         if self.spec.race == "wilcoxon":
             best = best_trials(self.study, 1)
-            return bool(best) and race.is_worse(errors(outcomes), errors_of(best[0]))
+            return bool(best) and race.is_worse(errors_in(outcomes), errors_of(best[0]))
         trials = self.study.get_trials(deepcopy=False)
-        return race.leaves(trials, number, self.steps, position, self.study.directions)
+        return race.leaves(trials, number, self.steps, position)
 
     def _record(self, trial: optuna.Trial, outcomes: Mapping[Block, Outcome]) -> None:
         set_constraints(trial, violations(self.spec, outcomes))
         trial.set_user_attr("coverage", coverage(outcomes))
         trial.set_user_attr("fps", fps(outcomes))
-        trial.set_user_attr("rtf", real_time_factor(outcomes))
         rows = [[str(block), o.run_id, o.ate_m, o.coverage, o.frame_s] for block, o in outcomes.items()]
         trial.set_user_attr("blocks", rows)
 
@@ -240,16 +241,13 @@ class Tuner:
             raise StudyError(absent, "dynslam-bench tune run STUDY.toml")
         storage = open_storage(self.results, self.spec)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        directions: list[Literal["minimize", "maximize"]] = [
-            "minimize" if objective == "accuracy" else "maximize" for objective in self.spec.objectives
-        ]
         how: dict[str, Any] = {"storage": storage, "study_name": name, "sampler": sampler}
         how["pruner"] = optuna.pruners.NopPruner()
         try:
             if self.reading:
                 study = optuna.load_study(**how)
             else:
-                study = optuna.create_study(directions=directions, **how)
+                study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
                 self._begin(study)
         except optuna.exceptions.DuplicatedStudyError:
             study = optuna.load_study(**how)
@@ -259,7 +257,9 @@ class Tuner:
             raise StudyError(f"cannot open study '{name}': {error}") from error
         stored, identity = _identity_of(study), self._identity()
         if stored is None:
-            raise StudyError(f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name")
+            raise StudyError(
+                f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name"
+            )
         if not same(stored, identity, but=CODE if self.reading else ()):
             raise StudyError(
                 f"study '{name}' is stored with other {difference(stored, identity)}",
@@ -327,7 +327,7 @@ def _identity_of(study: optuna.Study, wait_s: float = 10.0) -> dict[str, Any] | 
 def _describe(result: list[float], spec: StudySpec, outcomes: Mapping[Block, Outcome]) -> str:
     parts = []
     for objective, value in zip(spec.objectives, result, strict=True):
-        parts.append(f"ATE x {math.exp(value):.3f}" if objective == "accuracy" else f"{value:.2f} x real time")
+        parts.append(f"{find_objective(objective).what} x {math.exp(value):.3f}")
     violated = [name for name, value in violations(spec, outcomes).items() if value > 0]
     return ", ".join(parts) + (f", violates {' and '.join(violated)}" if violated else "")
 

@@ -20,7 +20,7 @@ else:
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
 RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
-ObjectiveName = Literal["accuracy", "speed"]
+ObjectiveName = Literal["accuracy", "speed", "worst", "robustness", "coverage"]
 Offset = Annotated[int, Field(ge=0)]
 
 
@@ -48,7 +48,8 @@ class StudySpec(_Part):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        tune: Blocks that trials run on, see `blocks.parse_blocks`: ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
+        tune: Blocks that trials run on, written as `blocks.parse_blocks` reads them:
+            ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
         confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
             for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
         held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.
@@ -57,8 +58,7 @@ class StudySpec(_Part):
         space: Which settings are tuned.
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
             other split; every table of the study then says so.
-        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
-            minimised, see `statistics.by_scene`); ``speed``: real-time factor (maximised).
+        objectives: Names in `objectives.OBJECTIVES`; logarithms of ratios to the default settings, all minimised.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
         seeds: Seeds of the blocks that name none. A seed changes nothing for a tracker that draws nothing from it.
@@ -157,4 +157,3 @@ def read_study(path: str | Path) -> StudySpec:
             raise StudyError(f"{path}: unknown key '{where}'", did_you_mean(where, known)) from None
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{path}: {where + ': ' if where else ''}{text}") from None
-
