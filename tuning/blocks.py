@@ -223,7 +223,7 @@ def _numbers(text: str, whole: str) -> list[int]:
 
 
 def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
-    from dynslam_bench.envs.degrade_frames import Degradation
+    from dynslam_bench.envs import Degradation
 
     found: dict[str, float] = {}
     for piece in text.split(",") if text else ():

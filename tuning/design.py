@@ -10,7 +10,7 @@ from dynslam_bench.sequences.catalogue import catalogue, open_public
 
 from .blocks import Block, scenes
 from .race import running_order
-from .splits import check_splits
+from .splits import Split, check_splits
 from .statistics import place_of
 from .study_file import StudySpec
 
@@ -63,7 +63,7 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
     taken = {block.scene for block in (*race, *confirm, *held_out)}
     recorded = _recordings(spec, taken) if spec.recorded is None else spec.blocks(*spec.recorded)
     if spec.recorded:
-        apart = {"tune": [*race, *confirm], "held_out": recorded}
+        apart: dict[Split, list[Block]] = {"tune": [*race, *confirm], "held_out": recorded}
         notes += check_splits(spec.name, apart, data_root=spec.data_root, accept=accept or spec.allow_overlap)
     race = running_order(race, spec.sampler_seed)
     return Design(

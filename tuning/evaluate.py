@@ -142,7 +142,7 @@ def held_protocol(protocol: Protocol | str) -> Protocol:
 @lru_cache(maxsize=256)
 def never_moved_m(block: Block, data_root: str | None) -> float:
     """ATE RMSE in metres of a camera that never moves on a block, from the ground truth of its frames alone."""
-    sequence = block.open(data_root)
+    sequence: Any = block.open(data_root)
     truth, stamps = sequence.ground_truth, sequence.timestamps
     positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
     return float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
@@ -10,16 +10,14 @@ from optuna.trial import FrozenTrial, TrialState
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.records import write_atomic
 
-from .blocks import Block
-from .evaluate import BlockFailedError, Outcome, held_protocol
+from .constraints import violations
+from .evaluate import BlockFailedError, held_protocol
 from .importance import importances, inert_parameters
-from .objective import errors, violations
+from .objectives import Outcomes
 from .preset import preset_text
 from .study import Tuner
 from .summary import Candidate, StudySummary, choose, compared, conclude
 from .trials import best_trials, count_states
-
-Outcomes = Mapping[Block, Outcome]
 
 
 def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: int = 1) -> StudySummary:
@@ -90,7 +88,7 @@ def _confirmed(tuner: Tuner, trial: FrozenTrial, default: Outcomes, candidates: 
     except BlockFailedError as error:
         return candidate.model_copy(update={"failed": str(error), "feasible": False})
     found = {
-        "confirm": compared(errors(again), errors(default), candidates=candidates),
+        "confirm": compared(again, default, objective=tuner.objectives[0], candidates=candidates),
         "frame_ms": _frame_ms(again),
         "default_frame_ms": _frame_ms(default),
         "feasible": all(value <= 0 for value in violations(tuner.spec, again).values()),
@@ -107,7 +105,7 @@ def _judged(tuner: Tuner, chosen: Candidate, jobs: int) -> Candidate:
             if blocks:
                 tuned = tuner.evaluate(settings, blocks, jobs=jobs, cache=False)
                 default = tuner.evaluate(tuner.spec.space.fixed, blocks, jobs=jobs, cache=False)
-                found[split] = compared(errors(tuned), errors(default))
+                found[split] = compared(tuned, default, objective=tuner.objectives[0])
     except BlockFailedError as error:
         return chosen.model_copy(update={"failed": str(error), "feasible": False})
     return chosen.model_copy(update=found)

@@ -63,8 +63,8 @@ class Study:
             ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned
             or failed; missing else). ``boolean``: feasible (all constraints hold; missing where nothing was measured).
             ``float64``, nan where unknown: one column for each objective, named after ``value_``, as told to Optuna
-            (accuracy: mean natural logarithm of the ATE ratio to the default settings, less is better; speed:
-            real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is better than the default;
+            (natural logarithms of ratios to the default settings, less is better), ratio (the ATE ratio, below 1 is
+            better than the default;
             nan if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second), duration_s (seconds from
             the start of the trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
             ``float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
@@ -96,7 +96,7 @@ class Study:
             "duration_s": None if trial.duration is None else trial.duration.total_seconds(),
             "coverage": notes.get("coverage"),
             "fps": notes.get("fps"),
-            "runs": len(notes.get("instances", [])),
+            "runs": len(notes.get("blocks", ())),
             "feasible": None if constraints is None else all(value <= 0 for value in constraints.values()),
             "reason": notes.get("reason"),
         }

@@ -13,7 +13,7 @@ from dynslam_bench.core.errors import StudyError, did_you_mean
 
 from .blocks import Block
 from .evaluate import Outcome
-from .statistics import by_scene, centre
+from .statistics import by_scene, by_start, centre
 
 Outcomes = Mapping[Block, Outcome]
 Cost = Callable[[Outcome], float]
@@ -40,6 +40,11 @@ class Objective:
     cost: Cost
     worst: bool = False
     degraded: bool = False
+
+    def by_start(self, outcomes: Outcomes, default: Outcomes) -> list[float]:
+        """Natural logarithm of the ratio on each block that counts and that both ran."""
+        own = {block: self.cost(outcome) for block, outcome in outcomes.items() if self._counts(block)}
+        return by_start(own, {block: self.cost(outcome) for block, outcome in default.items()})
 
     def ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[str, float]:
         """Natural logarithm of the ratio to the default by scene; empty without any block that counts."""

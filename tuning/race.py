@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import optuna
-from optuna.study import StudyDirection as Direction
 from optuna.trial import FrozenTrial, TrialState
 from scipy import stats
 
@@ -31,7 +30,7 @@ _COURSE = "values_after_{}_blocks"
 def running_order(blocks: Sequence[Block], seed: int) -> list[Block]:
     """The blocks as all trials meet them: one of each scene in turn, so that small sets hold different scenes."""
     groups = list(scenes(blocks).values())
-    stream(seed, "order").shuffle(groups)  # type: ignore[arg-type]  # a list of lists
+    stream(seed, "order").shuffle(groups)
     longest = max(len(group) for group in groups)
     return [group[turn] for turn in range(longest) for group in groups if turn < len(group)]
 
@@ -75,9 +74,7 @@ def is_worse(mine: Mapping[Block, float], best: Mapping[Block, float]) -> bool:
     return bool(stats.wilcoxon(differences, alternative="greater").pvalue < WILCOXON_LEVEL)
 
 
-def leaves(
-    trials: Sequence[FrozenTrial], number: int, passed: Sequence[int], position: int, directions: Sequence[Direction]
-) -> bool:
+def leaves(trials: Sequence[FrozenTrial], number: int, passed: Sequence[int], position: int) -> bool:
     """Whether a trial drops out after a step, by halving or rejection.
 
     Args:
@@ -85,14 +82,13 @@ def leaves(
         number: The trial's, whose values at the step are noted.
         passed: The study's steps, from `steps`.
         position: Which of them it has come to; not the last.
-        directions: Of the objectives.
     """
     values = {trial.number: noted(trial, passed[position]) for trial in trials}
-    signs = [1.0 if direction == Direction.MINIMIZE else -1.0 for direction in directions]
-    signed = {key: [s * v for s, v in zip(signs, found, strict=True)] for key, found in values.items() if found}
-    rivals = [signed[trial.number] for trial in trials if trial.number in signed and is_feasible(trial)]
+    rivals = [found for trial in trials if (found := values[trial.number]) is not None and is_feasible(trial)]
     entered = sum(noted(trial, passed[0]) is not None for trial in trials)
-    return is_dropped(signed[number], rivals, entered, passed[0] / passed[position + 1])
+    mine = values[number]
+    assert mine is not None, "noted before"
+    return is_dropped(mine, rivals, entered, passed[0] / passed[position + 1])
 
 
 def note(trial: optuna.Trial, step: int, values: Sequence[float]) -> None:

@@ -28,16 +28,16 @@ from dynslam_bench.trackers import TRACKERS
 
 from . import race
 from .blocks import Block
+from .constraints import coverage, fps, violations
 from .design import design_of
 from .evaluate import BlockFailedError, CancelledError, Outcome, evaluate
-from .objective import coverage, errors, fps, real_time_factor, violations
 from .objectives import Objective, Outcomes, find_objective
 from .samplers import build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
 from .stored_identity import as_stored, difference, same
 from .study_file import StudySpec
-from .trials import best_trials, errors_of
+from .trials import best_trials, errors_in, errors_of
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
 CODE = ("version", "source")
@@ -228,15 +228,14 @@ class Tuner:
         """Whether a trial leaves the race at a step."""
         if self.spec.race == "wilcoxon":
             best = best_trials(self.study, 1)
-            return bool(best) and race.is_worse(errors(outcomes), errors_of(best[0]))
+            return bool(best) and race.is_worse(errors_in(outcomes), errors_of(best[0]))
         trials = self.study.get_trials(deepcopy=False)
-        return race.leaves(trials, number, self.steps, position, self.study.directions)
+        return race.leaves(trials, number, self.steps, position)
 
     def _record(self, trial: optuna.Trial, outcomes: Mapping[Block, Outcome]) -> None:
         set_constraints(trial, violations(self.spec, outcomes, self._reference))
         trial.set_user_attr("coverage", coverage(outcomes))
         trial.set_user_attr("fps", fps(outcomes))
-        trial.set_user_attr("rtf", real_time_factor(outcomes))
         rows = [[str(block), o.run_id, o.ate_m, o.coverage, o.frame_s] for block, o in outcomes.items()]
         trial.set_user_attr("blocks", rows)
 

@@ -49,7 +49,8 @@ class StudySpec(_Part):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        tune: Blocks that trials run on, see `blocks.parse_blocks`: ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
+        tune: Blocks that trials run on, written as `blocks.parse_blocks` reads them:
+            ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
         confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
             for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
         held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.

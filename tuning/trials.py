@@ -6,6 +6,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from .blocks import Block, parse_blocks
+from .objectives import Outcomes
 from .samplers import is_feasible
 
 
@@ -19,8 +20,7 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     if len(study.directions) > 1:
         front = {trial.number for trial in study.best_trials}
         feasible = [trial for trial in feasible if trial.number in front] or feasible
-    sign = 1.0 if study.directions[0] == optuna.study.StudyDirection.MINIMIZE else -1.0
-    ranked = sorted(feasible, key=lambda trial: (sign * trial.values[0], trial.number))
+    ranked = sorted(feasible, key=lambda trial: (trial.values[0], trial.number))
     distinct: list[FrozenTrial] = []
     for trial in ranked:
         if all(trial.params != other.params for other in distinct):
@@ -34,6 +34,11 @@ def count_states(study: optuna.Study) -> dict[str, int]:
     for trial in study.get_trials(deepcopy=False):
         counts[trial.state.name.lower()] = counts.get(trial.state.name.lower(), 0) + 1
     return counts
+
+
+def errors_in(outcomes: Outcomes) -> dict[Block, float]:
+    """ATE in metres on each block."""
+    return {block: outcome.ate_m for block, outcome in outcomes.items()}
 
 
 def errors_of(trial: FrozenTrial) -> dict[Block, float]:

@@ -100,7 +100,7 @@ def tune_a_little(results: Path, *, frames: int, jobs: int, trials: int) -> tupl
         trials=trials,
         top=1,
         min_coverage=0.9,
-        pruner="none",
+        race="none",
     )
     render({*spec.tune, *spec.held_out})
     tuner = run_trials(spec, results, jobs)

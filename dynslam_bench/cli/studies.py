@@ -83,7 +83,7 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show how far a study is."""
     from dynslam_bench.tuning import Tuner, read_study
-    from dynslam_bench.tuning.final_runs import best_trials, count_states
+    from dynslam_bench.tuning.trials import best_trials, count_states
 
     tuner = Tuner(read_study(study), results, reading=True)
     facts: dict[str, Any] = {
@@ -115,9 +115,9 @@ def best(
     from dynslam_bench.core.errors import StudyError
     from dynslam_bench.core.records import write_atomic
     from dynslam_bench.tuning import Tuner, read_study
-    from dynslam_bench.tuning.final_runs import best_trials
     from dynslam_bench.tuning.preset import preset_text
     from dynslam_bench.tuning.storage import study_folder
+    from dynslam_bench.tuning.trials import best_trials
 
     spec = read_study(study)
     chosen = study_folder(results, spec) / "best.toml"
@@ -176,8 +176,9 @@ def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bo
         return
     write(summary.conclusion)
     write()
-    write_table(("setting", "value"), list(summary.candidates[0].params.items()))
-    write()
+    if summary.chosen is not None:
+        write_table(("setting", "value"), list(summary.candidates[0].params.items()))
+        write()
     write(f"preset: {preset}")
     write(f"page:   {page}")
 

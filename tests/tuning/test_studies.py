@@ -18,7 +18,6 @@ from optuna.trial import TrialState
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.runs import RunStore
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
-from dynslam_bench.tuning.dominance import hopeless
 from dynslam_bench.tuning.space import distribution
 from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
@@ -36,7 +35,7 @@ def make(sequences: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": sequences[:2], "held_out": sequences[2:], "trials": 10,
         "space": {"include": ["gain", "wobble"]}, "seeds": [0], "offsets": [0], "top": 2,
-        "pruner": "none", "min_coverage": None,
+        "race": "none", "min_coverage": None, "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 

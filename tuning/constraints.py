@@ -1,4 +1,4 @@
-"""What the outcomes of a configuration amount to beside its objectives: means, and the constraints."""
+"""What a configuration must fulfil, whatever it gains."""
 
 from __future__ import annotations
 
@@ -6,14 +6,8 @@ import math
 
 import numpy as np
 
-from .blocks import Block
 from .objectives import ACCURACY, Outcomes
 from .study_file import StudySpec
-
-
-def errors(outcomes: Outcomes) -> dict[Block, float]:
-    """ATE in metres on each block."""
-    return {block: outcome.ate_m for block, outcome in outcomes.items()}
 
 
 def coverage(outcomes: Outcomes) -> float:
@@ -24,11 +18,6 @@ def coverage(outcomes: Outcomes) -> float:
 def fps(outcomes: Outcomes) -> float:
     """Frames a second: the inverse of the mean frame time."""
     return 1.0 / float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
-
-
-def real_time_factor(outcomes: Outcomes) -> float:
-    """Geometric mean of the real-time factors."""
-    return float(np.exp(np.mean([math.log(outcome.rtf) for outcome in outcomes.values()])))
 
 
 def violations(spec: StudySpec, outcomes: Outcomes, default: Outcomes | None = None) -> dict[str, float]:
