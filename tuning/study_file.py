@@ -63,8 +63,8 @@ class StudySpec(_Part):
             minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
             the worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost
             frames.
-        ate_margin: What a study without ``accuracy``, ``worst`` or ``robustness`` may lose of accuracy, as a share: the
-            upper bound of its ATE ratio must lie below 1 + this.
+        ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
+            ATE ratio must lie below 1 + this.
         pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
@@ -138,8 +138,8 @@ class StudySpec(_Part):
 
     @property
     def at_equal_accuracy(self) -> bool:
-        """Whether a gain counts only at (nearly) the default's accuracy, as no objective holds the error."""
-        return not set(self.objectives) & set(EQUALLY_ACCURATE)
+        """Whether a gain counts only at (nearly) the default's accuracy, as it may be paid for with the error."""
+        return len(self.objectives) > 1 or self.objectives[0] not in EQUALLY_ACCURATE
 
     def digest(self) -> str:
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
