@@ -16,11 +16,11 @@ from .evaluate import BlockFailedError, held_protocol
 from .front import PICKS, pick
 from .importance import importances, inert_parameters
 from .objectives import ACCURACY, SPEED, Objective, Outcomes, together
-from .preset import preset_text
+from .presets import write_presets
 from .ratio import Ratio, compared
 from .study import Tuner
 from .study_file import StudySpec
-from .summary import Candidate, StudySummary, choose, conclude, worth
+from .summary import Candidate, StudySummary, choose, conclude
 from .trials import best_trials, count_states
 
 
@@ -135,22 +135,6 @@ def _picks(spec: StudySpec, candidates: Sequence[Candidate], chosen: Candidate |
     known = [each for each in candidates if each.feasible and each.confirm is not None]
     found = {name: pick(name, known, spec.ate_margin) for name in PICKS}
     return best | {name: None if each is None else each.trial for name, each in found.items()}
-
-
-def write_presets(tuner: Tuner, summary: StudySummary) -> None:
-    """Write every pick as a preset: tuned settings alone, with what they are worth and where that was seen."""
-    spec = tuner.spec
-    for name, number in summary.picks.items():
-        candidate = next((each for each in summary.candidates if each.trial == number), None)
-        text = preset_text(
-            {} if candidate is None else candidate.params,
-            spec.tracker,
-            summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes),
-            fixed=spec.space.fixed,
-            tuned_on=[*summary.tune, *summary.confirm],
-            judged_on=[*summary.held_out, *summary.recorded] if candidate is not None else (),
-        )
-        write_atomic(tuner.folder / f"{name}.toml", text)
 
 
 def _frame_ms(outcomes: Outcomes) -> float:
