@@ -24,8 +24,8 @@ def violations(spec: StudySpec, outcomes: Outcomes, default: Outcomes | None = N
     """How far each constraint is violated, relatively; <= 0 is fulfilled.
 
     Args:
-        spec: The study. One without an objective of error must not pay for its gain with accuracy: its ATE ratio has to
-            stay below 1 + `StudySpec.ate_margin`.
+        spec: The study. One of anything but error alone must not pay for its gain with accuracy: the ATE ratio has to
+            stay below 1 + `StudySpec.ate_margin`; a front of several objectives holds the error itself.
         outcomes: Of a configuration.
         default: Of the default settings at the same places, for that ratio; None to leave it out.
     """
@@ -34,6 +34,6 @@ def violations(spec: StudySpec, outcomes: Outcomes, default: Outcomes | None = N
         found["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
         found["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
-    if default is not None and spec.at_equal_accuracy:
+    if default is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
         found["ate"] = ACCURACY.value(outcomes, default) - math.log1p(spec.ate_margin)
     return found

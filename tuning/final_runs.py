@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
@@ -12,11 +13,14 @@ from dynslam_bench.core.records import write_atomic
 
 from .constraints import violations
 from .evaluate import BlockFailedError, held_protocol
+from .front import PICKS, pick
 from .importance import importances, inert_parameters
-from .objectives import Outcomes
-from .preset import preset_text
+from .objectives import ACCURACY, SPEED, Objective, Outcomes, together
+from .presets import write_presets
+from .ratio import Ratio, compared
 from .study import Tuner
-from .summary import Candidate, StudySummary, choose, compared, conclude
+from .study_file import StudySpec
+from .summary import Candidate, StudySummary, choose, conclude
 from .trials import best_trials, count_states
 
 
@@ -49,11 +53,14 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         note(f"trial {trial.number} on the same blocks")
         candidates.append(_confirmed(tuner, trial, default, len(best), jobs))
     chosen = choose(candidates)
+    picks = _picks(spec, candidates, chosen)
+    for trial_number in dict.fromkeys(number for number in picks.values() if number is not None):
+        note(f"trial {trial_number} on the held-out blocks")
+        place = next(index for index, each in enumerate(candidates) if each.trial == trial_number)
+        candidates[place] = _judged(tuner, candidates[place], jobs)
     if chosen is not None:
-        note(f"trial {chosen.trial} on the held-out blocks")
-        judged = _judged(tuner, chosen, jobs)
-        candidates = [judged, *(candidate for candidate in candidates if candidate is not chosen)]
-        chosen = judged
+        chosen = next(each for each in candidates if each.trial == chosen.trial)
+        candidates = [chosen, *(each for each in candidates if each is not chosen)]
     names = [parameter.name for parameter in tuner.space]
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     notes = list(design.notes)
@@ -73,9 +80,9 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         held_out=[str(block) for block in design.held_out],
         recorded=[str(block) for block in design.recorded],
         tune=[str(block) for block in design.race],
+        picks=picks,
     )
-    settings = {**spec.space.fixed, **(chosen.params if chosen is not None else {})}
-    write_atomic(tuner.folder / "best.toml", preset_text(settings, spec.tracker, summary.conclusion))
+    write_presets(tuner, summary)
     write_atomic(tuner.folder / "summary.json", summary.to_json())
     return summary
 
@@ -88,7 +95,9 @@ def _confirmed(tuner: Tuner, trial: FrozenTrial, default: Outcomes, candidates: 
     except BlockFailedError as error:
         return candidate.model_copy(update={"failed": str(error), "feasible": False})
     found = {
-        "confirm": compared(again, default, objective=tuner.objectives[0], candidates=candidates),
+        "confirm": compared(again, default, objective=together(tuner.objectives), candidates=candidates),
+        "on_confirm": _beside(again, default),
+        "ate_margin": tuner.spec.ate_margin if tuner.spec.at_equal_accuracy else None,
         "frame_ms": _frame_ms(again),
         "default_frame_ms": _frame_ms(default),
         "feasible": all(value <= 0 for value in violations(tuner.spec, again).values()),
@@ -99,16 +108,33 @@ def _confirmed(tuner: Tuner, trial: FrozenTrial, default: Outcomes, candidates: 
 def _judged(tuner: Tuner, chosen: Candidate, jobs: int) -> Candidate:
     """The choice on the held-out blocks and on recordings."""
     settings = {**tuner.spec.space.fixed, **chosen.params}
-    found = {}
+    found: dict[str, Any] = {}
     try:
         for split, blocks in (("held_out", tuner.design.held_out), ("recorded", tuner.design.recorded)):
             if blocks:
                 tuned = tuner.evaluate(settings, blocks, jobs=jobs, cache=False)
                 default = tuner.evaluate(tuner.spec.space.fixed, blocks, jobs=jobs, cache=False)
-                found[split] = compared(tuned, default, objective=tuner.objectives[0])
+                after: Objective = ACCURACY if split == "recorded" else together(tuner.objectives)
+                found[split] = compared(tuned, default, objective=after)
+                found |= {"on_held_out": _beside(tuned, default)} if split == "held_out" else {}
     except BlockFailedError as error:
         return chosen.model_copy(update={"failed": str(error), "feasible": False})
     return chosen.model_copy(update=found)
+
+
+def _beside(outcomes: Outcomes, default: Outcomes) -> dict[str, Ratio]:
+    """Accuracy and speed, whatever the study is after."""
+    return {each.name: compared(outcomes, default, objective=each) for each in (ACCURACY, SPEED)}
+
+
+def _picks(spec: StudySpec, candidates: Sequence[Candidate], chosen: Candidate | None) -> dict[str, int | None]:
+    """Which trial is which preset: of a study of several objectives three, else the choice alone."""
+    best = {"best": None if chosen is None else chosen.trial}
+    if len(spec.objectives) == 1:
+        return best
+    known = [each for each in candidates if each.feasible and each.confirm is not None]
+    found = {name: pick(name, known, spec.ate_margin) for name in PICKS}
+    return best | {name: None if each is None else each.trial for name, each in found.items()}
 
 
 def _frame_ms(outcomes: Outcomes) -> float:

@@ -6,14 +6,14 @@ All objectives are natural logarithms of ratios to the default settings: less is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 
 from .blocks import Block
 from .evaluate import Outcome
-from .statistics import by_scene, by_start, centre
+from .statistics import FLOOR_M, by_scene, by_start, centre
 
 Outcomes = Mapping[Block, Outcome]
 Cost = Callable[[Outcome], float]
@@ -86,7 +86,18 @@ OBJECTIVES = {
     )
 }
 """Objectives by name."""
-ACCURACY = OBJECTIVES["accuracy"]
+ACCURACY, SPEED = OBJECTIVES["accuracy"], OBJECTIVES["speed"]
+
+
+def together(objectives: Sequence[Objective]) -> Objective:
+    """Several objectives as one: the geometric mean of their ratios; one stays what it is."""
+    if len(objectives) == 1:
+        return objectives[0]
+    return Objective(
+        "balance",
+        f"geometric mean of {' and '.join(each.what for each in objectives)}",
+        lambda run: math.exp(sum(math.log(each.cost(run)) for each in objectives) / len(objectives)),
+    )
 
 
 def find_objective(name: str) -> Objective:
@@ -106,12 +117,15 @@ def own_objective(cost: Cost) -> Objective:
     Args:
         cost: Positive number of a run, less is better, e.g. ``lambda run: run.ate_m * run.processor_s``.
     """
+    name = getattr(cost, "__name__", "own").strip("<>")
 
     def checked(run: Outcome) -> float:
         value = float(cost(run))
-        if not (math.isfinite(value) and value > 0):
-            raise StudyError(f"the objective of one's own gives {value:g} on block '{run.block}'", "it must be above 0")
+        if not (math.isfinite(value) and value >= FLOOR_M):
+            raise StudyError(
+                f"objective '{name}' gives {value:g} on block '{run.block}'",
+                f"a ratio needs finite numbers from {FLOOR_M:g} on: give it in a smaller unit, or add a constant",
+            )
         return value
 
-    name = getattr(cost, "__name__", "own").strip("<>")
     return Objective(name, name.replace("_", " "), checked)

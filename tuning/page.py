@@ -22,9 +22,10 @@ from .blocks import Block, scenes
 from .importance import FEWEST_TRIALS, importances, inert_parameters
 from .objectives import find_objective
 from .preset import preset_text
+from .ratio import Ratio
 from .samplers import is_feasible
 from .study import Tuner
-from .summary import Candidate, Ratio, StudySummary
+from .summary import Candidate, StudySummary
 from .trials import errors_of
 
 _MODEBAR = {"bgcolor": "rgba(0,0,0,0)", "color": "#c4c9d1", "activecolor": "#1f6fb4"}

@@ -21,6 +21,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Parameter, Scalar
 
 from .blocks import Block, scenes
+from .evaluate import BlockFailedError
 from .objectives import Objective, Outcomes
 from .screening_plan import live, stepped, toward
 
@@ -222,10 +223,18 @@ def run_pilot(
         StudyError: See `judge_pilot`.
     """
     chosen = some_of(blocks)
-    default = run({}, chosen)
-    began, changed = time.perf_counter(), []
+    try:
+        default = run({}, chosen)
+    except BlockFailedError as error:
+        raise StudyError(f"the default settings fail: {error.args[0]}", "a study needs a default that runs") from error
+    began, changed, reason = time.perf_counter(), [], ""
     for number in range(CONFIGURATIONS):
-        changed.append(run(small_change(space, base, stream(seed, "pilot", number)), chosen))
+        try:
+            changed.append(run(small_change(space, base, stream(seed, "pilot", number)), chosen))
+        except BlockFailedError as error:
+            reason = str(error.args[0])
+    if not changed:
+        raise StudyError(f"no pilot: all settings tried near the default fail: {reason}", "narrow the space")
     run_s = (time.perf_counter() - began) * jobs / (CONFIGURATIONS * len(chosen))
     return judge_pilot(objective, default, changed, run_s=run_s, jobs=jobs, split=split)
 

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from .old_form import NEW, converted, is_old
 from .study_file import StudySpec
 
 
@@ -19,6 +20,9 @@ def as_stored(spec: StudySpec, file: Path) -> StudySpec:
 
 def same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:
     """Whether two identities agree, but for some keys."""
+    if is_old(stored):
+        stored, _ = converted(stored)
+        but = (*but, *NEW)
     return all(_of(stored, key) == _of(now, key) for key in (stored.keys() | now.keys()) - set(but))
 
 

@@ -40,7 +40,7 @@ from .study_file import StudySpec
 from .trials import best_trials, errors_in, errors_of
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-CODE = ("version", "source")
+CODE = ("version", "source", "parameters")
 """What of a study's identity tells the code that ran it: must be the same to go on, not to read."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
@@ -50,13 +50,14 @@ class StudyEvent:
     """Something happened in a study.
 
     Attributes:
-        kind: ``reference`` (a run with the default settings), ``started`` or ``finished`` (a trial).
-        number: Of the trial, or of the reference run.
+        kind: ``pilot`` (what it found), ``reference`` (runs with the default settings), ``started`` or ``finished`` (a
+            trial).
+        number: Of the trial.
         total: How many there are to be.
         text: One line.
     """
 
-    kind: Literal["reference", "started", "finished"]
+    kind: Literal["pilot", "reference", "started", "finished"]
     number: int
     total: int
     text: str
@@ -313,28 +314,6 @@ class Tuner:
             "source": source_fingerprint(self.tracker, defaults, masks),
             "parameters": digest([repr(parameter) for parameter in self.space]),
         }
-
-
-def run_study(
-    spec: StudySpec, *, results: str | Path = "results", jobs: int = 1, on_event: OnEvent | None = None
-) -> Tuner:
-    """Run a study to its end, or go on with it.
-
-    Args:
-        spec: The study.
-        results: The results folder; the study's own files lie in ``studies/<name>``.
-        jobs: Trials at a time.
-        on_event: Told of everything that happens.
-
-    Returns:
-        The study, for `finish`.
-
-    Raises:
-        DynslamError: See `Tuner`.
-    """
-    tuner = Tuner(spec, results)
-    tuner.run(jobs=jobs, on_event=on_event)
-    return tuner
 
 
 def _identity_of(study: optuna.Study, wait_s: float = 10.0) -> dict[str, Any] | None:

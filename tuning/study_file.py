@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +13,7 @@ from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.records import Record, digest
 
 from .blocks import Block, parse_blocks
+from .old_form import converted
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -63,8 +65,8 @@ class StudySpec(_Part):
             minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
             the worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost
             frames.
-        ate_margin: What a study without ``accuracy``, ``worst`` or ``robustness`` may lose of accuracy, as a share: the
-            upper bound of its ATE ratio must lie below 1 + this.
+        ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
+            ATE ratio must lie below 1 + this.
         pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
@@ -138,8 +140,8 @@ class StudySpec(_Part):
 
     @property
     def at_equal_accuracy(self) -> bool:
-        """Whether a gain counts only at (nearly) the default's accuracy, as no objective holds the error."""
-        return not set(self.objectives) & set(EQUALLY_ACCURATE)
+        """Whether a gain counts only at (nearly) the default's accuracy, as it may be paid for with the error."""
+        return len(self.objectives) > 1 or self.objectives[0] not in EQUALLY_ACCURATE
 
     def digest(self) -> str:
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
@@ -147,8 +149,12 @@ class StudySpec(_Part):
         return digest(self.model_dump(mode="json", exclude=free))
 
 
-def read_study(path: str | Path) -> StudySpec:
+def read_study(path: str | Path, on_note: Callable[[str], None] | None = None) -> StudySpec:
     """Read a study file.
+
+    Args:
+        path: The file.
+        on_note: Told what was converted, if the file has an old form.
 
     Raises:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
@@ -160,14 +166,30 @@ def read_study(path: str | Path) -> StudySpec:
         raise StudyError(f"cannot read the study {path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise StudyError(f"{path} is not TOML: {error}") from error
-    values.setdefault("name", path.stem)
+    values, notes = converted({"name": path.stem, **values})
+    if on_note is not None:
+        for text in notes:
+            on_note(f"{path} has an old form: {text}")
+    return make_spec(values, str(path))
+
+
+def make_spec(values: Mapping[str, Any], where: str) -> StudySpec:
+    """A study from its values.
+
+    Args:
+        values: Fields of `StudySpec`.
+        where: Where they come from, for messages.
+
+    Raises:
+        StudyError: An unknown key (with a did-you-mean) or an unfit value, in one line.
+    """
     try:
         return StudySpec.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
+        field = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             known = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
-            raise StudyError(f"{path}: unknown key '{where}'", did_you_mean(where, known)) from None
+            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, known)) from None
         text = first["msg"].removeprefix("Value error, ")
-        raise StudyError(f"{path}: {where + ': ' if where else ''}{text}") from None
+        raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None

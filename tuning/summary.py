@@ -3,73 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import Field
 
 from dynslam_bench.core.records import Record
 
-from .objectives import ACCURACY, Objective, Outcomes
-from .statistics import FEWEST_SCENES, bounds, centre, upper
-
-_LARGEST_LOG = 700.0
-"""Larger logarithms overflow."""
-FALSE_CHOICES = 0.05
-"""At most this share of the studies in which nothing is better may choose something."""
-
-
-class Ratio(Record):
-    """A ratio to the default settings, of the ATE or whatever a study is after, with its 95 % interval.
-
-    Attributes:
-        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the default.
-        low: Lower end of the interval over scenes (`statistics.bounds`); below three scenes over starts, which tells
-            nothing of other scenes. None for a single run. Summaries of older versions hold a bootstrap interval, which
-            was too narrow.
-        high: Upper end.
-        n: Paired runs.
-        sequences: How many scenes they come from.
-        bound: One-sided upper bound, wide enough for the number of candidates compared; None for a single run.
-        what: What the ratio is one of.
-    """
-
-    ratio: float
-    low: float | None
-    high: float | None
-    n: int
-    sequences: int
-    bound: float | None = None
-    what: str = "ATE"
-
-    @property
-    def shows_gain(self) -> bool:
-        """Whether the whole interval lies below 1, over enough scenes for an interval."""
-        return self.high is not None and self.high < 1 and self.sequences >= FEWEST_SCENES
-
-    @property
-    def shows_loss(self) -> bool:
-        """Whether the whole interval lies above 1, over enough scenes for an interval."""
-        return self.low is not None and self.low > 1 and self.sequences >= FEWEST_SCENES
-
-    @property
-    def verdict(self) -> str:
-        """What may be concluded."""
-        if self.sequences < FEWEST_SCENES:
-            return f"on {self.sequences} scene{'s' * (self.sequences > 1)} only, from which nothing follows for others"
-        if self.shows_gain:
-            return f"better than the default by {100 * (1 - self.ratio):.1f} %"
-        if self.shows_loss:
-            return f"worse than the default by {100 * (self.ratio - 1):.1f} %"
-        return "no difference to the default that these runs could show"
-
-    @property
-    def interval(self) -> str:
-        """The interval in brackets; empty without one."""
-        return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
-
-    def __str__(self) -> str:
-        return f"{self.what} x {self.ratio:.3f} {self.interval or 'without an interval'}"
+from .ratio import Ratio
+from .statistics import FEWEST_SCENES
 
 
 class Candidate(Record):
@@ -81,7 +23,10 @@ class Candidate(Record):
         values: What its trial had been worth.
         confirm: On the blocks for the choice, which no trial had seen.
         held_out: On the held-out split; None without one, or if it was not chosen.
-        recorded: On recordings; None without any, or if it was not chosen.
+        recorded: ATE on recordings; None without any, or if it was not chosen.
+        on_confirm: ATE and processor time on the blocks for the choice, by objective.
+        on_held_out: The same on the held-out split.
+        ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
         frame_ms: Mean milliseconds a frame, timed without the stage cache.
         default_frame_ms: The same of the default settings.
         feasible: Whether the constraints hold in the new runs.
@@ -94,6 +39,9 @@ class Candidate(Record):
     confirm: Ratio | None = None
     held_out: Ratio | None = None
     recorded: Ratio | None = None
+    on_confirm: dict[str, Ratio] = Field(default_factory=dict)
+    on_held_out: dict[str, Ratio] = Field(default_factory=dict)
+    ate_margin: float | None = None
     frame_ms: float | None = None
     default_frame_ms: float | None = None
     feasible: bool = True
@@ -103,7 +51,14 @@ class Candidate(Record):
     def bound(self) -> float:
         """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
         known = self.feasible and self.confirm is not None and self.confirm.bound is not None
+        if not self.nothing_lost(self.on_confirm):
+            return math.inf
         return self.confirm.bound if known and self.confirm is not None and self.confirm.bound is not None else math.inf
+
+    def nothing_lost(self, ratios: Mapping[str, Ratio]) -> bool:
+        """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the default, if that is asked."""
+        bound = ratios["accuracy"].bound if "accuracy" in ratios else None
+        return self.ate_margin is None or (bound is not None and bound < 1 + self.ate_margin)
 
     @property
     def worse_on_recordings(self) -> bool:
@@ -114,7 +69,7 @@ class Candidate(Record):
     def holds_up(self) -> bool:
         """Whether it beats the default on the held-out split and is not worse on recordings."""
         gain = self.held_out is not None and self.held_out.shows_gain
-        return self.feasible and gain and not self.worse_on_recordings
+        return self.feasible and gain and self.nothing_lost(self.on_held_out) and not self.worse_on_recordings
 
 
 class StudySummary(Record):
@@ -136,6 +91,7 @@ class StudySummary(Record):
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
+        picks: Presets of the study by name, and the trial of each; None where the default is the pick.
         split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
     """
 
@@ -153,36 +109,13 @@ class StudySummary(Record):
     confirm: list[str] = Field(default_factory=list)
     held_out: list[str] = Field(default_factory=list)
     recorded: list[str] = Field(default_factory=list)
+    picks: dict[str, int | None] = Field(default_factory=dict)
     split_notes: list[str] = Field(default_factory=list)
 
     @property
     def verdict(self) -> str:
         """One sentence: better or not on the held-out split, by how much, how sure, and whether to keep the default."""
         return conclude(self.candidates, self.chosen, self.split_notes)
-
-
-def compared(outcomes: Outcomes, default: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1) -> Ratio:
-    """A configuration beside the default on the same blocks.
-
-    Args:
-        outcomes: Of the configuration.
-        default: Of the default settings.
-        objective: What is compared.
-        candidates: How many configurations are compared for one choice; the bound allows for all of them (Bonferroni).
-    """
-    scenes = objective.ratios(outcomes, default)
-    sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, default)
-    sample = objective.counted(sample)
-    found, middle = bounds(sample), centre(sample)
-    about: dict[str, Any] = {"n": len(outcomes), "sequences": len(scenes), "what": objective.what}
-    if found is None:
-        return Ratio(ratio=_ratio(middle), low=None, high=None, **about)
-    bound = _ratio(upper(sample, 1 - FALSE_CHOICES / candidates))
-    return Ratio(ratio=_ratio(middle), low=_ratio(found[0]), high=_ratio(found[1]), bound=bound, **about)
-
-
-def _ratio(logarithm: float) -> float:
-    return math.exp(min(logarithm, _LARGEST_LOG))
 
 
 def choose(candidates: Sequence[Candidate]) -> Candidate | None:
@@ -208,6 +141,9 @@ def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
         return f"Keep the default: trial {candidates[0].trial} failed when run again: {candidates[0].failed}."
     if not feasible:
         return f"Keep the default: trial {judged[0].trial} violates a constraint when run again, as do all that were."
+    unsure = [each for each in feasible if not each.nothing_lost(each.on_confirm)]
+    if len(unsure) == len(feasible):
+        return _not_as_accurate(unsure)
     best = min(feasible, key=lambda each: each.bound)
     assert best.confirm is not None
     many = f"none of the {len(judged)} best trials holds" if len(judged) > 1 else "the best trial does not hold"
@@ -215,6 +151,17 @@ def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
     return (
         f"Keep the default: {many} up on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
         f"{best.confirm}, upper bound {bound})."
+    )
+
+
+def _not_as_accurate(candidates: Sequence[Candidate]) -> str:
+    """That no candidate could be shown to be as accurate as the default."""
+    best = min(candidates, key=lambda each: each.on_confirm["accuracy"].bound or math.inf)
+    ate, margin = best.on_confirm["accuracy"], best.ate_margin or 0.0
+    bound = "none" if ate.bound is None else f"{ate.bound:.3f}"
+    return (
+        f"Keep the default: no trial could be shown to be as accurate on {ate.n} runs that none had seen (trial "
+        f"{best.trial}: {best.confirm}, but {ate}, upper bound {bound}, asked for: below {1 + margin:.2f})."
     )
 
 
@@ -235,6 +182,11 @@ def _conclude(chosen: Candidate, overlapping: bool) -> str:
     checked = "" if chosen.recorded is None else f"; recorded: {chosen.recorded}"
     if chosen.worse_on_recordings:
         return f"Worse on recordings, keep the default: {chosen.recorded} there ({on}: {held}, {sure})."
+    if chosen.ate_margin is not None:
+        checked = f"; {chosen.on_held_out['accuracy']}{checked}" if "accuracy" in chosen.on_held_out else checked
+    if not chosen.nothing_lost(chosen.on_held_out):
+        asked = f"not shown to be as accurate, which asks for an upper bound below {1 + (chosen.ate_margin or 0):.2f}"
+        return f"Not better, keep the default: {held} {on}, but {asked} ({chosen_on}{checked})."
     if held.shows_gain and not overlapping:
         return (
             f"Better: trial {chosen.trial} has {100 * (1 - held.ratio):.1f} % less {held.what} {on} ({held}, {sure}; "
@@ -244,3 +196,24 @@ def _conclude(chosen: Candidate, overlapping: bool) -> str:
         more = f"{100 * (held.ratio - 1):.1f} % more {held.what}"
         return f"Worse, keep the default: {more} {on} ({held}, {sure}; {chosen_on})."
     return f"Not better, keep the default: {held} {on} shows no gain ({sure}; {chosen_on}{checked})."
+
+
+def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) -> str:
+    """What a preset is worth, in one sentence.
+
+    Args:
+        name: Of the preset.
+        candidate: Whose settings it holds, judged; None for the default's.
+        split_notes: How the splits are not apart, where the study accepts that.
+    """
+    if candidate is None:
+        return f"The '{name}' pick is the default: no trial was surely better than it."
+    judged = [f"{split}: {ratios['accuracy']}, {ratios['speed']}" for split, ratios in (
+        ("where it was chosen", candidate.on_confirm), ("held out", candidate.on_held_out),
+    ) if ratios]  # fmt: skip
+    if candidate.recorded is not None:
+        judged.append(f"recorded: {candidate.recorded}")
+    if candidate.failed:
+        judged.append(f"failed when it was judged: {candidate.failed}")
+    apart = f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else ""
+    return f"The '{name}' pick is trial {candidate.trial} ({'; '.join(judged)}).{apart}"

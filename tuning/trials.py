@@ -13,14 +13,17 @@ from .samplers import is_feasible
 def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     """The best trials that came to their end and fulfil the constraints, without repeats of the same settings.
 
-    With several objectives the front, best in the first one first; if no trial is feasible, the least bad ones.
+    With several objectives the front: the best in the first one, the best in the second, and so on in turn. If no trial
+    is feasible, the least bad ones.
     """
     finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     feasible = [trial for trial in finished if is_feasible(trial)] or finished
     if len(study.directions) > 1:
         front = {trial.number for trial in study.best_trials}
         feasible = [trial for trial in feasible if trial.number in front] or feasible
-    ranked = sorted(feasible, key=lambda trial: (trial.values[0], trial.number))
+    count_of = len(study.directions)
+    orders = [sorted(feasible, key=lambda trial: (trial.values[index], trial.number)) for index in range(count_of)]
+    ranked = [trial for turn in zip(*orders, strict=True) for trial in turn]
     distinct: list[FrozenTrial] = []
     for trial in ranked:
         if all(trial.params != other.params for other in distinct):
