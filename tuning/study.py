@@ -105,7 +105,7 @@ class Tuner:
         self.objectives = [find_objective(each) for each in spec.objectives] if objectives is None else list(objectives)
         sampler = build_sampler(spec) if sampler is None else sampler
         self.design = design_of(spec, accept=reading)
-        self.steps = race.steps(spec.race, len(self.design.race))
+        self.steps = self._steps()
         self.store = RunStore(self.results)
         self.store.prepare()
         self.folder = study_folder(self.results, spec)
@@ -179,6 +179,14 @@ class Tuner:
     def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
         """The overrides that a trial ran with."""
         return {**self.spec.space.fixed, **trial.params}
+
+    def _steps(self) -> list[int]:
+        """The steps of the race at which every objective has a block that counts."""
+        found = race.steps(self.spec.race, len(self.design.race))
+        return [
+            step for step in found[:-1]
+            if all(any(map(each.counts, self.design.race[:step])) for each in self.objectives)
+        ] + found[-1:]  # fmt: skip
 
     def _one(self, on_event: OnEvent | None) -> None:
         with self._lock:
