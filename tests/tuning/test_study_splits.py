@@ -63,7 +63,7 @@ def test_copies_and_excerpts_of_a_recording_are_the_same_recording(tmp_path: Pat
             faults([str(whole)], [str(held_out)])
         assert str(whole) in str(caught.value) and str(held_out) in str(caught.value)
     assert faults([str(whole)], [str(other)]) == []
-    with pytest.raises(StudyError, match="share 10 frames|are the same frames"):
+    with pytest.raises(StudyError, match="are the same frames"):
         faults([str(whole), str(copy)], [str(other)])
 
 
