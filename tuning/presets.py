@@ -51,7 +51,7 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", pick: str
         return (folder / f"{pick}.toml").read_text()
     if pick != "best":
         raise StudyError(
-            f"study '{spec.name}' is not finished, so it has no presets", "dynslam-bench tune run STUDY.toml"
+            f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml"
         )
     found = best_trials(Tuner(spec, results, reading=True).study, 1)
     if not found:

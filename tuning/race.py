@@ -22,6 +22,8 @@ from .study_file import RaceName
 
 FIRST_STEP = 3
 """Blocks that every trial runs on before it is compared."""
+AHEAD = 0.1
+"""With several objectives a trial is dropped once this share of the trials beats it in all of them, two at least."""
 WILCOXON_LEVEL = 0.1
 """A trial is dropped if it is worse than the best one at this level of significance."""
 _COURSE = "values_after_{}_blocks"
@@ -63,6 +65,8 @@ def is_dropped(mine: Sequence[float], rivals: Iterable[Sequence[float]], entered
         Always False for a trial that no other beats.
     """
     better = sum(_dominates(other, mine) for other in rivals)
+    if len(mine) > 1:  # few beat a trial in everything: waiting for as many as with one objective would drop nobody
+        return better >= max(2, AHEAD * entered)
     return better >= max(1, int(entered * share))
 
 

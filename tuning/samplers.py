@@ -114,10 +114,10 @@ def violations(trial: FrozenTrial) -> Sequence[float]:
     return [float(value) for value in trial.user_attrs.get(CONSTRAINTS, {}).values()]
 
 
-def set_constraints(trial: optuna.trial.Trial, values: dict[str, float]) -> None:
-    """Attach constraint values to a trial, in whichever way this Optuna knows."""
+def set_constraints(trial: optuna.trial.Trial, values: dict[str, float], *, final: bool) -> None:
+    """Attach constraint values to a trial, in whichever way this Optuna knows; it takes only the `final` ones."""
     trial.set_user_attr(CONSTRAINTS, values)
-    if hasattr(trial, "set_constraint"):
+    if final and hasattr(trial, "set_constraint"):
         for name, value in values.items():
             trial.set_constraint(name, value)
 

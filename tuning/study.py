@@ -207,8 +207,9 @@ class Tuner:
             for position, step in enumerate(self.steps):
                 outcomes |= self.evaluate(settings, self.design.race[len(outcomes) : step])
                 result = self.values(outcomes)
-                self._record(trial, outcomes)
-                if step < self.steps[-1]:
+                final = step == self.steps[-1]
+                self._record(trial, outcomes, final=final)
+                if not final:
                     race.note(trial, step, result)
                     if trial.number > 0 and self._drops(trial.number, position, outcomes):
                         text = f"dropped after {step} of {self.steps[-1]} blocks"
@@ -241,8 +242,8 @@ class Tuner:
         trials = self.study.get_trials(deepcopy=False)
         return race.leaves(trials, number, self.steps, position)
 
-    def _record(self, trial: optuna.Trial, outcomes: Mapping[Block, Outcome]) -> None:
-        set_constraints(trial, violations(self.spec, outcomes, self._reference))
+    def _record(self, trial: optuna.Trial, outcomes: Mapping[Block, Outcome], *, final: bool) -> None:
+        set_constraints(trial, violations(self.spec, outcomes, self._reference), final=final)
         trial.set_user_attr("coverage", coverage(outcomes))
         trial.set_user_attr("fps", fps(outcomes))
         rows = [[str(block), o.run_id, o.ate_m, o.coverage, o.frame_s] for block, o in outcomes.items()]
