@@ -18,8 +18,8 @@ class DropFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Feeds the tracker only the frames that a live camera would have left it, or drops frames at random.
 
     Real-time mode: frame i arrives at its stamp. When the tracker is done with a frame it takes the newest one that
-    has arrived, or waits for the next; those in between are dropped. They count as not tracked (coverage) and cost the
-    error of not moving, added to the reward of the step that dropped them. The last frame is never dropped. With
+    has arrived, or waits for the next; those in between are dropped. They count as not tracked (coverage) and cost
+    what lost ones do, added to the reward of the step that dropped them. The last frame is never dropped. With
     measured times the episode depends on the machine; `frame_time_s` makes it reproducible.
 
     Args:

@@ -61,8 +61,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     ``depth`` and ``stats``. Neither holds anything of the ground truth.
 
     **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`). Frames without a tracked pose, and
-    all remaining ones when `lost_after` ends an episode, cost the error of not moving (``neg_rpe``), or the length of
-    the true way so far (``neg_pose_error``).
+    all remaining ones when `lost_after` ends an episode, cost twice the true motion (``neg_rpe``: not having moved, and
+    having to catch up), or the length of the true way so far (``neg_pose_error``).
 
     **Info**: ``frame_index``, ``timestamp``, ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the
     tracker's diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames;
@@ -241,7 +241,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         Dropped frames count as not tracked. The last frame of the sequence is never dropped.
 
         Returns:
-            The sum of their rewards: each costs the error of not moving.
+            The sum of their rewards: each costs what a lost frame does.
 
         Raises:
             DynslamError: The episode is not running, or fewer frames are left.

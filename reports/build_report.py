@@ -15,11 +15,14 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
+from .html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
 from .html.page import render
+from .html.paper_section import add_paper
 from .model.board import DEFAULT_REFERENCE, Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
 from .model.rows import load_runs, open_stores
-from .tables.table import to_csv, to_latex, to_markdown
+from .tables.latex import to_latex
+from .tables.table import csv_text, prose, to_csv, to_markdown
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class ReportPaths:
     """The files of a report.
 
     Attributes:
-        html: The page, complete in one file.
+        html: The page; what it shows on demand lies in ``data/`` and ``frames/`` beside it.
+        run: The page that shows one run.
         markdown: The tables as Markdown.
         latex: The main tables as LaTeX.
         csv: The tables as CSV, by name.
@@ -35,6 +39,7 @@ class ReportPaths:
     """
 
     html: Path
+    run: Path
     markdown: Path
     latex: Path
     csv: dict[str, Path]
@@ -48,6 +53,8 @@ def build_report(
     protocol: Protocol | str = "tum-rgbd/v1",
     reference: str = DEFAULT_REFERENCE,
     on: On = "common",
+    rank_seen: bool = False,
+    picture_seconds: float = PICTURE_SECONDS,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
 ) -> ReportPaths:
@@ -62,6 +69,8 @@ def build_report(
         reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
             never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
+        picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
 
@@ -73,13 +82,16 @@ def build_report(
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
     loaded = load_runs(stores, protocol)
-    board = make_board([run.row for run in loaded.runs], reference, on)
-    again = command or _command([store.root for store in stores], output, on)
+    board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
+    again = command or _command([store.root for store in stores], output, board)
     draft = Draft()
+    explored = write_explore(board, loaded, protocol, output, title=title, picture_seconds=picture_seconds)
     sections.add_leaderboard(draft, board, protocol, loaded)
+    sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
-    sections.add_trajectories(draft, board, protocol, loaded)
+    add_paper(draft, board, protocol)
+    sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
     sections.add_failures(draft, board, output)
@@ -94,10 +106,11 @@ def build_report(
     return _write(draft, board, output, data)
 
 
-def _command(roots: Sequence[Path], output: Path, on: On) -> str:
+def _command(roots: Sequence[Path], output: Path, board: Board) -> str:
     """The command that makes the report again."""
     words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
-    return shlex.join(words + (["--on", on] if on != "common" else []))
+    words += ["--on", board.on] if board.on != "common" else []
+    return shlex.join(words + ["--rank-seen"] * board.rank_seen)
 
 
 def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> ReportPaths:
@@ -107,6 +120,7 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     names = [*(table.id for table in draft.tables), "runs"]
     paths = ReportPaths(
         html=output / "index.html",
+        run=output / RUN_PAGE,
         markdown=output / "report.md",
         latex=output / "report.tex",
         csv={name: output / "csv" / f"{name}.csv" for name in names},
@@ -115,9 +129,11 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     page = render(draft.sections, draft.figures, title=data.title, protocol=data.protocol, facts=facts, footer=footer)
     for table in draft.tables:
         write_atomic(paths.csv[table.id], to_csv(table))
-    write_atomic(paths.csv["runs"], board.frame().to_csv(index=False))
+    write_atomic(paths.csv["runs"], csv_text(board.frame()))
     write_atomic(paths.markdown, _markdown(draft, data, facts) + f"\n{footer}\n")
-    latex = [to_latex(table) for table in draft.tables if table.id not in ("machines", "failures")]
+    latex = [
+        to_latex(table, board.rows[0].protocol_id) for table in draft.tables if table.id not in ("machines", "failures")
+    ]
     write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
     write_atomic(paths.data, data.to_json())
     write_atomic(paths.html, page)
@@ -138,6 +154,6 @@ def _facts(board: Board) -> list[tuple[str, str]]:
 def _markdown(draft: Draft, data: ReportData, facts: Sequence[tuple[str, str]]) -> str:
     """The whole report as Markdown."""
     counted = ", ".join(f"{value} {name}" for value, name in facts)
-    notes = "".join(f"> {note}\n\n" for section in draft.sections for note in section.notes)
+    notes = "".join(f"> {prose(note)}\n\n" for section in draft.sections for note in section.notes)
     tables = "\n".join(to_markdown(table) for table in draft.tables)
-    return f"# {data.title}\n\n{data.protocol}\n\n{counted}\n\n{notes}{tables}"
+    return f"# {prose(data.title)}\n\n{data.protocol}\n\n{counted}\n\n{notes}{tables}"

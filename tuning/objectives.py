@@ -43,13 +43,13 @@ class Objective:
 
     def by_start(self, outcomes: Outcomes, default: Outcomes) -> list[float]:
         """Natural logarithm of the ratio on each block that counts and that both ran."""
-        own = {block: self.cost(outcome) for block, outcome in outcomes.items() if self._counts(block)}
+        own = {block: self.cost(outcome) for block, outcome in outcomes.items() if self.counts(block)}
         return by_start(own, {block: self.cost(outcome) for block, outcome in default.items()})
 
     def ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[str, float]:
         """Natural logarithm of the ratio to the default by scene; empty without any block that counts."""
-        own = {block: self.cost(outcome) for block, outcome in outcomes.items() if self._counts(block)}
-        other = {block: self.cost(outcome) for block, outcome in default.items() if self._counts(block)}
+        own = {block: self.cost(outcome) for block, outcome in outcomes.items() if self.counts(block)}
+        other = {block: self.cost(outcome) for block, outcome in default.items() if self.counts(block)}
         return by_scene(own, other)
 
     def value(self, outcomes: Outcomes, default: Outcomes) -> float:
@@ -71,7 +71,8 @@ class Objective:
         ranked = sorted(ratios, reverse=True)
         return ranked[: max(1, round(WORST_SHARE * len(ranked)))] if self.worst else ranked
 
-    def _counts(self, block: Block) -> bool:
+    def counts(self, block: Block) -> bool:
+        """Whether a block counts."""
         return not self.degraded or any(strength > 0 for _, strength in block.degradation)
 
 

@@ -27,7 +27,5 @@ def converted(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         found.setdefault("race", RACES.get(pruner, pruner))
         notes.append(f'pruner = "{pruner}" became race = "{found["race"]}"')
         if "speed" in found.get("objectives", ()):
-            notes.append(
-                'objective "speed" is the processor time beside the default\'s, no real-time factor'
-            )
+            notes.append('objective "speed" is the processor time beside the default\'s, no real-time factor')
     return found, notes

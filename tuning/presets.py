@@ -50,9 +50,7 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", pick: str
             raise StudyError(f"study '{spec.name}' has no preset '{pick}'", hint)
         return (folder / f"{pick}.toml").read_text()
     if pick != "best":
-        raise StudyError(
-            f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml"
-        )
+        raise StudyError(f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml")
     found = best_trials(Tuner(spec, results, reading=True).study, 1)
     if not found:
         raise StudyError(f"study '{spec.name}' has no finished trial", "dynslam-bench tune run STUDY.toml")

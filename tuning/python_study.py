@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import optuna
 from optuna.trial import FrozenTrial
 
 from dynslam_bench.core.errors import SequenceError, SettingsError, StudyError
+from dynslam_bench.core.reading import read_json
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.core.toml import read_toml
 
@@ -201,8 +201,10 @@ def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, P
     path = Path(study).expanduser()
     stored = path / _SPEC_FILE
     if stored.is_file():
-        values, _ = converted(json.loads(stored.read_text(encoding="utf-8")))
-        return make_spec(values, str(stored)), path.absolute().parents[1]
+        values = read_json(stored, kind=StudyError)
+        return make_spec(
+            converted(values)[0] if isinstance(values, dict) else values, str(stored)
+        ), path.absolute().parents[1]
     if path.is_dir():
         raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
     return read_study(path), results

@@ -14,6 +14,7 @@ from optuna.trial import FrozenTrial, TrialState
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.seeding import stream
 
+from . import cmaes_state
 from .emfoa_sampler import EmfoaSampler
 from .study_file import StudySpec
 
@@ -105,6 +106,7 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
     if spec.sampler == "cmaes":
         if find_spec("cmaes") is None:
             raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
+        cmaes_state.restrict()
         return optuna.samplers.CmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS)
     return EmfoaSampler(seed=seed, n_trials=spec.trials)
 

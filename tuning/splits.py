@@ -6,17 +6,14 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 from typing import Any, Literal, cast
 
-import numpy as np
-
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.part import Part, part_of
 from dynslam_bench.sequences.synthetic import HELD_OUT_INSTANCES, TUNE_INSTANCES
 
 from .blocks import Block
+from .same_recording import is_rendered, same_recording
 
-_COMPARED = 3
-"""So many of the frames that two recordings have in common by their stamps are compared pixel by pixel."""
 OVERRIDE = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
 
 Split = Literal["tune", "confirm", "held_out"]
@@ -28,9 +25,9 @@ def check_splits(
     """Open every block of a study and compare its splits.
 
     Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
-    a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder. `tune` and `confirm`
-    may share a scene, but no frames from the same start. A sequence that the catalogue, or its instance, gives to one
-    split must not stand in the other.
+    a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
+    names, other stamps or other image files (`same_recording`). `tune` and `confirm` may share a scene, but no frames
+    from the same start. A sequence that the catalogue, or its instance, gives to one split must not stand in the other.
 
     Args:
         name: Of the study.
@@ -107,25 +104,9 @@ def _misplaced(name: str, used: str, own: str) -> str:
 
 
 def _overlap(one: Any, part: Part, other: Any, other_part: Part) -> bool:
-    """Whether two sequences film the same: the same content, or the same images at the same stamps."""
+    """Whether two sequences film the same: the same content by digest, or the same images on the same way."""
     if part.scene == other_part.scene:
         return True
-    if part.noise is not None or other_part.noise is not None or (_is_rendered(one) and _is_rendered(other)):
+    if is_rendered(one) and is_rendered(other):
         return False  # rendered scenes are told apart by their parameters
-    _, here, there = np.intersect1d(
-        np.round(one.timestamps, 6), np.round(other.timestamps, 6), assume_unique=True, return_indices=True
-    )
-    picked = np.unique(np.linspace(0, len(here) - 1, min(_COMPARED, len(here))).astype(np.intp))
-    return any(_same_images(one, int(here[k]), other, int(there[k])) for k in picked)
-
-
-def _is_rendered(sequence: Any) -> bool:
-    return hasattr(sequence, "scene_digest")
-
-
-def _same_images(one: Any, index: int, other: Any, other_index: int) -> bool:
-    frame, twin = one[index], other[other_index]
-    if frame.rgb.shape != twin.rgb.shape or not np.array_equal(frame.rgb, twin.rgb):
-        return False
-    raw, twin_raw = frame.depth * one.camera.depth_factor, twin.depth * other.camera.depth_factor
-    return raw.shape == twin_raw.shape and bool(np.allclose(raw, twin_raw, atol=0.5))  # as stored, whatever the camera
+    return same_recording(one, other)

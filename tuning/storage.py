@@ -10,6 +10,7 @@ import optuna
 
 from dynslam_bench.core.errors import StudyError
 
+from .storage_address import check_scheme, without_password
 from .study_file import StudySpec
 
 JOURNAL = "journal.log"
@@ -24,8 +25,10 @@ def open_storage(results: Path, spec: StudySpec) -> optuna.storages.BaseStorage:
     """Open, or begin, the storage of a study.
 
     Raises:
-        StudyError: It cannot be reached or written.
+        StudyError: It cannot be reached or written, or is of no kind that is known.
     """
+    if spec.storage:
+        check_scheme(spec.storage)
     try:
         if not spec.storage:
             folder = study_folder(results, spec)
@@ -40,7 +43,8 @@ def open_storage(results: Path, spec: StudySpec) -> optuna.storages.BaseStorage:
     except Exception as error:  # drivers raise whatever they like
         where = spec.storage or str(study_folder(results, spec))
         line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise StudyError(f"cannot open the storage {where}: {line}", "check the address and the permissions") from error
+        said = without_password(f"cannot open the storage {where}: {line}", spec.storage)
+        raise StudyError(said, "check the address and the permissions") from None
 
 
 def worker_name() -> str:

@@ -6,6 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.reading import read_json
+
 from .old_form import NEW, converted, is_old
 from .study_file import StudySpec
 
@@ -14,8 +17,8 @@ def as_stored(spec: StudySpec, file: Path) -> StudySpec:
     """A study that is only read, with the start offsets that it had: one of before there were any began at frame 0."""
     if "offsets" in spec.model_fields_set or not file.is_file():
         return spec
-    stored = json.loads(file.read_text())
-    return spec if "offsets" in stored else spec.model_copy(update={"offsets": (0,)})
+    stored = read_json(file, kind=StudyError)
+    return spec if not isinstance(stored, dict) or "offsets" in stored else spec.model_copy(update={"offsets": (0,)})
 
 
 def same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:

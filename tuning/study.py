@@ -20,6 +20,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 import dynslam_bench
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.harmless import storable
+from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.settings import apply_overrides, flatten
 from dynslam_bench.runs import RunStore
@@ -35,6 +37,7 @@ from .objectives import Objective, Outcomes, find_objective
 from .samplers import build_sampler, set_constraints
 from .space import default_configuration, search_space, suggest
 from .storage import open_storage, study_folder, worker_is_dead, worker_name
+from .storage_address import without_password
 from .stored_identity import as_stored, difference, same
 from .study_file import StudySpec
 from .trials import best_trials, errors_in, errors_of
@@ -105,7 +108,7 @@ class Tuner:
         self.objectives = [find_objective(each) for each in spec.objectives] if objectives is None else list(objectives)
         sampler = build_sampler(spec) if sampler is None else sampler
         self.design = design_of(spec, accept=reading)
-        self.steps = race.steps(spec.race, len(self.design.race))
+        self.steps = self._steps()
         self.store = RunStore(self.results)
         self.store.prepare()
         self.folder = study_folder(self.results, spec)
@@ -179,6 +182,14 @@ class Tuner:
     def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
         """The overrides that a trial ran with."""
         return {**self.spec.space.fixed, **trial.params}
+
+    def _steps(self) -> list[int]:
+        """The steps of the race at which every objective has a block that counts."""
+        found = race.steps(self.spec.race, len(self.design.race))
+        return [
+            step for step in found[:-1]
+            if all(any(map(each.counts, self.design.race[:step])) for each in self.objectives)
+        ] + found[-1:]  # fmt: skip
 
     def _one(self, on_event: OnEvent | None) -> None:
         with self._lock:
@@ -277,7 +288,8 @@ class Tuner:
         except KeyError as error:
             raise StudyError(absent, "dynslam-bench tune run STUDY.toml") from error
         except Exception as error:  # storages raise their drivers' errors
-            raise StudyError(f"cannot open study '{name}': {error}") from error
+            said = without_password(f"cannot open study '{name}': {error}", self.spec.storage)
+            raise StudyError(said) from None
         stored, identity = _identity_of(study), self._identity()
         if stored is None:
             raise StudyError(
@@ -289,13 +301,13 @@ class Tuner:
                 f"give the study another name, or delete {self.folder}",
             )
         if not self.spec.storage:
-            write_atomic(self.folder / "study.json", json.dumps(self.spec.model_dump(mode="json"), indent=2) + "\n")
+            write_atomic(self.folder / "study.json", json.dumps(self.spec.for_others(), indent=2) + "\n")
         return study
 
     def _begin(self, study: optuna.Study) -> None:
         """What a new study begins with; the identity comes last, others wait for it."""
-        study.set_user_attr("spec", self.spec.model_dump(mode="json"))
-        study.set_user_attr("command", list(sys.argv))
+        study.set_user_attr("spec", self.spec.for_others())
+        study.set_user_attr("command", [without_passwords(word) for word in storable(sys.argv)])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             study.set_metric_names(list(self.spec.objectives))

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
+from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.toml import read_toml
 
 from .blocks import Block, parse_blocks
 from .old_form import converted
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
 RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
@@ -80,7 +76,8 @@ class StudySpec(_Part):
         race: How trials drop out: by sequential ``halving`` over growing sets of blocks, by successive ``rejection``
             after every block, by ``wilcoxon``'s test against the best one, or ``none``.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
-            ``postgresql://``, ``grpc://host:port``).
+            ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
+            ``~/.pgpass``): it is in no file that is written.
         protocol: Protocol of the errors; lost frames are always held at the last pose.
         cache: Whether trials use the stage cache.
         threads: Threads of a run.
@@ -148,6 +145,10 @@ class StudySpec(_Part):
         free = {"trials", "timeout_s", "top", "storage", "pilot"}
         return digest(self.model_dump(mode="json", exclude=free))
 
+    def for_others(self) -> dict[str, Any]:
+        """The study as it is written down beside its trials: without the password of its storage."""
+        return self.model_dump(mode="json") | {"storage": without_passwords(self.storage)}
+
 
 def read_study(path: str | Path, on_note: Callable[[str], None] | None = None) -> StudySpec:
     """Read a study file.
@@ -160,20 +161,14 @@ def read_study(path: str | Path, on_note: Callable[[str], None] | None = None) -
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    try:
-        values = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise StudyError(f"cannot read the study {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path} is not TOML: {error}") from error
-    values, notes = converted({"name": path.stem, **values})
+    values, notes = converted({"name": path.stem, **read_toml(path, kind=StudyError)})
     if on_note is not None:
         for text in notes:
             on_note(f"{path} has an old form: {text}")
     return make_spec(values, str(path))
 
 
-def make_spec(values: Mapping[str, Any], where: str) -> StudySpec:
+def make_spec(values: Any, where: str) -> StudySpec:
     """A study from its values.
 
     Args:

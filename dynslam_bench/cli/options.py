@@ -62,7 +62,7 @@ Degrade = Annotated[
     ),
 ]
 Cache = Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")]
-Video = Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")]
+Video = Annotated[bool, typer.Option("--video", help="Write video.webm beside the run.")]
 Sheet = Annotated[
     bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
 ]
@@ -111,13 +111,10 @@ def read_settings(file: Path) -> dict[str, Any]:
     Raises:
         SettingsError: The file cannot be read, or is no TOML.
     """
-    from dynslam_bench.core.errors import SequenceError, SettingsError
+    from dynslam_bench.core.errors import SettingsError
     from dynslam_bench.core.toml import read_toml
 
-    try:
-        document = read_toml(file.expanduser())
-    except SequenceError as error:
-        raise SettingsError(str(error)) from None
+    document = read_toml(file.expanduser(), kind=SettingsError)
     values = document.get("settings", document)
     if not isinstance(values, dict):
         raise SettingsError(f"'settings' in {file} is {values!r}, not a table")

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from dynslam_bench.core.download_progress import Report
+from dynslam_bench.core.harmless import printable
 
 SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
@@ -29,8 +30,11 @@ def for_scripts(asked: bool) -> bool:
 
 
 def write(text: str = "", *, now: bool = False) -> None:
-    """Write a line to standard output; `now` also where nobody watches, ahead of what follows."""
-    sys.stdout.write(text + "\n")
+    """Write a line to standard output; `now` also where nobody watches, ahead of what follows.
+
+    What it names may come from anywhere: a terminal is never handed what it would act upon.
+    """
+    sys.stdout.write(printable(text) + "\n")
     if now:
         sys.stdout.flush()
 
@@ -38,7 +42,12 @@ def write(text: str = "", *, now: bool = False) -> None:
 def note(text: str) -> None:
     """Write a line for people to standard error, only if they watch and nobody asked for JSON."""
     if sys.stderr.isatty() and not _for_scripts:
-        sys.stderr.write(text + "\n")
+        complain(text)
+
+
+def complain(text: str) -> None:
+    """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
+    sys.stderr.write(printable(text) + "\n")
 
 
 def write_json(value: Any) -> None:
@@ -59,7 +68,7 @@ def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, shr
     if sys.stdout.isatty():
         cells = fitted(cells, [columns.index(name) for name in shrink if name in columns], _terminal_width())
     head, *body = aligned(cells).split("\n")
-    write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
+    sys.stdout.write(f"\033[1m{head}\033[0m\n" if sys.stdout.isatty() else f"{head}\n")
     for line in body:
         write(line)
 
@@ -117,7 +126,7 @@ def heartbeat() -> Iterator[Callable[[str], None]]:
         now = time.monotonic()
         if now - told >= HEARTBEAT_S and not _for_scripts:
             told = now
-            sys.stderr.write(f"{text}, {now - began:.0f} s\n")
+            complain(f"{text}, {now - began:.0f} s")
             sys.stderr.flush()
 
     yield beat
@@ -139,7 +148,7 @@ class _Lines:
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            sys.stderr.write(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far\n")
+            complain(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 
@@ -170,13 +179,14 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
     amount = DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
-    columns = [TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn()]
+    columns = [TextColumn("{task.description}", markup=False), BarColumn(), amount, TimeRemainingColumn()]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(label, total=1)
+        task = bar.add_task(printable(label), total=1)
 
         def told(done: float, total: float | None, what: str = "") -> None:
             shown = f"{label}: {what}" if what else label
-            bar.update(task, completed=done, total=total if total is not None else done + 1, description=shown)
+            total = total if total is not None else done + 1
+            bar.update(task, completed=done, total=total, description=printable(shown))
 
         yield told
 
@@ -197,7 +207,7 @@ def _text(value: object) -> str:
         return f"{value:.4g}"
     if isinstance(value, (list, tuple, set, frozenset)):
         return ", ".join(_text(part) for part in (sorted(value) if isinstance(value, (set, frozenset)) else value))
-    return str(value)
+    return printable(" ".join(str(value).splitlines()))
 
 
 def _plain(value: Any) -> Any:

@@ -38,6 +38,9 @@ def make(
         str,
         typer.Option(help="common: rank on the sequences that all have; all: only trackers that have all."),
     ] = "common",
+    rank_seen: Annotated[
+        bool, typer.Option("--rank-seen", help="Rank also where the network behind the masks was trained.")
+    ] = False,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     as_json: AsJson = False,
 ) -> None:
@@ -55,6 +58,7 @@ def make(
         reference=reference,
         title=title,
         on="all" if on == "all" else "common",
+        rank_seen=rank_seen,
     )
     if as_json:
         write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
-from .output import write_json, write_table
+from .output import complain, write, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunStore
@@ -46,7 +47,35 @@ def show_runs(
     write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
 
 
+def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> None:
+    """Where the pictures of runs lie; on standard error for which runs there are none, and why."""
+    by_id = {record.run_id: record for record in records}
+    for (run_id, record), name in product(by_id.items(), names):
+        path = store.folder(run_id) / name
+        if not path.is_file():
+            ended = f"no {name}: the run ended early, {record.status}"
+            complain(f"{next((text for text in record.notes if text.startswith(f'no {name}')), ended)} ({run_id})")
+        elif not as_json:
+            write(str(path))
+
+
+def seen_note(records: Sequence[RunRecord]) -> str:
+    """One line on the runs whose network was trained on what it judged; empty without any."""
+    from dynslam_bench.segmentation.training_set import seen_in_training
+
+    seen = [r.sequence.id for r in records if seen_in_training(r.segmentation, r.sequence.id)]
+    if not seen:
+        return ""
+    return (
+        f"{len(seen)} of {len(records)} runs have masks of a network that was trained on their scene, the first on "
+        f"{seen[0]}: a best case, which reports mark and do not rank; instances 100-199 are held out, e.g. "
+        f"{seen[0].partition('?')[0].partition('@')[0]}@100"
+    )
+
+
 def _row(record: RunRecord, store: RunStore, protocol: str) -> dict[str, Any]:
+    from dynslam_bench.segmentation.training_set import seen_in_training
+
     metrics = {} if record.status == "stopped" else store.score(record, protocol).metrics
     return {
         "run": record.run_id,
@@ -64,6 +93,7 @@ def _row(record: RunRecord, store: RunStore, protocol: str) -> dict[str, Any]:
         "coverage": record.coverage,
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "masks": record.segmentation,
+        "seen_in_training": seen_in_training(record.segmentation, record.sequence.id),
         "reason": record.reason,
         "protocol": protocol,
         "folder": str(store.folder(record.run_id)),

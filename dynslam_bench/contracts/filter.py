@@ -34,6 +34,7 @@ class FrameBundle:
         xy: float64 ``[N, 2]``, undistorted pixels of the keypoints.
         z: float32 ``[N]``, depth at the keypoints, metres, 0 missing.
         instances: What the segmenter found; None if no segmenter ran.
+        mask: bool ``[H, W]``, the pixels held for dynamic because of what they show, dilated; None if nobody asked.
     """
 
     index: int
@@ -45,6 +46,7 @@ class FrameBundle:
     xy: NDArray[np.float64]
     z: NDArray[np.float32]
     instances: Instances | None = None
+    mask: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)

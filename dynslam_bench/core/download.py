@@ -1,4 +1,4 @@
-"""Resumable download of one file over HTTP."""
+"""Resumable download of one file over HTTP, bounded in size and time."""
 
 from __future__ import annotations
 
@@ -13,16 +13,22 @@ import shutil
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .address import check_address, connect
 from .download_progress import Progress, Report, reporting
-from .errors import DownloadError
+from .errors import DownloadError, DynslamError
+from .passwords import without_passwords
+from .reading import read_json
 
 __all__ = ["CHUNK", "Progress", "Report", "download", "file_sha256", "forget"]
 
 CHUNK = 1 << 18
+MOST_BYTES = 32 * 2**30
+DEADLINE_S = 24 * 3600.0
 
 
 def download(
@@ -34,51 +40,79 @@ def download(
     attempts: int = 6,
     wait_s: float = 1.0,
     timeout_s: float = 30.0,
+    most_bytes: int = MOST_BYTES,
+    deadline_s: float = DEADLINE_S,
 ) -> str:
     """Download a file; what an earlier call got is kept, and the download goes on where that stopped.
 
     The bytes gather in ``<target>.part``; `target` appears only when it is whole and its checksum fits.
 
     Args:
-        url: An ``http`` or ``https`` address.
+        url: An ``https`` address, or an ``http`` one where the checksum is known.
         target: The file to write.
         sha256: Expected checksum, or its first digits; None if it is not known.
         progress: Called with the bytes done; None leaves that to what `download_progress.show_downloads` was given.
         attempts: Connections in a row that may fail without bringing a single byte.
         wait_s: Pause before the second attempt, doubled before each further one.
         timeout_s: How long a connection may be silent.
+        most_bytes: A longer file is refused.
+        deadline_s: How long all of it may take.
 
     Returns:
         SHA-256 of the file.
 
     Raises:
-        DownloadError: The server cannot be reached, refuses, or announces another length than it sends; the disk is
-            full; the checksum is wrong (then the bytes are thrown away), or another process downloads the same file.
+        DownloadError: The address is none; the server cannot be reached, refuses, redirects to something else than the
+            web, or announces another length than it sends; the file is too long or takes too long; the disk is full;
+            the checksum is wrong (then the bytes are thrown away), or another process downloads the same file.
     """
-    if not url.startswith(("http://", "https://")):
-        raise DownloadError(f"cannot download {url}", "the address has to begin with http:// or https://")
+    check_address(url, checked=sha256 is not None)
     part = target.with_name(target.name + ".part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DownloadError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
-    with _only_one(part.with_name(part.name + ".lock"), url), reporting(target.name, progress) as report:
-        here = target if target.is_file() else part
-        if here is part:
-            _complete(url, part, report, attempts, wait_s, timeout_s)
-        found = file_sha256(here, report)
-        if sha256 is not None and not found.startswith(sha256):
-            size = here.stat().st_size
-            here.unlink()
+    bounds = _Bounds(most_bytes, time.monotonic() + deadline_s, deadline_s)
+    try:
+        with _only_one(part.with_name(part.name + ".lock"), url), reporting(target.name, progress) as report:
+            here = target if target.is_file() else part
+            if here is part:
+                _complete(url, part, report, attempts, wait_s, timeout_s, bounds)
+            found = file_sha256(here, report)
+            if sha256 is not None and not found.startswith(sha256):
+                size = here.stat().st_size
+                here.unlink()
+                forget(part)
+                raise DownloadError(
+                    f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
+                    "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
+                )
+            if here is part:
+                part.replace(target)
+                forget(part)
+            return found
+    except OSError as error:
+        raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """How long a file may be, and until when it has to be here."""
+
+    most_bytes: int
+    deadline: float
+    seconds: float
+
+    def check(self, url: str, part: Path, size: int) -> None:
+        """Refuse what is too long, and throw away what came of it; end what takes too long, and keep it."""
+        if size > self.most_bytes:
             forget(part)
+            raise DownloadError(f"{url} is longer than the {self.most_bytes / 1e9:.2f} GB that are expected, refused")
+        if time.monotonic() > self.deadline:
             raise DownloadError(
-                f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
-                "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
+                f"download of {url} stopped at {_size(part)} bytes: it took longer than {self.seconds:g} s",
+                "run the same command again, it goes on from there",
             )
-        if here is part:
-            part.replace(target)
-            forget(part)
-        return found
 
 
 def forget(part: Path) -> None:
@@ -99,19 +133,22 @@ def file_sha256(path: Path, progress: Report | None = None) -> str:
     return value.hexdigest()
 
 
-def _complete(url: str, part: Path, report: Report, attempts: int, wait_s: float, timeout_s: float) -> None:
+def _complete(
+    url: str, part: Path, report: Report, attempts: int, wait_s: float, timeout_s: float, bounds: _Bounds
+) -> None:
     """Connect until the partial file is whole."""
     fruitless, pause, reason, best = 0, wait_s, "", _size(part)
     while fruitless < attempts:
+        bounds.check(url, part, _size(part))
         try:
-            if _one_connection(url, part, report, timeout_s):
+            if _one_connection(url, part, report, timeout_s, bounds):
                 return
             reason = "the server closed the connection early"
         except urllib.error.HTTPError as error:
             if error.code < 500 and error.code not in (408, 429):
                 raise DownloadError(f"the server answers {error.code} {error.reason} for {url}") from error
             reason = f"the server answers {error.code} {error.reason}"
-        except (OSError, http.client.HTTPException) as error:  # no route, time-out, reset, TLS
+        except (OSError, http.client.HTTPException, ValueError) as error:  # no route, time-out, TLS, an odd redirect
             reason = str(getattr(error, "reason", "") or error) or type(error).__name__
         if _size(part) > best:
             fruitless, pause, best = 0, wait_s, _size(part)
@@ -128,10 +165,10 @@ def _complete(url: str, part: Path, report: Report, attempts: int, wait_s: float
     )
 
 
-def _one_connection(url: str, part: Path, report: Report, timeout_s: float) -> bool:
+def _one_connection(url: str, part: Path, report: Report, timeout_s: float, bounds: _Bounds) -> bool:
     """One request from where the partial file ends; True if the file is whole afterwards."""
     start, notes = _size(part), _read_notes(part)
-    if start and notes.get("url") != url:
+    if start and notes.get("url") != without_passwords(url):
         forget(part)
         start, notes = 0, {}
     request = urllib.request.Request(url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"})
@@ -140,7 +177,7 @@ def _one_connection(url: str, part: Path, report: Report, timeout_s: float) -> b
         if validator := notes.get("etag") or notes.get("modified"):
             request.add_header("If-Range", validator)
     try:
-        response = urllib.request.urlopen(request, timeout=timeout_s)
+        response = connect(request, timeout_s)
     except urllib.error.HTTPError as error:
         if error.code != 416 or not start:
             raise
@@ -157,11 +194,14 @@ def _one_connection(url: str, part: Path, report: Report, timeout_s: float) -> b
         length = response.headers.get("Content-Length")
         total = start + int(length) if length is not None and length.isdigit() else None
         _write_notes(part, url, total, response.headers)
+        bounds.check(url, part, total or start)
         _check_space(part, total, start)
-        return _receive(response, part, start, total, report)
+        return _receive(response, part, start, total, report, lambda size: bounds.check(url, part, size))
 
 
-def _receive(response: Any, part: Path, start: int, total: int | None, report: Report) -> bool:
+def _receive(
+    response: Any, part: Path, start: int, total: int | None, report: Report, check: Callable[[int], None]
+) -> bool:
     """Append the body to the partial file; True if it came to its announced end."""
     done = start
     try:
@@ -175,6 +215,7 @@ def _receive(response: Any, part: Path, start: int, total: int | None, report: R
                     return False
                 if not block:
                     return total is None or done == total
+                check(done + len(block))
                 file.write(block)
                 done += len(block)
                 report(Progress("download", done, total))
@@ -235,8 +276,8 @@ def _notes(part: Path) -> Path:
 
 def _read_notes(part: Path) -> dict[str, Any]:
     try:
-        notes = json.loads(_notes(part).read_text())
-    except (OSError, ValueError):
+        notes = read_json(_notes(part))
+    except DynslamError:
         return {}
     return notes if isinstance(notes, dict) else {}
 
@@ -244,7 +285,7 @@ def _read_notes(part: Path) -> dict[str, Any]:
 def _write_notes(part: Path, url: str, total: int | None, headers: Any) -> None:
     etag = headers.get("ETag")
     notes = {
-        "url": url,
+        "url": without_passwords(url),
         "total": total,
         "etag": None if etag is None or etag.startswith("W/") else etag,  # a weak one cannot validate a range
         "modified": headers.get("Last-Modified"),

@@ -1,10 +1,15 @@
-"""Files and folders written under another name, then renamed: no half of one is ever seen under its own name."""
+"""Files and folders written under another name, then renamed: no half of one is ever seen under its own name.
+
+What is written has the permissions that the user's umask gives.
+"""
 
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import shutil
-import tempfile
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,12 +27,10 @@ def replacing(path: Path) -> Iterator[Path]:
         OSError: The folder cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = _beside(path)
+    temporary.touch(exist_ok=False)
     try:
         yield temporary
-        temporary.chmod(0o644)
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -42,7 +45,7 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     """
     try:
         with replacing(path) as temporary:
-            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+            temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
     except OSError as error:
         reason = f"cannot write {path}: {error.strerror}"
         raise DynslamError(reason, "check the permissions and the free space") from error
@@ -54,11 +57,11 @@ def replace_folder(work: Path, target: Path) -> None:
     Raises:
         OSError: It cannot be renamed; then `target` is as it was.
     """
-    work.chmod(0o755)
     if not target.exists():
         work.replace(target)
         return
-    stale = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
+    stale = _beside(target)
+    stale.mkdir()
     try:
         target.replace(stale / "old")
         try:
@@ -74,14 +77,17 @@ def replace_folder(work: Path, target: Path) -> None:
 def atomic_folder(target: Path) -> Iterator[Path]:
     """A temporary folder beside `target` that becomes `target` when the block ends without an error.
 
-    An existing target is replaced. If the block raises, or the process dies, `target` is as it was.
+    An existing target is replaced. If the block raises, or the process dies, `target` is as it was; what a process of
+    this machine left when it died is swept up by the next one.
 
     Raises:
         DynslamError: The parent folder cannot be written.
     """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+        _sweep(target)
+        work = _beside(target)
+        work.mkdir()
     except OSError as error:
         raise DynslamError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
     try:
@@ -89,3 +95,28 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         replace_folder(work, target)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _beside(target: Path) -> Path:
+    """A hidden name beside a target that tells whose it is."""
+    return target.with_name(f".{target.name}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}")
+
+
+def _sweep(target: Path) -> None:
+    """Remove the hidden folders beside a target that belonged to processes of this machine that are no more."""
+    pattern = re.compile(rf"\.{re.escape(target.name)}\.{re.escape(socket.gethostname())}\.(\d+)\.[0-9a-f]{{8}}")
+    for left in target.parent.iterdir():
+        match = pattern.fullmatch(left.name)
+        if match and not process_exists(int(match[1])):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def process_exists(pid: int) -> bool:
+    """Whether a process of this machine has that number."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

@@ -16,11 +16,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import entry_points
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-from .errors import PluginError, did_you_mean
+from .errors import DynslamError, PluginError, did_you_mean
+from .plugin_probe import check_import
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_PLUGINS"
 Kind = Literal["trackers", "segmenters", "features", "flow", "filters", "sequences"]
@@ -125,7 +127,8 @@ class Registry(Generic[P]):
             add(lambda target=target: load_object(target), f"{ENVIRONMENT_VARIABLE}: {target}")  # type: ignore[misc]
         for point in sorted(entry_points(group=f"dynslam_bench.{self.kind}"), key=lambda point: point.name):
             distribution = point.dist.name if point.dist else "unknown distribution"
-            add(point.load, f"entry point '{point.name}' of {distribution}")
+            target = f"{point.module}:{point.attr}"
+            add(lambda target=target: load_object(target), f"entry point '{point.name}' of {distribution}")  # type: ignore[misc]
         for spec in self._builtin():
             add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
         self._found = found
@@ -143,29 +146,48 @@ def load_object(target: str) -> Any:
     """Import ``package.module:Attr`` or ``path/to/file.py:Attr``.
 
     Raises:
-        PluginError: The module cannot be imported or lacks the attribute; carries the original reason.
+        PluginError: The module cannot be imported, would end this process, or lacks the attribute; carries the original
+            reason.
     """
     location, separator, attribute = target.rpartition(":")
     if not separator or not location or not attribute:
         raise PluginError(
             f"'{target}' is not module:Attr", "for example my_package.trackers:SPEC or my_tracker.py:SPEC"
         )
+    if not _is_imported(location):
+        check_import(location)
     try:
-        module = _load_file(Path(location)) if location.endswith(".py") else importlib.import_module(location)
-    except Exception as error:
+        module = import_module(location)
+    except (Exception, SystemExit) as error:
         raise PluginError(f"cannot import {location}: {_reason(error)}") from error
     try:
-        return getattr(module, attribute)
+        return attrgetter(attribute)(module)
     except AttributeError:
         public = [name for name in vars(module) if not name.startswith("_")]
         raise PluginError(f"{location} has no '{attribute}'", did_you_mean(attribute, public)) from None
+
+
+def import_module(location: str) -> ModuleType:
+    """The module of a name, or of the path of a ``.py`` file; whatever the import raises."""
+    return _load_file(Path(location)) if location.endswith(".py") else importlib.import_module(location)
+
+
+def _is_imported(location: str) -> bool:
+    """Whether a module is there already, comes with this package, or does not exist as a file."""
+    if not location.endswith(".py"):
+        return location in sys.modules or location.partition(".")[0] == __name__.partition(".")[0]
+    return _module_name(Path(location)) in sys.modules or not Path(location).expanduser().is_file()
+
+
+def _module_name(path: Path) -> str:
+    return f"_dynslam_bench_plugin_{sha256(str(path.expanduser().resolve()).encode()).hexdigest()[:12]}"
 
 
 def _load_file(path: Path) -> ModuleType:
     resolved = path.expanduser().resolve()
     if not resolved.is_file():
         raise FileNotFoundError(f"no file {resolved}")
-    name = f"_dynslam_bench_plugin_{sha256(str(resolved).encode()).hexdigest()[:12]}"
+    name = _module_name(path)
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, resolved)
@@ -192,4 +214,6 @@ def _environment_targets(kind: Kind) -> list[str]:
 
 def _reason(error: BaseException) -> str:
     text = str(error).strip().splitlines()
+    if isinstance(error, DynslamError):
+        return text[-1]
     return f"{type(error).__name__}: {text[-1]}" if text else type(error).__name__

@@ -5,42 +5,62 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticSerializationError
 
 from .errors import DynslamError
 from .files import atomic_folder, write_atomic
+from .harmless import storable
+from .passwords import without_passwords
+from .reading import RECORD_BYTES, read_text
 
-__all__ = ["Record", "atomic_folder", "digest", "write_atomic"]
+__all__ = ["Digest", "Record", "atomic_folder", "digest", "write_atomic"]
 
 R = TypeVar("R", bound="Record")
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+"""Sixteen hexadecimal digits, as `digest` makes them; nothing else names a file or folder."""
 
 
 class Record(BaseModel):
     """Base of everything that is written to disk and read back; unknown keys of newer versions are refused."""
 
     model_config = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
+    most_bytes: ClassVar[int] = RECORD_BYTES
+    """A larger file is not read."""
 
     def to_json(self) -> str:
-        """The record as indented JSON with a final newline."""
-        return self.model_dump_json(indent=2) + "\n"
+        """The record as indented JSON with a final newline; no password, and nothing that UTF-8 cannot hold."""
+        try:
+            text = self.model_dump_json(indent=2)
+        except (PydanticSerializationError, UnicodeEncodeError):  # half characters, e.g. of a foreign command line
+            text = type(self).model_validate(storable(self.model_dump())).model_dump_json(indent=2)
+        return without_passwords(text) + "\n"
 
     @classmethod
     def read(cls: type[R], path: Path) -> R:
         """Read and validate a record.
 
         Raises:
-            DynslamError: The file is missing, is not JSON or does not fit the schema; names file and first fault.
+            DynslamError: The file is missing, too large, no UTF-8, no JSON or does not fit the schema; names file and
+                first fault.
+        """
+        return cls.parse(read_text(path, limit=cls.most_bytes), str(path))
+
+    @classmethod
+    def parse(cls: type[R], text: str, where: str) -> R:
+        """Validate a record's JSON; `where` says in messages what it is.
+
+        Raises:
+            DynslamError: It is no JSON or does not fit the schema; names the first fault.
         """
         try:
-            return cls.model_validate_json(path.read_text())
-        except OSError as error:
-            raise DynslamError(f"cannot read {path}: {error.strerror}") from error
+            return cls.model_validate_json(text)
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(map(str, first["loc"])) or "file"
-            raise DynslamError(f"{path} is not a valid {cls.__name__}: {where}: {first['msg']}") from error
+            place = ".".join(map(str, first["loc"])) or "file"
+            raise DynslamError(f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}") from error
 
 
 def digest(value: Any, length: int = 12) -> str:

@@ -357,7 +357,7 @@ def _parse(value: Any) -> Any:
         return value
     try:
         return json.loads(value)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return value
 
 
@@ -367,4 +367,13 @@ def _explain(cls: type[Settings], error: ValidationError) -> SettingsError:
     if first["type"] == "extra_forbidden":
         return SettingsError(f"unknown setting '{name}'", did_you_mean(name, field_names(cls)))
     message = first["msg"][0].lower() + first["msg"][1:]
-    return SettingsError(f"setting '{name}' is {first['input']!r}: {message}")
+    return SettingsError(f"setting '{name}' is {_shown(first['input'])}: {message}")
+
+
+def _shown(value: Any) -> str:
+    """A value for a message; one of thousands of digits or characters is cut short."""
+    try:
+        text = repr(value)
+    except ValueError:  # more digits than Python writes out
+        return "a number of thousands of digits"
+    return text if len(text) <= 200 else f"{text[:200]}..."

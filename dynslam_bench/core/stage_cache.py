@@ -8,9 +8,10 @@ over its bound.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import io
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ DEFAULT_MAX_BYTES = 8 * 2**30
 _PRUNE_EVERY = 512
 """Writes between two looks at the cache's size."""
 _SHRINK_TO = 0.8
+_DIGEST = 16
+"""Bytes of the checksum at the beginning of an entry."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -73,13 +76,12 @@ class StageCache:
             data = path.read_bytes()
         except OSError:
             return None
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            cost = float(arrays.pop("cost_s"))
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
-            path.unlink(missing_ok=True)
+        arrays = _unpack(data)
+        if arrays is None:
+            with contextlib.suppress(OSError):  # a cache that can only be read keeps its damaged entries
+                path.unlink(missing_ok=True)
             return None
+        cost = float(arrays.pop("cost_s"))
         try:
             os.utime(path)
         except OSError:
@@ -93,8 +95,10 @@ class StageCache:
             DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
         """
         path = self._path(stage, key)
-        buffer = io.BytesIO()
+        buffer = io.BytesIO(bytes(_DIGEST))
+        buffer.seek(_DIGEST)
         np.savez(buffer, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
+        buffer.getbuffer()[:_DIGEST] = _digest_of(buffer.getbuffer())
         try:
             with replacing(path) as temporary:
                 temporary.write_bytes(buffer.getbuffer())
@@ -152,3 +156,15 @@ class StageCache:
                 continue
             found.append((status.st_mtime, path, status.st_size))
         return found
+
+
+def _unpack(data: bytes) -> Arrays | None:
+    """The arrays of an entry, None if a single bit of it is not as it was written."""
+    if data[:_DIGEST] != _digest_of(memoryview(data)):
+        return None
+    with np.load(io.BytesIO(data[_DIGEST:]), allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def _digest_of(entry: memoryview) -> bytes:
+    return hashlib.blake2b(entry[_DIGEST:], digest_size=_DIGEST).digest()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import field_validator
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record
@@ -93,6 +94,13 @@ class Evaluation(Record):
     alignment: AlignmentRecord
     association: AssociationRecord
     diagnostics: list[str]
+
+    @field_validator("metrics")
+    @classmethod
+    def _has_the_absolute_error(cls, metrics: dict[str, float]) -> dict[str, float]:
+        if "ate_rmse_m" not in metrics:
+            raise ValueError("the metrics lack ate_rmse_m")
+        return metrics
 
     def summary(self) -> str:
         """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""

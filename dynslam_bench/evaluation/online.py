@@ -26,6 +26,8 @@ class OnlineSample:
         way_m: Length in metres of the true path since the first frame with ground truth, straight across frames that
             have none (it was at least that); no tracker changes it.
         tracked: Whether the frame was tracked.
+        lost_way_m: Metres that the camera truly moved over the lost frames since the last tracked pose, where its
+            frame-to-frame motion is known; 0 without lost frames in between.
     """
 
     trans_m: float
@@ -34,14 +36,15 @@ class OnlineSample:
     frame_rot_deg: float | None
     way_m: float = 0.0
     tracked: bool = True
+    lost_way_m: float = 0.0
 
 
 class OnlineError:
     """Follows the pose error of a running tracker; what is known at a frame never changes later.
 
-    A frame that is lost counts as not having moved: cumulatively it stays at the last tracked pose, and frame to frame
-    an interval with a lost frame at either end is charged with the whole true motion.
-    Until a first pose is tracked the camera counts as standing at the first true pose.
+    A frame that is lost counts as not having moved: it stays at the last tracked pose, cumulatively and frame to frame,
+    as if the tracker had repeated that pose; the first tracked pose after it is a jump from there. Until a first pose
+    is tracked the camera counts as standing at the first true pose, and where it then is joins estimate and truth.
 
     Args:
         ground_truth: True camera-to-world poses at their own stamps, possibly with holes; None if there are none.
@@ -61,6 +64,7 @@ class OnlineError:
         self._previous_pose: Array | None = None
         self._last_truth: Array | None = None
         self._way_m = 0.0
+        self._lost_way_m = 0.0
 
     def truth_at(self, timestamp: float) -> Array | None:
         """The true pose ``[4, 4]`` nearest in time, or None in a hole."""
@@ -91,7 +95,9 @@ class OnlineError:
         if pose is not None and self._align is not None:
             self._held = self._align @ pose
         self._previous_truth = truth
-        self._previous_pose = pose
+        if pose is not None:
+            self._previous_pose = pose
+            self._lost_way_m = 0.0
         return sample
 
     def _sample(self, truth: Array, pose: Array | None) -> OnlineSample:
@@ -112,7 +118,9 @@ class OnlineError:
             if pose is not None and self._previous_pose is not None:
                 estimated = se3.inverse(self._previous_pose) @ pose
             frame_trans, frame_rot = _size(se3.inverse(moved) @ estimated)
-        return OnlineSample(*_size(error), frame_trans, frame_rot, self._way_m, pose is not None)
+            if pose is None:
+                self._lost_way_m += frame_trans
+        return OnlineSample(*_size(error), frame_trans, frame_rot, self._way_m, pose is not None, self._lost_way_m)
 
 
 def _size(error: Array) -> tuple[float, float]:

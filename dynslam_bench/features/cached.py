@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import FeatureExtractor, Keypoints
+from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
@@ -57,8 +59,11 @@ class CachedExtractor:
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image."""
+        return self._answer([content_digest(gray)], lambda: self._extractor.extract(gray))
+
+    def _answer(self, inputs: list[Any], compute: Callable[[], Keypoints]) -> Keypoints:
         begin = time.perf_counter()
-        key = digest([self._prefix, content_digest(gray)], 32)
+        key = digest([self._prefix, *inputs], 32)
         entry = self._cache.get("features", key)
         self.hit = entry is not None
         if entry is not None:
@@ -67,11 +72,30 @@ class CachedExtractor:
             self.saved_s = entry.cost_s - (time.perf_counter() - begin)
             return found
         start = time.perf_counter()
-        found = self._extractor.extract(gray)
+        found = compute()
         cost = time.perf_counter() - start
         self._cache.put("features", key, vars(found), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
         return found
+
+
+class CachedMaskedExtractor(CachedExtractor):
+    """The same for an extractor that knows of masks."""
+
+    _extractor: MaskedExtractor
+
+    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+        """The keypoints of a uint8 ``[H, W]`` image beside a mask; see `MaskedExtractor`."""
+        inputs = [content_digest(gray), content_digest(mask), share]
+        return self._answer(inputs, lambda: self._extractor.extract_beside(gray, mask, share))
+
+
+def cached_extractor(
+    extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int
+) -> CachedExtractor:
+    """An extractor behind the cache, which knows of masks exactly if it does."""
+    kind = CachedMaskedExtractor if isinstance(extractor, MaskedExtractor) else CachedExtractor
+    return kind(extractor, settings, cache, threads)
 
 
 def code_of(settings: Settings) -> str:

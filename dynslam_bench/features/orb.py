@@ -7,12 +7,16 @@ intensity centroid and the descriptor the rotated BRIEF of Rublee et al. (2011).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.geometry.pixels import inside
 
 from ._centroid import orientations, patch_half_widths
 from .settings import FeatureSettings
@@ -21,6 +25,37 @@ PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
 EDGE = 19
 """Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """One level of the pyramid and all its corners.
+
+    Attributes:
+        image: uint8 ``[h, w]``.
+        scale: Pixels of the given image a pixel of the level.
+        xy: float32 ``[N, 2]``, pixels of the level.
+        response: int16 ``[N]``, strengths.
+        cells: int64 ``[N]``, cell of the grid that each lies in.
+        n_cells: Cells of the grid.
+    """
+
+    image: NDArray[np.uint8]
+    scale: float
+    xy: NDArray[np.float32]
+    response: NDArray[np.int16]
+    cells: NDArray[np.int64]
+    n_cells: int
+
+    def choose(self, quota: int, threshold: int, allowed: NDArray[np.bool_] | None) -> NDArray[np.int64]:
+        """Indices of up to `quota` corners, spread over the cells; weak ones count in cells without a strong one."""
+        strong = self.response >= threshold
+        if allowed is not None:
+            strong = strong & allowed
+        filled = np.zeros(self.n_cells, bool)
+        filled[self.cells[strong]] = True
+        weak = ~filled[self.cells] if allowed is None else allowed & ~filled[self.cells]
+        return spread(self.cells, self.response, strong | weak, quota)
 
 
 class OrbExtractor:
@@ -57,17 +92,36 @@ class OrbExtractor:
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
+        levels = self._levels(gray)
+        return self._describe(gray, levels, self._chosen(levels))
+
+    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+        """As `extract`; where less than a share of `n_features` lies outside the mask, so many are sought there too."""
+        levels = self._levels(gray)
+        chosen = self._chosen(levels)
+        free = [~inside(mask, level.xy * level.scale) for level in levels]
+        if sum(np.count_nonzero(f[c]) for f, c in zip(free, chosen, strict=True)) < share * self.settings.n_features:
+            beside = self._chosen(levels, free)
+            chosen = [np.concatenate([c[~f[c]], b]) for f, c, b in zip(free, chosen, beside, strict=True)]
+        return self._describe(gray, levels, chosen)
+
+    def _levels(self, gray: NDArray[np.uint8]) -> list[_Level]:
+        """All corners of every level of the pyramid."""
         gray = np.ascontiguousarray(gray, dtype=np.uint8)
-        pyramid = self._pyramid(gray)
-        quotas = level_quotas(self.settings.n_features, len(pyramid), self.settings.scale_factor)
-        parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
+        return [self._corners(image, self.settings.scale_factor**i) for i, image in enumerate(self._pyramid(gray))]
+
+    def _chosen(
+        self, levels: Sequence[_Level], allowed: Sequence[NDArray[np.bool_]] | None = None
+    ) -> list[NDArray[np.int64]]:
+        """Indices of the chosen corners of every level, `n_features` in all, among the allowed ones."""
+        quotas = level_quotas(self.settings.n_features, len(levels), self.settings.scale_factor)
+        chosen: list[NDArray[np.int64]] = []
         missing = 0
-        for image, quota in zip(reversed(pyramid), reversed(quotas), strict=True):
-            xy, response = self._corners(image, quota + missing)
-            missing = quota + missing - len(xy)  # what a coarse level cannot give is sought in the next finer one
-            parts.append((xy, response, orientations(image, xy, self._half_widths)))
-        parts.reverse()
-        return self._describe(gray, parts)
+        for i in reversed(range(len(levels))):
+            index = levels[i].choose(quotas[i] + missing, self.settings.fast_threshold, allowed and allowed[i])
+            missing += quotas[i] - len(index)  # what a coarse level cannot give is sought in the next finer one
+            chosen.append(index)
+        return chosen[::-1]
 
     def _pyramid(self, gray: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
         height, width = gray.shape
@@ -80,25 +134,17 @@ class OrbExtractor:
             levels.append(np.asarray(cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8))
         return levels if min(height, width) > 2 * EDGE else []
 
-    def _corners(self, image: NDArray[np.uint8], quota: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to `quota` corners of one level, level pixels ``[N, 2]``, and their strengths ``[N]``."""
+    def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
         inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
         cell = self.settings.cell_px
         columns, rows = -(-inner.shape[1] // cell), -(-inner.shape[0] // cell)
         xy, response = _detect(self._detector, inner)
-        cells = _cell_of(xy, cell, columns)
-        strong = response >= self.settings.fast_threshold
-        filled = np.zeros(rows * columns, bool)
-        filled[cells[strong]] = True
-        chosen = spread(cells, response, strong | ~filled[cells], quota)
-        return xy[chosen] + np.float32(EDGE - 3), response[chosen].astype(np.float32)
+        return _Level(image, scale, xy + np.float32(EDGE - 3), response, _cell_of(xy, cell, columns), rows * columns)
 
     def _describe(
-        self,
-        gray: NDArray[np.uint8],
-        parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]],
+        self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]
     ) -> Keypoints:
-        count = sum(len(xy) for xy, _, _ in parts)
+        count = sum(len(index) for index in chosen)
         if count == 0:
             return Keypoints(
                 np.zeros((0, 2), np.float32),
@@ -107,12 +153,15 @@ class OrbExtractor:
                 np.zeros(0, np.float32),
                 np.zeros((0, 32), np.uint8),
             )
-        scales = self.settings.scale_factor ** np.arange(len(parts))
-        octave = np.repeat(np.arange(len(parts), dtype=np.int32), [len(xy) for xy, _, _ in parts])
-        level_xy = np.concatenate([xy for xy, _, _ in parts]).astype(np.float64)
-        xy = np.asarray(level_xy * scales[octave][:, None], dtype=np.float32)
-        response = np.concatenate([part for _, part, _ in parts])
-        angle = np.concatenate([part for _, _, part in parts])
+        pairs = list(zip(levels, chosen, strict=True))
+        scales = np.array([level.scale for level in levels])
+        octave = np.repeat(np.arange(len(levels), dtype=np.int32), [len(index) for index in chosen])
+        level_xy = [level.xy[index] for level, index in pairs]
+        xy = np.asarray(np.concatenate(level_xy).astype(np.float64) * scales[octave][:, None], dtype=np.float32)
+        response = np.concatenate([level.response[index] for level, index in pairs]).astype(np.float32)
+        angle = np.concatenate(
+            [orientations(level.image, at, self._half_widths) for level, at in zip(levels, level_xy, strict=True)]
+        )
         size = (2 * PATCH_RADIUS + 1) * scales[octave]
         make = cv2.KeyPoint
         points = [
@@ -121,9 +170,9 @@ class OrbExtractor:
                 zip(xy.tolist(), size.tolist(), angle.tolist(), response.tolist(), octave.tolist(), strict=True)
             )
         ]
-        kept, descriptors = self._describer.compute(gray, points)
+        kept, descriptors = self._describer.compute(np.ascontiguousarray(gray), points)
         if descriptors is None or not len(kept):
-            return self._describe(gray, [])
+            return self._describe(gray, [], [])
         index = np.array([point.class_id for point in kept], dtype=np.int64)
         return Keypoints(xy[index], octave[index], angle[index], response[index], np.ascontiguousarray(descriptors))
 

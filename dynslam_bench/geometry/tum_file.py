@@ -7,6 +7,7 @@ lines with one stamp the last holds. Whatever is not taken as it stands is count
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,11 +17,14 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.reading import read_lines
 
 from . import se3
 from .trajectory import Trajectory
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
+MOST_LINES = 4_000_000
+"""More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
 _UNIT_TOLERANCE = 0.01
 
@@ -84,7 +88,7 @@ def load_tum(path: str | Path) -> TumFile:
     path = Path(path)
     values = read_table(path, 8, _COLUMNS)
     finite = np.isfinite(values).all(axis=1)
-    norm = np.linalg.norm(np.where(np.isfinite(values), values, 0.0)[:, 4:8], axis=1)
+    norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
     counted = {
         "lines": len(values),
@@ -146,8 +150,10 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     Raises:
         TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
     """
-    rows: list[list[float]] = []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    values = array("d")
+    for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
+        if number > MOST_LINES:
+            raise TrajectoryError(f"{path} has more than {MOST_LINES} lines, too many for a trajectory")
         parts = line.partition("#")[0].replace(",", " ").replace("\t", " ").split()
         if not parts:
             continue
@@ -156,22 +162,13 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
                 f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(len(parts))
             )
         try:
-            rows.append([float(part) for part in parts])
+            values.extend(map(float, parts))
         except ValueError:
             bad = next(part for part in parts if not _is_number(part))
             raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
-    if not rows:
+    if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
-    return np.array(rows)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise TrajectoryError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path} is not a text file: byte {error.start} is no UTF-8") from error
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
 
 
 def _is_number(text: str) -> bool:

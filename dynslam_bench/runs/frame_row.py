@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.reading import parse_json, read_lines
 from dynslam_bench.geometry import se3
 
 if TYPE_CHECKING:
@@ -26,6 +28,8 @@ FIXED = (
     *("reward_m", "mask_iou"),
 )
 """Columns of every ``frames.csv``; after them come ``<stage>_s``, seconds of every stage, and ``stat_<name>``."""
+_SHARE = "dynamic_share"
+"""A column of sequences with exact masks only."""
 _STAT = "stat_"
 _SECONDS = "_s"
 
@@ -49,6 +53,7 @@ class FrameRow:
         stats: The tracker's diagnostics by name.
         pose: Tracked camera-to-world pose ``tx ty tz qx qy qz qw``; None unless the state is ``ok``. Not in
             ``frames.csv``: ``trajectory_online.txt`` holds it.
+        dynamic_share: Share of the pixels that show people, by the exact masks, 0 to 1; None without such masks.
     """
 
     index: int
@@ -63,9 +68,12 @@ class FrameRow:
     timings: Mapping[str, float] = field(default_factory=dict)
     stats: Mapping[str, float] = field(default_factory=dict)
     pose: Sequence[float] | None = None
+    dynamic_share: float | None = None
 
     @classmethod
-    def of(cls, outcome: FrameOutcome, mask_iou: float | None = None) -> FrameRow:
+    def of(
+        cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None
+    ) -> FrameRow:
         """The row of a frame that an environment has tracked."""
         error = outcome.error
         pose = None
@@ -85,24 +93,73 @@ class FrameRow:
             timings=dict(outcome.timings),
             stats=dict(outcome.stats),
             pose=pose,
+            dynamic_share=dynamic_share,
         )
 
     def cells(self) -> dict[str, Any]:
-        """The row by the columns of ``frames.csv``: `FIXED`, ``<stage>_s`` and ``stat_<name>``."""
+        """The row by the columns of ``frames.csv``: `FIXED`, the dynamic share, ``<stage>_s`` and ``stat_<name>``."""
+        share = {} if self.dynamic_share is None else {_SHARE: self.dynamic_share}
         times = {stage + _SECONDS: value for stage, value in self.timings.items()}
         stats = {_STAT + name: value for name, value in self.stats.items()}
-        return {name: getattr(self, name) for name in FIXED} | times | stats
+        return {name: getattr(self, name) for name in FIXED} | share | times | stats
 
     def to_json(self) -> str:
         """The row as one line of the child's log, with its newline."""
         return json.dumps(vars(self)) + "\n"
 
 
-def read_log(path: Path) -> list[FrameRow]:
-    """Read the child's log; a line that a dying process left unfinished is not taken, and no file is no frames."""
+def read_log(path: Path) -> tuple[list[FrameRow], str]:
+    """Read the child's log; no file is no frames.
+
+    Returns:
+        The rows up to the first that is damaged, and what is wrong with that, empty for none. A line that a dying
+        process left unfinished is not taken, and no damage.
+    """
+    rows: list[FrameRow] = []
     if not path.is_file():
-        return []
-    return [FrameRow(**json.loads(line)) for line in path.read_text().split("\n")[:-1]]
+        return rows, ""
+    try:
+        for line in read_lines(path, kind=RunError):
+            if line.endswith("\n"):
+                row = _from_json(line)
+                if rows and round(row.timestamp, 6) <= round(rows[-1].timestamp, 6):
+                    raise ValueError(f"stamp {row.timestamp:.6f} after {rows[-1].timestamp:.6f}")
+                rows.append(row)
+    except (DynslamError, LookupError, TypeError, ValueError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:200]
+        return rows, f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})"
+    return rows, ""
+
+
+def _from_json(line: str) -> FrameRow:
+    values = parse_json(line, "it", kind=RunError)
+    if not isinstance(values, dict) or not set(values) <= set(FrameRow.__dataclass_fields__):
+        raise ValueError("it is no frame")
+    pose = values.get("pose")
+    if pose is not None:
+        pose = [float(number) for number in pose]
+        if len(pose) != 7 or not all(map(math.isfinite, pose)) or math.hypot(*pose[3:]) < 1e-8:
+            raise ValueError("it holds no pose")
+    numbers = {name: _number(values[name]) for name in FIXED[3:] if values.get(name) is not None}
+    timestamp = float(values["timestamp"])
+    if not math.isfinite(timestamp):
+        raise ValueError(f"stamp {timestamp}")
+    return FrameRow(
+        index=int(values["index"]),
+        timestamp=timestamp,
+        state=_state(values["state"]),
+        **numbers,
+        timings={str(name): _number(number) for name, number in dict(values.get("timings", {})).items()},
+        stats={str(name): _number(number) for name, number in dict(values.get("stats", {})).items()},
+        pose=pose,
+    )
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{str(value)[:40]!r} is no number")
+    float(value)  # an integer may be too large for one
+    return value
 
 
 def column_names(rows: Iterable[FrameRow]) -> list[str]:
@@ -115,7 +172,7 @@ def column_names(rows: Iterable[FrameRow]) -> list[str]:
 def write_csv(path: Path, rows: Sequence[FrameRow]) -> None:
     """Write ``frames.csv``."""
     columns = column_names(rows)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = csv.writer(file)
         table.writerow(columns)
         for row in rows:
@@ -131,16 +188,15 @@ def read_csv(path: Path) -> list[FrameRow]:
     """
     rows: list[FrameRow] = []
     try:
-        with path.open(newline="") as file:
-            rows.extend(_parse(line) for line in csv.DictReader(file))
-    except OSError as error:
-        raise RunError(f"cannot read {path}: {error.strerror}") from error
-    except (KeyError, TypeError, ValueError) as error:
+        rows.extend(_parse(line) for line in csv.DictReader(read_lines(path, kind=RunError)))
+    except (LookupError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({error!r})") from error
     return rows
 
 
 def _parse(line: Mapping[str, str]) -> FrameRow:
+    if None in line or None in line.values():
+        raise ValueError("another number of cells than the heading has")
     cells = {name: float(text) for name, text in line.items() if text and name not in FIXED[:3]}
     stats = {name[len(_STAT) :]: value for name, value in cells.items() if name.startswith(_STAT)}
     timings = {
@@ -160,10 +216,11 @@ def _parse(line: Mapping[str, str]) -> FrameRow:
         mask_iou=cells.get("mask_iou"),
         timings=timings,
         stats=stats,
+        dynamic_share=cells.get(_SHARE),
     )
 
 
-def _state(text: str) -> FrameState:
+def _state(text: object) -> FrameState:
     for known in STATES:
         if text == known:
             return known

@@ -15,11 +15,13 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
 from .identity import ResolvedRun, resolve
 from .one import OnProgress, run_one
+from .sheet_collector import SHEET_FILE
 from .spec import RunSpec
 from .storage.packing import run_packed, unpack
 from .storage.record import FAILED, RunRecord
 from .storage.scoring import DEFAULT_PROTOCOL, score
 from .storage.store import RunStore
+from .video import VIDEO_FILE
 
 
 @dataclass(frozen=True)
@@ -189,9 +191,11 @@ class _Bench:
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
     """Whether a stored run has to be made again for a video or a sheet that is asked for now."""
     folder = store.folder(stored.run_id)
-    wanted = [name for name, asked in (("video.mp4", run.spec.video), ("sheet.png", run.spec.sheet)) if asked]
+    wanted = [name for name, asked in ((VIDEO_FILE, run.spec.video), (SHEET_FILE, run.spec.sheet)) if asked]
     excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
-    return not stored.failed and any(not (folder / name).is_file() for name in set(wanted) - excused)
+    if stored.failed:  # what ends early has no map to draw, and what saw no frame nothing at all
+        excused |= {SHEET_FILE} if stored.n_processed else set(wanted)
+    return any(not (folder / name).is_file() for name in set(wanted) - excused)
 
 
 def _statuses(retry: Collection[str]) -> set[str]:

@@ -202,6 +202,8 @@ def _judge(verdict: Verdict, frames: FrameLog, total: int) -> tuple[Status, str]
     """A run that came to its end may still have lost its way."""
     if verdict.status != "ok":
         return verdict.status, verdict.reason
+    if frames.damage:
+        return "invalid", frames.damage
     due = total - frames.count("dropped")
     tracked, streak = frames.count("ok"), frames.lost_streak()
     if tracked < LOST_COVERAGE * due:

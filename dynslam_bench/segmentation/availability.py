@@ -63,7 +63,9 @@ def masks_are_optional(settings: Settings) -> bool:
 
 def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequence) -> None:
     missing = RecordedSegmenter(folder).missing(sequence.timestamps)
-    if missing and (settings.schedule == "every" or len(missing) == len(sequence)):
+    if settings.schedule == "every_nth":  # the only schedule that says beforehand which frames it will ask for
+        missing = [index for index in missing if index % settings.n == 0]
+    if missing:
         raise SegmentationError(
             f"the folder of recorded masks {folder} has none for {len(missing)} of {len(sequence)} frames of "
             f"'{sequence.id}', the first is frame {missing[0]} ({sequence.timestamps[missing[0]]:.6f} s)",

@@ -83,6 +83,10 @@ class SegmentationSettings(Settings):
         8, low=2, high=20, limits=(1, 100), unit="px", when={"repair": ["depth"]},
         meaning="width of the border in which depth decides, on both sides of the mask's edge",
     )  # fmt: skip
+    outside_share: float = tunable(
+        0.3, low=0.0, high=1.0, limits=(0.0, 1.0), online=True,
+        meaning="share of n_features that must lie outside the masks; where fewer do, n_features are sought there too",
+    )  # fmt: skip
     network_side: int = tunable(
         480,
         low=240,

@@ -12,6 +12,8 @@ from dynslam_bench.core.download import Report, download, file_sha256
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.core.harmless import inside, is_inside
+from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import Record
 
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
@@ -132,19 +134,21 @@ def fetch(
     if found.folder is not None:
         return found.folder
     entry, address = found.entry, url or found.entry.url
-    archive = find_data_root(data_root) / ".downloads" / address.rpartition("/")[2]
+    archive = find_data_root(data_root) / ".downloads" / _archive_name(address, entry)
     expected = entry.sha256 if checksum else None
+    most = {} if entry.size_bytes is None or not checksum else {"most_bytes": entry.size_bytes}
     try:
         sha256 = download(
-            address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s, timeout_s=timeout_s
-        )
+            address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s,
+            timeout_s=timeout_s, **most,
+        )  # fmt: skip
     except DownloadError as error:
         raise SequenceError(str(error.args[0]), error.hint) from error
     try:
         _extract(found, archive, sha256, address, expected is not None, progress)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
+            raise SequenceError(f"cannot extract {archive.name} into {found.place.parent}: {error.strerror}") from error
         raise SequenceError(
             f"no room to extract {archive.name} ({archive.stat().st_size / 1e9:.2f} GB) into {found.place.parent}",
             "make room and run the same command again, the archive is kept",
@@ -210,21 +214,30 @@ def verify(
         if progress is not None:
             progress(index + 1, len(sequence))
     manifest = folder / MANIFEST
-    faults += _compare(folder, manifest) if manifest.is_file() else []
+    try:
+        faults += _compare(folder, manifest) if manifest.is_file() else []
+    except SequenceError as error:
+        faults.append(str(error))
     dropped = getattr(sequence, "dropped", None)
     return Verification(sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped)
 
 
 def _compare(folder: Path, manifest: Path) -> list[str]:
     faults = []
-    for line in manifest.read_text().splitlines():
-        expected, _, name = line.partition("  ")
-        path = folder / name
+    for line in read_lines(manifest, kind=SequenceError):
+        expected, _, name = line.rstrip("\n").partition("  ")
+        path = inside(folder, name, where=str(manifest), kind=SequenceError)
         if not path.is_file():
             faults.append(f"{name} is missing")
         elif file_sha256(path) != expected:
             faults.append(f"{name} is not what was fetched")
     return faults
+
+
+def _archive_name(address: str, entry: CatalogueEntry) -> str:
+    """Under which name an archive is kept until it is extracted: its own, where that is one."""
+    name = address.partition("?")[0].rpartition("/")[2]
+    return name if is_inside(name) and not name.startswith(".") and len(name) < 200 else f"{entry.folder}.archive"
 
 
 def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import FeatureExtractor
+from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.contracts.map_outputs import MapOutputs
@@ -28,6 +28,8 @@ from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.culling.tools.ego_motion import refine_prediction
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.segmentation.masks.postprocess import dynamic_mask
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .backend import RgbdBackend
 from .culled import Culled, settled
@@ -75,7 +77,7 @@ class SlamPipeline:
     """A tracker: features, masks, culling, flow, culling, tracking and mapping, one frame at a time.
 
     Args:
-        extractor: Finds the keypoints.
+        extractor: Finds the keypoints; a `MaskedExtractor` sees to it that people take no place of the room's.
         masks: Segmentation stage; None for systems without semantics.
         filters: Dynamic feature filters in the order of application.
         flow: Flow of the keypoints that are left to the previous image; run before the first filter that needs it.
@@ -109,6 +111,7 @@ class SlamPipeline:
         self._flow = flow
         self._backend = backend
         self._guard: GuardSettings = getattr(settings, "guard", GuardSettings())
+        self._objects: SegmentationSettings | None = getattr(settings, "segmentation", None)
         self._steering = Steering(settings, self._takers(settings))
         self._cached = dict(cached or {})
         self._camera: Camera | None = None
@@ -151,22 +154,26 @@ class SlamPipeline:
         )
 
     def _see(self, frame: Frame, camera: Camera, clock: StageClock) -> FrameBundle:
-        """Keypoints with their depth, and the objects in the image."""
-        with clock("features"):
-            seen = self._extract(frame, camera)
-        with clock("segmentation"):
-            if self._masks is not None:
-                seen.instances = self._masks.masks_for(frame, seen.gray, keyframe=self._keyframe_due)
-        return seen
-
-    def _extract(self, frame: Frame, camera: Camera) -> FrameBundle:
+        """The objects in the image, and keypoints with their depth, enough of them outside the objects."""
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        keypoints = self._extractor.extract(gray)
         depth = own_depth(frame.depth)
+        instances = mask = None
+        if self._masks is not None:
+            with clock("segmentation"):
+                instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
+                if self._objects is not None and len(instances):
+                    mask = dynamic_mask(instances, self._objects, depth)
+        with clock("features"):
+            keypoints = self._extract(gray, mask)
         column, row = np.rint(keypoints.xy).astype(np.intp).T
         z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         xy = camera.undistort_points(keypoints.xy)
-        return FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z)
+        return FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
+
+    def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
+        if mask is None or self._objects is None or not isinstance(self._extractor, MaskedExtractor):
+            return self._extractor.extract(gray)
+        return self._extractor.extract_beside(gray, mask, self._objects.outside_share)
 
     def _known(self, seen: FrameBundle, camera: Camera) -> FilterState:
         """What the filters may know beside the frame: the past, the prediction and the map."""
@@ -281,9 +288,14 @@ class SlamPipeline:
                 yield group, part.configure
         if hasattr(settings, "guard"):
             yield "guard", self._use_guard
+        if self._objects is not None:
+            yield "segmentation", self._use_objects
 
     def _use_guard(self, guard: GuardSettings) -> None:
         self._guard = guard
+
+    def _use_objects(self, objects: SegmentationSettings) -> None:
+        self._objects = objects
 
     def _begun(self, method: str) -> Camera:
         if self._camera is None:

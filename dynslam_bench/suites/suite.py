@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,16 +9,12 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, ValidationError
 
 from dynslam_bench.core.errors import RunError, did_you_mean
+from dynslam_bench.core.reading import read_text
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.settings import field_names
+from dynslam_bench.core.toml import parse_toml
 from dynslam_bench.runs.spec import Limits, RunSpec
 from dynslam_bench.trackers.registry import TRACKERS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 
 Offset = Annotated[int, Field(ge=0)]
 
@@ -184,10 +179,7 @@ def load_suite(name: str | Path) -> Suite:
         PluginError: One of its trackers is not known.
     """
     text, where = _read(str(name))
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise RunError(f"{where} is not valid TOML: {error}") from error
+    document = parse_toml(text, where, kind=RunError)
     document.setdefault("name", Path(where).stem)
     try:
         suite = Suite.model_validate(document)
@@ -204,12 +196,7 @@ def _read(name: str) -> tuple[str, str]:
     path = Path(name).expanduser()
     if path.suffix != ".toml":
         raise RunError(f"unknown suite '{name}'", did_you_mean(name, suite_names()) + ", or name a .toml file")
-    try:
-        return path.read_text(encoding="utf-8"), str(path)
-    except OSError as error:
-        raise RunError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RunError(f"{path} is not a text file: byte {error.start} is no UTF-8") from error
+    return read_text(path, kind=RunError), str(path)
 
 
 def _explain(error: ValidationError, where: str) -> RunError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Literal
 
@@ -37,6 +38,7 @@ class Board:
     Attributes:
         rows: All rows.
         on: What trackers are ranked on.
+        rank_seen: Whether cells rank whose masks come from a network that was trained on the scene.
         columns: Column id of a row to the name of its sequence.
         trackers: Variant keys in order of standing; those of which only final trajectories are known stand apart.
         final_only: Variant keys of imports of which only the final trajectory is known.
@@ -58,6 +60,7 @@ class Board:
 
     rows: list[RunRow]
     on: On = "common"
+    rank_seen: bool = False
     columns: dict[str, str] = field(default_factory=dict)
     trackers: list[str] = field(default_factory=list)
     final_only: list[str] = field(default_factory=list)
@@ -76,17 +79,24 @@ class Board:
     incomplete: list[str] = field(default_factory=list)
     hopeless: list[str] = field(default_factory=list)
 
+    @cached_property
+    def _by_key(self) -> dict[str, list[RunRow]]:
+        found: dict[str, list[RunRow]] = {}
+        for row in self.rows:
+            found.setdefault(row.variant_key, []).append(row)
+        return found
+
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
         return self.columns[row.column_id]
 
     def runs(self, key: str) -> list[RunRow]:
         """All rows of a tracker."""
-        return [row for row in self.rows if row.variant_key == key]
+        return self._by_key[key]
 
     def first(self, key: str) -> RunRow:
         """Any row of a tracker, for what all its rows share."""
-        return next(row for row in self.rows if row.variant_key == key)
+        return self._by_key[key][0]
 
     def ranked_order(self) -> list[str]:
         """Ranked trackers from the best to the worst."""
@@ -95,6 +105,10 @@ class Board:
     def frame(self) -> pd.DataFrame:
         """All rows as a pandas frame; see `rows_frame` for its columns and units."""
         return rows_frame(self.rows, self.columns, self.labels)
+
+    def competes(self, key: str, name: str) -> bool:
+        """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
+        return self.rank_seen or not self.cells[key][name].seen
 
     def lacking(self, key: str) -> list[str]:
         """The sequences on which a tracker was not run."""
@@ -120,7 +134,9 @@ class Board:
         return {at for at in (unranked, failed) if 0 < at < len(self.trackers)}
 
 
-def make_board(rows: Sequence[RunRow], reference: str = DEFAULT_REFERENCE, on: On = "common") -> Board:
+def make_board(
+    rows: Sequence[RunRow], reference: str = DEFAULT_REFERENCE, on: On = "common", *, rank_seen: bool = False
+) -> Board:
     """Order rows into a board.
 
     Args:
@@ -128,6 +144,7 @@ def make_board(rows: Sequence[RunRow], reference: str = DEFAULT_REFERENCE, on: O
         reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
             never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 
     Raises:
         ReportError: There are no rows, they mix protocols, or nothing is known of the reference.
@@ -138,7 +155,7 @@ def make_board(rows: Sequence[RunRow], reference: str = DEFAULT_REFERENCE, on: O
     known = sorted({row.tracker for row in rows})
     if reference not in known and reference != DEFAULT_REFERENCE:
         raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, known))
-    board = Board(list(rows), on, name_columns(rows))
+    board = Board(list(rows), on, rank_seen, name_columns(rows))
     board.labels = make_labels(rows)
     _order_sequences(board)
     for key in board.labels:
@@ -216,11 +233,12 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
 
     Trackers with few sequences are left out where that leaves more cells to rank (trackers times sequences), so that
     neither one more sequence of one tracker nor one run of another takes the ranking away from the rest. A tracker
-    without any success is not ranked.
+    without any success is not ranked, nor is one where its network was trained (`Board.competes`).
     """
     rankable = [key for key in scored if board.first(key).ranked and board.first(key).provenance != "control"]
     rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
-    has = {key: set(_scored(board, key)) for key in rankable}
+    has = {key: {name for name in _scored(board, key) if board.competes(key, name)} for key in rankable}
+    rankable = [key for key in rankable if has[key]]
     competing = sorted(rankable, key=lambda key: (-len(has[key]), key))
     if board.on == "all":
         competing = [key for key in competing if has[key] == set(board.sequences)]

@@ -47,6 +47,11 @@ class Cell:
         return len(self.kept) == 1 < len(self.rows)
 
     @property
+    def seen(self) -> bool:
+        """Whether masks of it come from a network that was trained on the scene."""
+        return any(row.seen_in_training for row in self.rows)
+
+    @property
     def ending(self) -> str:
         """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))

@@ -22,7 +22,7 @@ def common_errors(
     brief = protocol.model_copy(update={"rpe": (), "segments_m": (), "lost_frames": "exclude"})
     for sequence in board.sequences:
         runs = successful(board, sequence, loaded)
-        pairs = [(run, run.store.trajectory(run.row.run_id, protocol.trajectory)) for run in runs]
+        pairs = [(run, run.trajectory(protocol.trajectory)) for run in runs]
         held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
         if len({run.row.variant_key for run, _ in held}) < 2:
             continue
@@ -30,8 +30,11 @@ def common_errors(
         total = max(run.row.n_frames for run, _ in held)
         frames[sequence] = f"{len(reduced[0])} of {total}"
         values: dict[str, list[float]] = {}
-        for (run, _), trajectory in zip(held, reduced, strict=True):
-            truth = run.store.ground_truth(run.record.sequence.part)
+        for (run, whole), trajectory in zip(held, reduced, strict=True):
+            if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # it is the error that is known
+                values.setdefault(run.row.variant_key, []).append(run.row.metrics["ate_rmse_m"])
+                continue
+            truth = run.ground_truth()
             if truth is None:
                 continue
             try:
@@ -46,17 +49,14 @@ def common_errors(
 def representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:
     """Of each tracker the successful run on a sequence whose error is the (lower) median one."""
     runs = successful(board, sequence, loaded)
-    chosen: dict[str, LoadedRun] = {}
-    for key in board.trackers:
-        ordered = sorted((r for r in runs if r.row.variant_key == key), key=lambda r: r.row.metrics["ate_rmse_m"])
-        if ordered:
-            chosen[key] = ordered[(len(ordered) - 1) // 2]
-    return chosen
+    by_key: dict[str, list[LoadedRun]] = {key: [] for key in board.trackers}
+    for run in sorted(runs, key=lambda run: run.row.metrics["ate_rmse_m"]):
+        by_key.get(run.row.variant_key, []).append(run)
+    return {key: ordered[(len(ordered) - 1) // 2] for key, ordered in by_key.items() if ordered}
 
 
 def successful(board: Board, sequence: str, loaded: Loaded) -> list[LoadedRun]:
     """The runs on a sequence that ended and could be evaluated, copies left out."""
-    kept = {row.run_id for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept}
-    return [
-        run for run in loaded.runs if run.row.run_id in kept and not run.row.failed and "ate_rmse_m" in run.row.metrics
-    ]
+    rows = [row for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept]
+    good = [row.run_id for row in rows if not row.failed and "ate_rmse_m" in row.metrics]
+    return [loaded.by_id[run_id] for run_id in good]

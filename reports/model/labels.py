@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .row import RunRow
+from .row import SEEN, RunRow
 
 
 def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
-    """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants."""
+    """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants.
+
+    Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
+    """
+    seen = {row.variant_key for row in rows if row.seen_in_training}
     variants: dict[str, RunRow] = {}
     for row in rows:
         variants.setdefault(row.variant_key, row)
@@ -22,5 +26,5 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
             parts.append("imported")
         same_label = [other for other in variants.values() if other.label == row.label and other.tracker != row.tracker]
         base = f"{row.label} <{row.tracker}>" if same_label else row.label
-        labels[key] = base + (f" · {', '.join(parts)}" if parts else "")
+        labels[key] = base + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in seen)
     return labels

@@ -44,6 +44,7 @@ def load_board(
     *,
     reference: str = DEFAULT_REFERENCE,
     on: On = "common",
+    rank_seen: bool = False,
 ) -> Board:
     """The board of some results folders: all runs, ordered and ranked as in a report.
 
@@ -52,9 +53,10 @@ def load_board(
         protocol: How to evaluate; SLAM is never run again for it.
         reference: As in `make_board`.
         on: As in `make_board`.
+        rank_seen: As in `make_board`.
 
     Raises:
         ReportError: As `make_board`.
     """
     rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
-    return make_board(rows, reference, on)
+    return make_board(rows, reference, on, rank_seen=rank_seen)

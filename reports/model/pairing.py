@@ -9,7 +9,7 @@ from statistics import median
 
 from .cell import make_cell
 from .labels import make_labels
-from .row import RunRow
+from .row import SEEN, RunRow
 from .statistics import FLOOR_M
 
 Side = dict[str, dict[str, list[RunRow]]]
@@ -21,7 +21,7 @@ class Paired:
     """One tracker on one sequence, on both sides.
 
     Attributes:
-        sequence: Name of the sequence.
+        sequence: Name of the sequence, with `SEEN` behind it if a side's network was trained on it.
         scores_a: Errors of A in metres, a run each.
         scores_b: Likewise of B.
         coverage_a: Mean coverage of A.
@@ -75,7 +75,8 @@ def differences(a: Side, b: Side, one: str, other: str) -> list[str]:
 
 def label_pairs(pairs: Sequence[tuple[str, str]], a: Side, b: Side) -> dict[tuple[str, str], str]:
     """The label of A's variant, with that of B's where they differ."""
-    names = make_labels([row for one, other in pairs for row in (_first(a, one), _first(b, other))])
+    sides = [side[key] for one, other in pairs for side, key in ((a, one), (b, other))]
+    names = make_labels([row for columns in sides for rows in columns.values() for row in rows])
     return {(one, other): names[one] if one == other else f"{names[one]} → {names[other]}" for one, other in pairs}
 
 
@@ -90,7 +91,8 @@ def pair_errors(
         scores = [make_cell(side).scores for side in sides]
         coverage = [sum(row.coverage for row in side) / len(side) for side in sides]
         if scores[0] and scores[1]:
-            found.append(Paired(columns[column], scores[0], scores[1], coverage[0], coverage[1]))
+            name = columns[column] + f" {SEEN}" * any(row.seen_in_training for side in sides for row in side)
+            found.append(Paired(name, scores[0], scores[1], coverage[0], coverage[1]))
     return sorted(found, key=lambda paired: paired.sequence)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
+from dynslam_bench.core.reading import TABLE_BYTES
 from dynslam_bench.core.records import Record
 
 from .row import RunRow
@@ -23,6 +26,8 @@ class ReportData(Record):
         version: Version of the package.
         rows: One a run.
     """
+
+    most_bytes: ClassVar[int] = TABLE_BYTES
 
     schema_version: int = SCHEMA_VERSION
     title: str

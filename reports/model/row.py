@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from typing import Any, Literal
 
 from pydantic import Field
@@ -13,6 +14,8 @@ from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
 Kind = Literal["run here", "imported"]
 Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
+SEEN = "§"
+"""Behind trackers and numbers whose masks come from a network that was trained on the scene."""
 
 
 class RunRow(Record):
@@ -47,6 +50,7 @@ class RunRow(Record):
         trajectory: Which trajectory the metrics are of; an import may hold the final one only.
         metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
         final_ate_m: ATE of the final trajectory; None if there is none.
+        final_metrics: All errors of the final trajectory; empty if there is none, or in reports of older versions.
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
         held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
@@ -63,6 +67,8 @@ class RunRow(Record):
         peak_memory_mb: Largest resident memory, None if unknown.
         mask_iou: Overlap of the dynamic mask with the exact one, None if unknown.
         segmentation: Source of the masks.
+        seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
+            does not rank unless that is asked for.
         started: UTC, ISO 8601.
         log: Path of the run's log.
         command: Command line that made it.
@@ -98,6 +104,7 @@ class RunRow(Record):
     trajectory: Which = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
     final_ate_m: float | None = None
+    final_metrics: dict[str, float] = Field(default_factory=dict)
     rotation_uncertainty_deg: float | None = None
     held_ate_m: float | None = None
     never_move_m: float | None = None
@@ -112,6 +119,7 @@ class RunRow(Record):
     peak_memory_mb: float | None = None
     mask_iou: float | None = None
     segmentation: str = ""
+    seen_in_training: bool = False
     started: str = ""
     log: str = ""
     command: str = ""
@@ -141,7 +149,7 @@ class RunRow(Record):
         """Whether the trajectory comes from elsewhere."""
         return self.kind == "imported"
 
-    @property
+    @cached_property
     def variant_key(self) -> str:
         """Tracker and everything that sets its runs apart besides sequence and repeat."""
         return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)

@@ -30,7 +30,12 @@ def camera_words(record: RunRecord) -> str:
     camera = record.identity.get("camera")
     if not isinstance(camera, dict) or not {"width", "height", "fx", "fy"} <= camera.keys():
         return ""
-    return f"camera {camera['width']}x{camera['height']}, f {camera['fx']:g} {camera['fy']:g}"
+    return "camera {width}x{height}, f {fx} {fy}".format(**{key: _short(value) for key, value in camera.items()})
+
+
+def _short(value: object) -> str:
+    """A number, or whatever else a record of somebody else's holds in its place."""
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
 
 
 def never_move_error(
@@ -63,11 +68,14 @@ def held_error(
     if evaluation.coverage == 1.0:
         return error
     unheld = error if record.coverage >= 1.0 else max(error, still or 0.0)
-    trajectory, truth = store.trajectory(record.run_id, protocol.trajectory), store.ground_truth(record.sequence.part)
-    if trajectory is None or truth is None:
-        return unheld
     held = protocol.model_copy(update={"lost_frames": "hold", "rpe": (), "segments_m": ()})
     try:
+        trajectory, truth = (
+            store.trajectory(record.run_id, protocol.trajectory),
+            store.ground_truth(record.sequence.part),
+        )
+        if trajectory is None or truth is None:
+            return unheld
         stamps = store.timestamps(record.sequence.part)
         return evaluate(trajectory, truth, held, input_timestamps=stamps).metrics["ate_rmse_m"]
     except DynslamError:

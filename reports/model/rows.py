@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
-from dynslam_bench.core.errors import ReportError
+from dynslam_bench.core.errors import DynslamError, ReportError
 from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.segmentation.training_set import seen_in_training
 
 from .row import RunRow, Which
 from .row_values import (
@@ -34,6 +37,20 @@ class LoadedRun:
     record: RunRecord
     store: RunStore
 
+    def trajectory(self, which: Which) -> Trajectory | None:
+        """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
+        try:
+            return self.store.trajectory(self.record.run_id, which)
+        except DynslamError:
+            return None
+
+    def ground_truth(self) -> Trajectory | None:
+        """The ground truth of its part of the sequence; None if there is none, or it is damaged."""
+        try:
+            return self.store.ground_truth(self.record.sequence.part)
+        except DynslamError:
+            return None
+
 
 @dataclass
 class Loaded:
@@ -50,6 +67,11 @@ class Loaded:
     superseded: int = 0
     stopped: int = 0
     unreadable: list[str] = field(default_factory=list)
+
+    @cached_property
+    def by_id(self) -> dict[str, LoadedRun]:
+        """The runs by their id."""
+        return {run.row.run_id: run for run in self.runs}
 
 
 def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
@@ -128,6 +150,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         trajectory=which,
         metrics={} if evaluation is None else dict(evaluation.metrics),
         final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
+        final_metrics={} if scored.final is None else dict(scored.final.metrics),
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         held_ate_m=held_error(store, record, protocol, evaluation, still),
         never_move_m=still,
@@ -142,6 +165,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         peak_memory_mb=record.peak_memory_mb,
         mask_iou=record.mask_iou,
         segmentation=record.segmentation,
+        seen_in_training=seen_in_training(record.segmentation, sequence.id),
         started=record.started,
         log=str(store.folder(record.run_id) / "log.txt"),
         command=command_line(record.command),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from ..model.board import Board, rank
-from ..model.row import RunRow
+from ..model.row import SEEN, RunRow
 from .formats import mm
 from .leaderboard import interval_cell, rank_cell, sequence_columns, skipped_words
 from .table import Column, Emphasis, Table, TableCell, emphasise
@@ -25,8 +25,9 @@ def common_frames_table(
         return None
     marks: dict[tuple[str, str], Emphasis] = {}
     for sequence in board.sequences:
-        values = [common.get((key, sequence)) for key in board.ranked]
-        marks |= {(key, sequence): mark for key, mark in zip(board.ranked, emphasise(values), strict=True)}
+        found = [key for key in board.ranked if (key, sequence) in common and board.competes(key, sequence)]
+        values = [common[key, sequence] for key in found]
+        marks |= {(key, sequence): mark for key, mark in zip(found, emphasise(values), strict=True)}
     rows, muted = [], set()
     for position, key in enumerate(board.trackers):
         if key not in board.ranked:
@@ -35,8 +36,11 @@ def common_frames_table(
         for sequence in board.sequences:
             number = common.get((key, sequence))
             mark = marks.get((key, sequence), "")
-            small = "" if number is None else skipped_words(board.cells[key][sequence])
-            cells.append(TableCell() if number is None else TableCell(mm(number), small, number, mark))
+            if number is None:
+                cells.append(TableCell())
+                continue
+            cell = board.cells[key][sequence]
+            cells.append(TableCell(mm(number) + SEEN * cell.seen, skipped_words(cell), number, mark))
         rows.append(cells)
     separators = {len(rows)}
     muted.add(len(rows))
@@ -46,7 +50,8 @@ def common_frames_table(
         "tracker gains nothing here by losing the hard frames. Failed runs take no part."
     )
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
-    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators)
+    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
+    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators, brief)
 
 
 def failure_rule_table(board: Board) -> Table | None:

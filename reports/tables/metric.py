@@ -7,9 +7,9 @@ from statistics import median
 
 from ..model.board import Board
 from ..model.cell import Cell
-from ..model.row import RunRow
+from ..model.row import SEEN, RunRow
 from .formats import mm
-from .leaderboard import sequence_columns, skipped_words
+from .leaderboard import SEEN_NOTE, sequence_columns, skipped_words
 from .table import Column, Emphasis, Table, TableCell, emphasise
 
 Value = Callable[[RunRow], float | None]
@@ -25,6 +25,7 @@ def metric_table(
     title: str,
     caption: str,
     *,
+    unit: str = "RMSE, mm",
     text: Callable[[float], str] = mm,
     larger_is_better: bool = False,
     trackers: Sequence[str] | None = None,
@@ -38,6 +39,7 @@ def metric_table(
         name: Id of the table.
         title: Heading.
         caption: How to read it.
+        unit: What the numbers are, in a word or two.
         text: How the number is written; metres become millimetres by default.
         larger_is_better: Which end is bold.
         trackers: Variant keys; the board's by default.
@@ -63,12 +65,14 @@ def metric_table(
                 cells.append(TableCell())
             else:
                 shown, mark = text(number) + DOUBT * bool(why), "muted" if why else marks.get(place, "")
-                cells.append(TableCell(shown, skipped_words(cell), number, mark, tip=why or cell.ending))
+                tip = why or (SEEN_NOTE if cell.seen else cell.ending)
+                cells.append(TableCell(shown + SEEN * cell.seen, skipped_words(cell), number, mark, tip=tip))
         rows.append(cells)
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
     competing = sum(key in board.ranked for key in present)
     muted = [at for at, key in enumerate(present) if key not in board.ranked]
-    return Table(name, title, caption, columns, rows, muted, {competing} if 0 < competing < len(rows) else ())
+    separators = {competing} if 0 < competing < len(rows) else set()
+    return Table(name, title, caption, columns, rows, muted, separators, f"{title} ({unit})")
 
 
 def median_of(cell: Cell, value: Value) -> float | None:
@@ -78,7 +82,7 @@ def median_of(cell: Cell, value: Value) -> float | None:
 
 
 def column_marks(board: Board, values: dict[tuple[str, str], float]) -> dict[tuple[str, str], Emphasis]:
-    """Best and second best of every column among the ranked trackers whose runs there all succeeded.
+    """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
 
     Args:
         board: The board.
@@ -86,7 +90,8 @@ def column_marks(board: Board, values: dict[tuple[str, str], float]) -> dict[tup
     """
     marks: dict[tuple[str, str], Emphasis] = {}
     for name in board.sequences:
-        keys = [key for key in board.ranked if (cell := board.cells[key].get(name)) and not cell.failed]
+        cells = {key: board.cells[key][name] for key in board.ranked if name in board.cells[key]}
+        keys = [key for key, cell in cells.items() if not cell.failed and board.competes(key, name)]
         found = emphasise([values.get((key, name)) for key in keys])
         marks |= {(key, name): mark for key, mark in zip(keys, found, strict=True)}
     return marks

@@ -45,7 +45,7 @@ def repeatability(board: Board) -> Table | None:
         Column("runs a cell"),
         Column("worst / best", meaning="median over cells of the largest over the smallest ATE"),
         Column("largest worst / best"),
-        Column("where", numeric=False),
+        Column("where", numeric=False, latex=False),
     ]
     rows = [cells for key in board.trackers if (cells := _spread_cells(board, key))]
     if not rows:

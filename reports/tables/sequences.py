@@ -13,8 +13,9 @@ from dynslam_bench.evaluation.protocol import Protocol
 from ..model.board import NEVER_MOVE, Board
 from ..model.cell import Cell
 from ..model.published import ReportedCell
+from ..model.row import SEEN
 from .formats import mm, significant_text
-from .leaderboard import sequence_columns, skipped_words
+from .leaderboard import SEEN_NOTE, sequence_columns, skipped_words
 from .metric import DOUBT, column_marks, metric_table
 from .table import Column, Emphasis, Table, TableCell
 
@@ -55,7 +56,20 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             "which contradict themselves (see the audit)."
         )
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
-    return Table("per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators)
+    if any(row.seen_in_training for row in board.rows):
+        columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
+        rows = [[*row, TableCell(_trained_on(board, board.trackers, at))] for at, row in enumerate(rows)]
+        caption += f" {SEEN_NOTE}"
+    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
+    return Table(
+        "per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators, brief
+    )
+
+
+def _trained_on(board: Board, keys: Sequence[str], at: int) -> str:
+    """The sequences on which the masks of a row's tracker were trained; empty for the rows below the trackers."""
+    cells = board.cells[keys[at]] if at < len(keys) else {}
+    return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].seen)
 
 
 def final_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -97,6 +111,7 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
                 f"Relative pose error over {spec.describe()}: {name}",
                 f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
                 f"they tracked. {protocol.describe()}.",
+                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
                 text=mm if unit == "m" else significant_text,
             )
             if table is not None:
@@ -122,6 +137,7 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
         "ape_rotation",
         "Absolute rotational error",
         caption,
+        unit="RMSE, °",
         text=significant_text,
         doubt=_rotation_doubt,
     )
@@ -146,8 +162,11 @@ def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, 
     small = ", ".join(filter(None, notes))
     base = board.reference_median(sequence)
     if base is None:
-        return TableCell(mm(cell.median), small, cell.median, mark, tip=f"coverage {coverage:.1f} %")
+        shown = mm(cell.median) + SEEN * cell.seen
+        return TableCell(shown, small, cell.median, mark, tip=f"coverage {coverage:.1f} %")
     ratio = cell.median / max(base, 1e-6)
+    if cell.seen:
+        return TableCell(mm(cell.median) + SEEN, small, cell.median, mark, tip=SEEN_NOTE)
     colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
     tip = f"{ratio:.2f} × the reference, coverage {coverage:.1f} %" + (f"; {cell.ending}" if cell.failed else "")
     return TableCell(mm(cell.median), small, cell.median, mark, colour, tip)

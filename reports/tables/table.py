@@ -9,10 +9,6 @@ from typing import Literal
 import pandas as pd
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
-_LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
-_LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"}
-_LATEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"}
-_LATEX |= {"×": r"$\times$", "±": r"$\pm$", "≤": r"$\leq$", "≥": r"$\geq$", "°": r"$^\circ$", "²": r"$^2$"}
 
 
 @dataclass(frozen=True)
@@ -25,6 +21,7 @@ class Column:
         numeric: Whether it holds numbers, aligned to the right.
         meaning: Shown when the pointer rests on the heading.
         full: Name in CSV, where the heading is shortened; empty for the heading itself.
+        latex: Whether it stands in LaTeX, where there is little room.
     """
 
     name: str
@@ -32,6 +29,7 @@ class Column:
     numeric: bool = True
     meaning: str = ""
     full: str = ""
+    latex: bool = True
 
     @property
     def key(self) -> str:
@@ -89,13 +87,15 @@ class Table:
         title: Heading.
         caption: Everything a reader needs, including the protocol.
         columns: The columns.
+        rows: What is displayed, by row.
         shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
         values: The numbers behind it with all their digits, in the units that the caption and the headings name
             (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
-            ``Int64`` if all their numbers are whole, else ``float64``; missing where the cell has no number. Columns
+            ``Int64`` if all their numbers are whole, else ``Float64``; ``pd.NA`` where the cell has no number. Columns
             of text are ``string``.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
+        brief: Caption where there is little room, without the full stop: what is shown, and its unit.
     """
 
     def __init__(
@@ -107,24 +107,21 @@ class Table:
         rows: Sequence[Sequence[TableCell]],
         muted_rows: Collection[int] = (),
         separators: Collection[int] = (),
+        brief: str = "",
     ) -> None:
         """A table of rows with one cell for every column.
 
         Raises:
             ValueError: A row has another number of cells than there are columns.
         """
-        self.id, self.title, self.caption = id, title, caption
+        self.id, self.title, self.caption, self.brief = id, title, caption, brief or title
         self.columns = list(columns)
         self.muted_rows, self.separators = set(muted_rows), set(separators)
-        self.shown = pd.DataFrame([list(row) for row in rows], columns=range(len(self.columns)), dtype=object)
+        self.rows = [list(row) for row in rows]
+        self.shown = pd.DataFrame(self.rows, columns=range(len(self.columns)), dtype=object)
         series = [_values(column, self.shown[at]) for at, column in enumerate(self.columns)]
         self.values = pd.concat(series, axis=1)
         self.shown.columns = self.values.columns = pd.Index([column.key for column in self.columns])
-
-    @property
-    def rows(self) -> list[list[TableCell]]:
-        """What is displayed, by row."""
-        return [list(row) for row in self.shown.itertuples(index=False, name=None)]
 
     def frame(self) -> pd.DataFrame:
         """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
@@ -147,41 +144,26 @@ def to_markdown(table: Table) -> str:
     """The table as GitHub Markdown with its caption."""
     names = [f"{column.group}: {column.name}" if column.group else column.name for column in table.columns]
     lines = [
-        f"## {table.title}",
+        f"## {prose(table.title)}",
         "",
         "| " + " | ".join(_escape_markdown(name) for name in names) + " |",
         "| " + " | ".join("---:" if column.numeric else "---" for column in table.columns) + " |",
     ]
     for row in table.rows:
         lines.append("| " + " | ".join(_markdown_cell(cell) for cell in row) + " |")
-    return "\n".join([*lines, "", table.caption, ""])
+    return "\n".join([*lines, "", prose(table.caption), ""])
 
 
 def to_csv(table: Table) -> str:
     """The table as CSV; numbers stand with all their digits."""
-    return str(table.frame().to_csv(index=False, lineterminator="\n"))
+    return csv_text(table.frame())
 
 
-def to_latex(table: Table) -> str:
-    """The table for LaTeX with booktabs; needs nothing else."""
-    spec = "".join("r" if column.numeric else "l" for column in table.columns)
-    lines = [
-        "\\begin{table}[t]",
-        "\\centering\\small",
-        f"\\caption{{{escape_latex(table.title)}. {escape_latex(table.caption)}}}",
-        f"\\label{{tab:{table.id}}}",
-        f"\\begin{{tabular}}{{{spec}}}",
-        "\\toprule",
-    ]
-    if any(column.group for column in table.columns):
-        lines.append(_latex_groups(table))
-    lines.append(" & ".join(escape_latex(column.name) for column in table.columns) + " \\\\")
-    lines.append("\\midrule")
-    for position, row in enumerate(table.rows):
-        if position in table.separators:
-            lines.append("\\midrule")
-        lines.append(" & ".join(_latex_cell(cell) for cell in row) + " \\\\")
-    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", "\\end{table}", ""])
+def csv_text(frame: pd.DataFrame) -> str:
+    """A frame as CSV that a spreadsheet may open: words that it would take for a formula begin with a quote."""
+    safe = frame.astype(object).map(_harmless)
+    safe.columns = pd.Index([_harmless(name) for name in frame.columns])
+    return str(safe.to_csv(index=False, lineterminator="\n"))
 
 
 def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
@@ -196,14 +178,14 @@ def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
     return marks
 
 
-def escape_latex(text: str) -> str:
-    """Text with LaTeX's special characters made harmless."""
-    return "".join(_LATEX.get(character, character) for character in text)
+def prose(text: str) -> str:
+    """A sentence for Markdown: on one line, and without markup of HTML."""
+    return " ".join(text.split()).replace("<", "&lt;")
 
 
 def _escape_markdown(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")
-    return escaped.replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_").replace("[", "\\[")
+    escaped = text.replace("\\", "\\\\").replace("|", "\\|")
+    return prose(escaped).replace("*", "\\*").replace("_", "\\_").replace("[", "\\[")
 
 
 def _markdown_cell(cell: TableCell) -> str:
@@ -222,29 +204,12 @@ def _values(column: Column, shown: pd.Series) -> pd.Series:
     found = [cell.value for cell in shown]
     present = [value for value in found if value is not None]
     whole = bool(present) and all(isinstance(value, int) for value in present)
-    return pd.Series(found, dtype="Int64" if whole else "float64", name=column.key)
+    return pd.Series(found, dtype="Int64" if whole else "Float64", name=column.key)
 
 
 def _words(cell: TableCell) -> str:
     return " ".join(part for part in (cell.text, cell.small, cell.tag) if part)
 
 
-def _latex_cell(cell: TableCell) -> str:
-    text = escape_latex(cell.text)
-    if text and cell.emphasis == "best":
-        text = f"\\textbf{{{text}}}"
-    elif text and cell.emphasis == "second":
-        text = f"\\textit{{{text}}}"
-    small = f"{{\\scriptsize {escape_latex(cell.small)}}}" if cell.small else ""
-    tag = f"{{\\scriptsize {escape_latex(cell.tag)}}}" if cell.tag else ""
-    return "~".join(part for part in (text, small, tag) if part)
-
-
-def _latex_groups(table: Table) -> str:
-    cells, rules, at = [], [], 1
-    for name, width in table.groups():
-        cells.append(f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}")
-        if name:
-            rules.append(f"\\cmidrule(lr){{{at}-{at + width - 1}}}")
-        at += width
-    return " & ".join(cells) + " \\\\ " + " ".join(rules)
+def _harmless(value: object) -> object:
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

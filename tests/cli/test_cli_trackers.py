@@ -3,7 +3,10 @@
 import json
 from pathlib import Path
 
+import pytest
 from cli_errors import one_line
+
+from dynslam_bench.trackers import TRACKERS
 
 
 def test_trackers_list_and_info(cli):
@@ -26,8 +29,6 @@ def test_trackers_info_tells_what_others_report_and_where(cli):
 
 
 def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
-    from dynslam_bench.trackers import TRACKERS
-
     (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
     monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "broken.py:SPEC")
     TRACKERS.refresh()
@@ -35,6 +36,22 @@ def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
         code, out, _ = cli("trackers", "doctor")
         assert code == 0 and "broken.py:SPEC" in out and "No module named 'nothing_of_this_name'" in out
         assert cli("trackers", "list")[0] == 0
+    finally:
+        monkeypatch.undo()
+        TRACKERS.refresh()
+
+
+@pytest.mark.parametrize("statement", ["import sys; sys.exit(0)", "import os; os._exit(0)"])
+def test_a_plugin_whose_import_ends_the_process_ends_neither_run_nor_list(cli, walk, monkeypatch, tmp_path, statement):
+    (tmp_path / "ends.py").write_text(statement)
+    code, out, err = cli("run", "./ends.py:SPEC", walk)
+    assert code == 1 and out == "" and "ends.py: that ends the process (exit code 0)" in one_line(err)
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "./ends.py:SPEC")
+    TRACKERS.refresh()
+    try:
+        code, out, _ = cli("trackers", "list", "--json")
+        assert code == 0 and "never-move" in {each["id"] for each in json.loads(out)}
+        assert "that ends the process" in cli("trackers", "doctor")[1]
     finally:
         monkeypatch.undo()
         TRACKERS.refresh()

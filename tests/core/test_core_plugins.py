@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from dynslam_bench.core import plugin_probe
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, Registry, load_object
 
@@ -87,6 +88,38 @@ def test_a_file_that_raises_gives_its_reason_and_can_be_mended(tmp_path):
     assert load_object(f"{file}:SPEC") == 7
 
 
+ENDINGS = {
+    "import sys; sys.exit(0)": "exit code 0",
+    "import os; os._exit(0)": "exit code 0",
+    "raise SystemExit('no GPU')": "exit code 1",
+    "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)": "SIGSEGV",
+}
+
+
+@pytest.mark.parametrize("statement", ENDINGS)
+def test_an_import_that_ends_the_process_is_an_error_like_any_other(tmp_path, monkeypatch, statement):
+    """As a file, as a module that the environment names, and as an entry point: the rest goes on."""
+    (tmp_path / "ends_env.py").write_text(statement)
+    (tmp_path / "ends_dist.py").write_text(statement)
+    fake_distribution(tmp_path, "dynslam_bench.trackers", {"ends": "ends_dist:SPEC"}, "ends-dist")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "ends_env:SPEC")
+    with pytest.raises(PluginError, match=rf"that ends the process \({ENDINGS[statement]}\) .*sys.exit") as caught:
+        load_object(f"{tmp_path / 'ends_env.py'}:SPEC")
+    assert "\n" not in str(caught.value)
+    trackers = registry()
+    assert len(trackers.all()) == 2
+    reasons = [failure.reason for failure in trackers.failures()]
+    assert len(reasons) == 2 and all(f"ends the process ({ENDINGS[statement]})" in reason for reason in reasons)
+
+
+def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(plugin_probe, "LIMIT_S", 3)
+    (tmp_path / "endless.py").write_text("while True: pass\n")
+    with pytest.raises(PluginError, match="is not done after 3 s"):
+        load_object(f"{tmp_path / 'endless.py'}:SPEC")
+
+
 def test_environment_variable(tmp_path, monkeypatch):
     good, broken = tmp_path / "good.py", tmp_path / "broken.py"
     good.write_text(SPEC_SOURCE.format(id="from-env"))
@@ -119,7 +152,7 @@ def test_entry_points_of_installed_distributions(tmp_path, monkeypatch):
     reasons = {failure.source: failure.reason for failure in trackers.failures()}
     assert "libGL.so.1" in reasons["entry point 'bad' of fake-dist"]
     assert "is a int" in reasons["entry point 'number' of fake-dist"]
-    with pytest.raises(PluginError, match="failed to load: OSError: libGL"):
+    with pytest.raises(PluginError, match="failed to load: cannot import dist_broken: OSError: libGL"):
         trackers.get("bad")
     assert trackers.get("from-dist").id == "from-dist"
 

@@ -61,11 +61,11 @@ def test_pose_error_against_an_independent_computation() -> None:
         assert info["pose_error_rot_deg"] == pytest.approx(angle, abs=1e-5)
 
 
-def test_lost_frames_earn_the_error_of_not_moving() -> None:
+def test_lost_frames_cost_twice_the_way_and_the_way_back_nothing() -> None:
     env = SlamEnv(ToySequence(12), TARGET, settings=QUIET | {"mode": "lost", "at": 4, "until": 7})
     rewards, infos, _ = play(env)
-    assert np.allclose(rewards[:3], 0, atol=1e-9) and np.allclose(rewards[7:], 0, atol=1e-9)
-    assert np.allclose(rewards[3:7], -MOTION_M, atol=1e-9)  # frames 4, 5, 6, and the way back at 7
+    assert np.allclose(rewards[:3], 0, atol=1e-9) and np.allclose(rewards[6:], 0, atol=1e-9)
+    assert np.allclose(rewards[3:6], -2 * MOTION_M, atol=1e-9)  # frames 4, 5, 6
     assert [info["tracking_state"] for info in infos[4:7]] == ["lost"] * 3
     assert all("pose" not in info for info in infos[4:7])
     assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(9 / 12)
@@ -90,7 +90,7 @@ def test_quitting_never_pays(reward: str) -> None:
 
 def test_a_tracker_that_never_begins_is_charged_too() -> None:
     rewards, infos, _ = play(SlamEnv(ToySequence(8), TARGET, settings={"mode": "initialising", "at": 0}))
-    assert np.allclose(rewards, -MOTION_M, atol=1e-9)
+    assert np.allclose(rewards, -2 * MOTION_M, atol=1e-9)
     assert "ate_rmse_m" not in infos[-1]["episode_metrics"]
     assert infos[-1]["episode_metrics"]["coverage"] == 0
 

@@ -78,16 +78,29 @@ def test_a_tracker_that_drifts_does_not_gain_by_giving_up_half_way() -> None:
 
 
 @pytest.mark.parametrize("seed", range(EPISODES))
-def test_under_neg_rpe_a_lost_frame_earns_the_true_motion_and_a_wrong_motion_may_earn_less(seed: int) -> None:
+def test_under_neg_rpe_admitting_a_loss_never_earns_more_than_repeating_the_last_pose(seed: int) -> None:
     truth, poses, tracked = episode(seed)
-    known = np.isin(np.arange(len(poses)) / 30.0, truth.timestamps)
-    motion = np.zeros(len(poses))
-    true = np.full((len(poses), 4, 4), np.nan)
-    true[known] = truth.T_world_cam
-    both = np.flatnonzero(known[1:] & known[:-1]) + 1
-    motion[both] = np.linalg.norm((se3.inverse(true[both - 1]) @ true[both])[:, :3, 3], axis=1)
-    earned = rewards("neg_rpe", truth, poses, tracked)
-    lost = ~tracked
-    lost[1:] |= ~tracked[:-1]
-    lost[0] = False
-    assert earned[lost] == pytest.approx(-motion[lost], abs=1e-12)
+    tracked[0] = True
+    repeated = poses[np.maximum.accumulate(np.where(tracked, np.arange(len(poses)), 0))]
+    admitted = rewards("neg_rpe", truth, poses, tracked)
+    kept = rewards("neg_rpe", truth, repeated, np.ones(len(poses), bool))
+    assert (np.cumsum(admitted) <= np.cumsum(kept) + 1e-12).all(), "wherever the episode ends"
+    assert admitted[tracked & np.r_[True, tracked[:-1]]] == pytest.approx(kept[tracked & np.r_[True, tracked[:-1]]])
+    if not tracked.all():
+        assert admitted.sum() < kept.sum()
+
+
+def test_under_neg_rpe_the_way_back_costs_nothing_and_a_wrong_one_its_error() -> None:
+    stamps = np.arange(60) / 30.0
+    true = np.repeat(np.eye(4)[None], 60, axis=0)
+    true[:, 0, 3] = np.cumsum(np.r_[0, np.full(59, 0.01)])
+    tracked = np.ones(60, bool)
+    tracked[20:50] = False
+    truth = Trajectory(stamps, true)
+    earned = rewards("neg_rpe", truth, true, tracked)
+    assert earned[20:50] == pytest.approx(-0.02) and not np.delete(earned, np.s_[20:50]).any()
+    wrong = true.copy()
+    wrong[50:, 0, 3] += 0.3
+    assert rewards("neg_rpe", truth, wrong, tracked)[50] == pytest.approx(-0.3)
+    tracked[50:] = False
+    assert rewards("neg_rpe", truth, true, tracked).sum() < earned.sum(), "to stay lost does not pay"

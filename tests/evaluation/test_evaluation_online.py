@@ -51,7 +51,7 @@ def test_frame_to_frame_error_is_eq_26_over_one_frame():
     assert rotation.max() == pytest.approx(metrics["rpe_1f_rot_max_deg"], abs=1e-9)
 
 
-def test_a_lost_frame_is_charged_as_not_moving():
+def test_a_lost_frame_counts_as_the_last_tracked_pose_repeated():
     truth = walk()
     poses = estimate_of(truth)
     ok = np.ones(len(truth), dtype=bool)
@@ -59,11 +59,14 @@ def test_a_lost_frame_is_charged_as_not_moving():
     samples = run(OnlineError(truth), truth, poses, ok)
     moved = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
     way = np.linalg.norm(moved[:, :3, 3], axis=1)
-    for i in range(20, 31):  # the interval that ends the spell has a lost frame at its beginning
+    for i in range(20, 30):
         assert samples[i].frame_trans_m == pytest.approx(way[i - 1], abs=1e-12)
+    assert [s.lost_way_m for s in samples[19:32]] == pytest.approx([0, *np.cumsum(way[19:29]), way[19:29].sum(), 0])
     held = hold(Trajectory(truth.timestamps, poses).select(ok), truth.timestamps)
     expected = run(OnlineError(truth), truth, held.T_world_cam, [True] * len(truth))
     assert [s.trans_m for s in samples] == pytest.approx([s.trans_m for s in expected], abs=1e-12)
+    jumps = [[s.frame_trans_m for s in found[1:]] for found in (samples, expected)]
+    assert jumps[0] == pytest.approx(jumps[1], abs=1e-12)
 
 
 def test_a_predicted_pose_of_a_lost_frame_counts_for_nothing():

@@ -4,13 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.features import FeatureExtractor
+from dynslam_bench.contracts.features import FeatureExtractor, MaskedExtractor
 from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
 from dynslam_bench.features.build_extractor import build_extractor
 from dynslam_bench.features.orb import OrbExtractor, level_quotas, spread
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.geometry.pixels import inside
 
 
 def texture(height=480, width=640, seed=0):
@@ -94,6 +95,22 @@ def test_small_images_are_no_error(shape):
     rng = np.random.default_rng(0)
     found = OrbExtractor().extract(rng.integers(0, 256, shape).astype(np.uint8))
     assert ((found.xy >= 0) & (found.xy < shape[::-1])).all()
+
+
+def test_what_lies_on_a_mask_takes_no_place_of_what_lies_outside():
+    image = texture()
+    mask = np.zeros(image.shape, bool)
+    mask[:, :576] = True  # nine tenths
+    extractor = OrbExtractor(FeatureSettings(n_features=500))
+    plain, beside = extractor.extract(image), extractor.extract_beside(image, mask, share=0.3)
+    assert isinstance(extractor, MaskedExtractor)
+    assert np.count_nonzero(~inside(mask, plain.xy)) < 100 < 400 < np.count_nonzero(~inside(mask, beside.xy)) <= 500
+    on = inside(mask, plain.xy)
+    assert np.array_equal(plain.xy[on], beside.xy[inside(mask, beside.xy)])
+    assert np.all(np.diff(beside.octave) >= 0)
+    assert len(np.unique(np.c_[beside.xy, beside.octave], axis=0)) == len(beside)
+    enough = extractor.extract_beside(image, mask, share=0.02)
+    assert np.array_equal(enough.xy, plain.xy) and np.array_equal(enough.descriptors, plain.descriptors)
 
 
 def test_quotas_sum_up_and_fall():

@@ -70,6 +70,7 @@ def add_run(
     skipped=None,
     died_at=None,
     duration_s=None,
+    masks="",
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -77,11 +78,11 @@ def add_run(
     """
     stamps, truth = stamps_of(n)[offset:], truth_of(sequence, n)
     n = len(stamps)
-    part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:12]
+    part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:16]
     store.prepare()
     store.add_sequence(part, stamps, truth if ground_truth else None)
     identity = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
-                "extra": (offset, noise, content, camera, frames, online)}  # fmt: skip
+                "extra": (offset, noise, content, camera, frames, online, masks)}  # fmt: skip
     run_id = hashlib.sha256(repr(identity).encode()).hexdigest()[:16]
     rng = np.random.default_rng(int(run_id[:8], 16) if copy_of is None else copy_of)
     nearest = np.abs(truth.timestamps[:, None] - stamps).argmin(0)
@@ -108,7 +109,7 @@ def add_run(
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
         started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
-        mask_iou=mask_iou, command=list(command),
+        mask_iou=mask_iou, segmentation=masks, command=list(command),
     )  # fmt: skip
     with store.work_folder(run_id) as work:
         if ok.any() and online:

@@ -284,7 +284,7 @@ def test_a_fresh_interpreter_does_the_same(store: RunStore, toy_folder: str, mon
 
 def test_video(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 5), video=True), store)
-    assert (store.folder(record.run_id) / "video.mp4").stat().st_size > 1000
+    assert (store.folder(record.run_id) / "video.webm").stat().st_size > 1000
 
 
 def test_sheet(store: RunStore, tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ def store(tmp_path: Path) -> RunStore:
 
 def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
-    assert read_log(tmp_path / "log") == ROWS
-    assert read_log(tmp_path / "none") == []
+    assert read_log(tmp_path / "log") == (ROWS, "")
+    assert read_log(tmp_path / "none") == ([], "")
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
+from quick_dense import quick
 
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
@@ -72,7 +73,7 @@ SEGMENTER = SegmenterSpec("erring", f"{__file__}:build_erring")
 
 def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
     """A tracker for the scene, with fewer features as its images are smaller."""
-    given: dict[str, object] = {"features.n_features": 500, "features.levels": 4}
+    given: dict[str, object] = {"features.n_features": 500, "features.levels": 4} | quick(spec.settings)
     if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto":
         given["segmentation.source"] = f"plugin:{__file__}:SEGMENTER"
         if "segmentation.dilation_px" in {each.name for each in parameters(spec.settings)}:
@@ -82,26 +83,29 @@ def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
 
 def play(
     tracker, scene: SmallScene, frames: int = FRAMES, before: Callable[[int], None] | None = None
-) -> list[TrackResult]:
-    """Reset a tracker and track the scene; `before` is called before each frame, with its number."""
+) -> Iterator[TrackResult]:
+    """Reset a tracker and track the scene, a frame at a time; `before` is called before each, with its number."""
     tracker.reset(scene.camera, rng=np.random.default_rng(0))
-    results = []
     for frame in scene.frames[:frames]:
         if before is not None:
             before(frame.index)
-        results.append(tracker.track(frame))
-    return results
+        yield tracker.track(frame)
 
 
-def difference(first: list[TrackResult], second: list[TrackResult]) -> str:
-    """The first thing in which two episodes differ, bit for bit; empty if in none."""
+def differing(first: TrackResult, second: TrackResult) -> str:
+    """The first thing in which two results differ, bit for bit; empty if in none."""
+    if first.state != second.state:
+        return f"states {first.state} and {second.state}"
+    for name in ("T_world_cam", "keypoints_xy", "keypoints_keep", "dynamic_mask"):
+        if not np.array_equal(getattr(first, name), getattr(second, name)):
+            return name
+    changed = [key for key in {**first.stats, **second.stats} if first.stats.get(key) != second.stats.get(key)]
+    return f"stats {changed[:4]}" if changed else ""
+
+
+def difference(first: Iterable[TrackResult], second: Iterable[TrackResult]) -> str:
+    """The first thing in which two episodes of the same length differ, bit for bit; empty if in none."""
     for index, (a, b) in enumerate(zip(first, second, strict=True)):
-        if a.state != b.state:
-            return f"frame {index}: states {a.state} and {b.state}"
-        for name in ("T_world_cam", "keypoints_xy", "keypoints_keep", "dynamic_mask"):
-            if not np.array_equal(getattr(a, name), getattr(b, name)):
-                return f"frame {index}: {name}"
-        if dict(a.stats) != dict(b.stats):
-            changed = [key for key in a.stats if a.stats[key] != b.stats.get(key)]
-            return f"frame {index}: stats {changed[:4]}"
+        if found := differing(a, b):
+            return f"frame {index}: {found}"
     return ""

@@ -1,4 +1,4 @@
-"""Studies from Python: own objective, sampler, callbacks, a preset to start from; old files; one clear line for mistakes."""
+"""Studies from Python: own objective, sampler, callbacks, a preset to start from; old files; mistakes in one line."""
 
 from __future__ import annotations
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
 import pytest
 import toy_tracker
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.part import part_of
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, write_page
 from dynslam_bench.tuning.splits import check_splits
 from dynslam_bench.tuning.trials import errors_of
@@ -65,6 +68,44 @@ def test_copies_and_excerpts_of_a_recording_are_the_same_recording(tmp_path: Pat
     assert faults([str(whole)], [str(other)]) == []
     with pytest.raises(StudyError, match="are the same frames"):
         faults([str(whole), str(copy)], [str(other)])
+
+
+def disguised(whole: Path, copy: Path, how: str) -> Path:
+    """A copy of a toy recording: renamed, shifted, re-encoded, beginning later, seen from elsewhere, or all of it."""
+    shutil.copytree(whole, copy)
+    shift = 0.001 if how in ("shifted", "all") else 0.0
+    names = {f"{i}.png": f"{100 + i}-b.png" if how in ("renamed", "all") else f"{i}.png" for i in range(24)}
+    dropped = 5 if how in ("later", "all") else 0
+    for kind in ("rgb", "depth"):
+        for old, new in names.items():
+            image = cv2.imread(str(copy / kind / old), cv2.IMREAD_UNCHANGED)
+            (copy / kind / old).unlink()
+            level = 0 if how in ("re-encoded", "all") else 3
+            cv2.imwrite(str(copy / kind / new), image, [cv2.IMWRITE_PNG_COMPRESSION, level])
+    for kind in ("rgb", "depth", "groundtruth"):
+        lines = [line.split() for line in (copy / f"{kind}.txt").read_text().splitlines()[dropped:]]
+        for words in lines:
+            words[0] = f"{float(words[0]) + shift:.6f}"
+            if kind != "groundtruth":
+                words[1] = f"{kind}/{names[Path(words[1]).name]}"
+            elif how in ("elsewhere", "all"):  # turned by 90 degrees and moved
+                words[1:4] = ["5", f"{float(words[1]) - 2:.6f}", "1"]
+        (copy / f"{kind}.txt").write_text("\n".join(" ".join(words) for words in lines) + "\n")
+    return copy
+
+
+@pytest.mark.parametrize("how", ["renamed", "shifted", "re-encoded", "later", "elsewhere", "all"])
+def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
+    whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
+    copy, twin = (disguised(whole, tmp_path / name, how) for name in ("copy", "twin"))
+    assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, "digests alone pass it"
+    with pytest.raises(StudyError, match="are the same sequence"):
+        faults([str(whole)], [str(copy)])
+    with pytest.raises(StudyError, match="are the same sequence"):
+        faults([str(twin)], [str(whole)])
+    for phase in (0.9, 1.7, 2.5):
+        other = toy_tracker.make_sequence(tmp_path / f"other{phase}", phase, 24)
+        assert faults([str(copy)], [str(other)]) == []
 
 
 def test_instances_stay_in_their_split() -> None:

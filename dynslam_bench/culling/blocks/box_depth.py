@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import dilate
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .box_depth_settings import BoxDepthSettings
 from .boxes import dynamic_boxes
-from .semantic import inside
 
 
 class BoxDepthFilter(DynamicFilter):

@@ -6,13 +6,13 @@ import numpy as np
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import dynamic_mask, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..tools.fundamental_matrix import Estimator, Flags, Matches, f_stats
 from ..tools.links import judged_by_flow
 from .class_rule_settings import ClassRuleSettings
-from .semantic import inside
 
 
 class ClassRuleFilter(DynamicFilter):

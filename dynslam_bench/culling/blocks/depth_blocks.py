@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import dilate, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .depth_blocks_settings import DepthBlockSettings
-from .semantic import inside
 
 
 class DepthBlockFilter(DynamicFilter):

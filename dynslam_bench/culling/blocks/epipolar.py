@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 
 from ..tools.coherence import coherent
 from ..tools.ego_motion import rigid_flow
@@ -20,7 +21,6 @@ from ..tools.fundamental_matrix import (
     rotation_residual,
 )
 from .epipolar_settings import EpipolarSettings
-from .semantic import inside
 
 RIGID_PX = 2.0
 """Nearer than this to where the camera's motion puts it, a point moves with the static world."""
@@ -72,18 +72,7 @@ class EpipolarFilter(DynamicFilter):
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
     provenance: Provenance = "faithful-paper"
-    stats_names = (
-        "dropped",
-        "matches",
-        "inliers",
-        "parallax_px",
-        "homography_share",
-        "contradiction",
-        "degenerate",
-        "moving_objects",
-        "f_asked",
-        "f_judged",
-    )
+    stats_names = ("dropped", *STATS)
 
     def __init__(self, settings: EpipolarSettings) -> None:
         self.settings = settings

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..tools.links import inherit, link_to_previous
 from .boxes import dynamic_boxes, in_boxes
 from .moving_probability_settings import ProbabilitySettings
-from .semantic import inside
 
 UNKNOWN = 0.5
 SURE = (0.25, 0.75)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from ..tools.fundamental_matrix import Estimator, Matches, f_stats
 from .moving_vote_settings import MovingVoteSettings
-from .semantic import inside
 
 BORDER_PX = 5
 HARRIS_K = 0.04

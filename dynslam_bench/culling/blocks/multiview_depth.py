@@ -17,12 +17,12 @@ from dynslam_bench.contracts.filter import (
 )
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import dilate
 
 from ..tools.light_track import light_track
 from .multiview_depth_settings import MultiViewSettings
 from .multiview_kernels import BIN_M, grow, hidden
-from .semantic import inside
 
 MAX_REFERENCE_DEPTH_M = 6.0
 MAX_PROJECTED_DEPTH_M = 7.0

@@ -10,11 +10,11 @@ from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterSt
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .residual_clusters_settings import ResidualSettings
-from .semantic import inside
 
 STEP = 8
 """The image is sampled on every eighth pixel."""

@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.pixels import inside
 from dynslam_bench.segmentation.masks.postprocess import dynamic_mask, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-
-def inside(mask: NDArray[np.bool_], xy: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Bool ``[N]``: which raw pixels ``[N, 2]`` lie on the mask ``[H, W]``; pixels outside the image do not."""
-    height, width = mask.shape
-    column, row = np.rint(xy).astype(np.intp).T
-    seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.asarray(seen & mask[row.clip(0, height - 1), column.clip(0, width - 1)])
 
 
 class SemanticFilter(DynamicFilter):
@@ -41,7 +33,9 @@ class SemanticFilter(DynamicFilter):
         """Drop what lies on the masks; without a segmenter, keep all."""
         if frame.instances is None or not len(frame.instances):
             return FilterResult.of(np.ones(len(frame), bool), {"objects": 0.0, "mask_fraction": 0.0})
-        mask = dynamic_mask(frame.instances, self.settings, depth=frame.depth)
+        mask = frame.mask
+        if mask is None:
+            mask = dynamic_mask(frame.instances, self.settings, depth=frame.depth)
         keep = ~inside(mask, frame.keypoints.xy)
         stats = {"objects": float(len(select(frame.instances, self.settings))), "mask_fraction": float(mask.mean())}
         return FilterResult.of(keep, stats, mask)

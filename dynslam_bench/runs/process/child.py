@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.core.plugin_probe import ISOLATED_VARIABLE
 from dynslam_bench.core.plugins import load_object
 
 from .failures import describe_failure
@@ -107,7 +108,7 @@ def _redirect(log: Path) -> None:
 
 
 def _prepare(job: dict[str, Any]) -> None:
-    os.environ.update(job["environment"])
+    os.environ.update(job["environment"] | {ISOLATED_VARIABLE: "1"})
     with contextlib.suppress(OSError):
         os.chdir(job["working_folder"])
     sys.path[:] = job["path"]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import EvaluationError, TrajectoryError
+from dynslam_bench.core.errors import DynslamError, EvaluationError
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -21,18 +21,19 @@ Which = Literal["online", "final"]
 
 def evaluate_run(
     record: RunRecord,
-    trajectories: Mapping[Which, Trajectory | None],
-    truth: Trajectory | None,
-    stamps: Callable[[], NDArray[np.float64]],
+    read_trajectory: Callable[[Which], Trajectory | None],
+    read_truth: Callable[[], Trajectory | None],
+    read_stamps: Callable[[], NDArray[np.float64]],
     protocol: Protocol,
 ) -> MetricRecord:
     """The metrics of a run under a protocol.
 
     Args:
         record: The run.
-        trajectories: Its ``online`` and ``final`` trajectory; None for one that does not exist or holds no pose.
-        truth: The ground truth of its part of the sequence; None if there is none.
-        stamps: Reads the stamps of the part's input frames; asked only where they are needed.
+        read_trajectory: Reads its ``online`` or ``final`` trajectory; None for one that does not exist or holds no
+            pose.
+        read_truth: Reads the ground truth of its part of the sequence; None if there is none.
+        read_stamps: Reads the stamps of the part's input frames; asked only where they are needed.
         protocol: How to evaluate.
 
     Returns:
@@ -40,15 +41,18 @@ def evaluate_run(
     """
     found: dict[Which, Evaluation | None] = {}
     reasons: dict[str, str] = {}
-    for which, trajectory in trajectories.items():
+    which: Which
+    for which in ("online", "final"):
         try:
+            truth = read_truth()
             if truth is None:
                 raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
+            trajectory = read_trajectory(which)
             if trajectory is None:
                 raise EvaluationError("there is no such trajectory, or it holds no tracked frame")
-            inputs = stamps() if record.stamps_match else None
+            inputs = read_stamps() if record.stamps_match else None
             found[which] = evaluate(trajectory, truth, protocol, input_timestamps=inputs)
-        except (EvaluationError, TrajectoryError) as error:
+        except DynslamError as error:
             found[which], reasons[which] = None, str(error)
     return MetricRecord(
         run_id=record.run_id,

@@ -23,14 +23,16 @@ class FrameLog:
 
     Attributes:
         rows: One a frame.
+        damage: What is wrong with the row after the last, one line; empty for nothing.
     """
 
     rows: list[FrameRow] = field(default_factory=list)
+    damage: str = ""
 
     @classmethod
     def read(cls, path: Path) -> FrameLog:
         """Read the child's log; a line that a dying process left unfinished is not taken."""
-        return cls(read_log(path))
+        return cls(*read_log(path))
 
     def count(self, state: str) -> int:
         """Frames of a state."""

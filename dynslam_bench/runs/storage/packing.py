@@ -5,8 +5,11 @@ from __future__ import annotations
 import io
 import json
 import re
+import shutil
+import struct
 import tempfile
 import zipfile
+import zlib
 from pathlib import Path
 
 from dynslam_bench.core.errors import RunError
@@ -20,6 +23,12 @@ from .store import RUN_FILE, RunStore
 
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16})/([A-Za-z0-9_]+\.[a-z0-9]+)")
 _LARGEST = 2**31
+_MAX_RATIO = 200
+"""Most bytes that a byte of the archive may unpack to."""
+_SLACK = 1 << 24
+# What Python's zipfile raises over damaged archives.
+_DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError, LookupError,
+           ValueError, TypeError, OverflowError)  # fmt: skip
 
 
 def run_packed(spec_json: str, options_json: str = "{}") -> bytes:
@@ -64,16 +73,18 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return _take(archive, store)
-    except zipfile.BadZipFile as error:
+            return _take(archive, store, min(_LARGEST, _SLACK + _MAX_RATIO * len(data)))
+    except _DAMAGE as error:
         raise RunError(f"{len(data)} bytes from a worker are no packed run: {error}") from error
 
 
-def _take(archive: zipfile.ZipFile, store: RunStore) -> RunRecord:
+def _take(archive: zipfile.ZipFile, store: RunStore, largest: int) -> RunRecord:
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
-    if size > _LARGEST:
-        raise RunError(f"a packed run holds {size / 1e9:.1f} GB, at most {_LARGEST / 1e9:.1f} GB are taken")
+    if size > largest:
+        raise RunError(f"a packed run holds {size / 1e9:.1f} GB, at most {largest / 1e9:.1f} GB are taken")
+    if any(entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for entry in entries):
+        raise RunError("a packed run is compressed in a way that pack() does not use")
     matches = {entry.filename: _ENTRY.fullmatch(entry.filename) for entry in entries}
     odd = [name for name, match in matches.items() if match is None]
     runs = {match[2] for match in matches.values() if match is not None and match[1] == "runs"}
@@ -84,7 +95,8 @@ def _take(archive: zipfile.ZipFile, store: RunStore) -> RunRecord:
         for name, match in matches.items():
             assert match is not None
             if match[1] == "runs":
-                (work / match[3]).write_bytes(archive.read(name))
+                with archive.open(name) as source, (work / match[3]).open("wb") as file:
+                    shutil.copyfileobj(source, file)
         record = RunRecord.read(work / RUN_FILE)
         if record.run_id != run_id:
             raise RunError(f"a packed run names itself {record.run_id} but lies under {run_id}")

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from dynslam_bench.core.machine import GitRevision, Machine
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Digest, Record
 from dynslam_bench.evaluation.evaluate import Evaluation
 
 RUN_SCHEMA = 1
@@ -55,7 +55,7 @@ class SequenceInfo(Record):
 
     id: str
     content: str = ""
-    part: str
+    part: Digest
     block: str = ""
     noise: int | None = None
     frames: int
@@ -134,7 +134,7 @@ class RunRecord(Record):
 
     schema_version: int = RUN_SCHEMA
     kind: Literal["run", "imported"] = "run"
-    run_id: str
+    run_id: Digest
     status: Status
     reason: str = ""
     tracker: TrackerInfo
@@ -231,7 +231,7 @@ class MetricRecord(Record):
     """
 
     schema_version: int = METRIC_SCHEMA
-    run_id: str
+    run_id: Digest
     protocol_id: str
     protocol_digest: str
     trajectory: Literal["online", "final"] = "online"

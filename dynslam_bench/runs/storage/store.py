@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 import secrets
@@ -11,6 +12,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,17 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
+from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
-from .evaluating import DEFAULT_PROTOCOL, Which, evaluate_run
+from .evaluating import DEFAULT_PROTOCOL, evaluate_run
 from .record import MetricRecord, RunRecord
 
 if TYPE_CHECKING:
     import pandas as pd
 
+LOGGER = logging.getLogger(__name__)
 RUN_FILE = "run.json"
 _RUN_ID = re.compile(r"[0-9a-f]{16}")
 
@@ -62,8 +66,16 @@ class RunStore:
         return self.root / "runs"
 
     def folder(self, run_id: str) -> Path:
-        """Folder of one run, whether it exists or not."""
-        return self.runs / run_id
+        """Folder of one run, whether it exists or not.
+
+        Raises:
+            RunError: It is no run's id, which is 16 hexadecimal digits: anything else could lead out of the store.
+        """
+        return self.runs / _checked(run_id, "a run's id")
+
+    def _part(self, part: str) -> Path:
+        """Folder of the stamps and the ground truth of a sequence's part."""
+        return self.root / "sequences" / _checked(part, "the part of a sequence")
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
@@ -111,7 +123,7 @@ class RunStore:
         """
         target = self.folder(record.run_id)
         try:
-            (work / RUN_FILE).write_text(record.to_json())
+            (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
             work.chmod(0o755)
             if target.exists():
                 stale = work.with_name(f"{work.name}.old")
@@ -127,7 +139,7 @@ class RunStore:
 
     def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
         """Keep the stamps of a sequence's frames and its ground truth; done once a part."""
-        folder = self.root / "sequences" / part
+        folder = self._part(part)
         if (folder / "timestamps.txt").is_file():
             return
         if ground_truth is not None and len(ground_truth):
@@ -181,23 +193,30 @@ class RunStore:
             RunError: There is no such run.
             DynslamError: Its record is damaged.
         """
-        return RunRecord.read(self.folder(self.find(run_id)) / RUN_FILE)
+        return self._read(self.find(run_id))
 
     def get(self, run_id: str) -> RunRecord | None:
         """The record of a run by its full id, None if it is not stored or damaged."""
         if not (self.folder(run_id) / RUN_FILE).is_file():
             return None
         try:
-            return RunRecord.read(self.folder(run_id) / RUN_FILE)
+            return self._read(run_id)
         except DynslamError:
             return None
+
+    def _read(self, run_id: str) -> RunRecord:
+        path = self.folder(run_id) / RUN_FILE
+        record = RunRecord.read(path)
+        if record.run_id != run_id:
+            raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
+        return record
 
     def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
         """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
         records, unreadable = [], []
         for run_id in self.ids():
             try:
-                records.append(RunRecord.read(self.folder(run_id) / RUN_FILE))
+                records.append(self._read(run_id))
             except DynslamError as error:
                 unreadable.append(Unreadable(self.folder(run_id), str(error)))
         return sorted(records, key=lambda record: (record.started, record.run_id)), unreadable
@@ -220,9 +239,16 @@ class RunStore:
         raise RunError(f"there is no run '{prefix}'", hint)
 
     def metrics(self, run_id: str, protocol: Protocol) -> MetricRecord | None:
-        """A run's stored metrics under a protocol; None if it was not scored under it."""
+        """A run's stored metrics under a protocol; None if it was not scored under it, or they are damaged."""
         path = self._metric_file(run_id, protocol.digest())
-        return MetricRecord.read(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        try:
+            found = MetricRecord.read(path)
+        except DynslamError as error:
+            LOGGER.warning("run %s is scored again: %s", run_id, error)
+            return None
+        return found if (found.run_id, found.protocol_digest) == (run_id, protocol.digest()) else None
 
     def score(
         self, record: RunRecord, protocol: Protocol | str = DEFAULT_PROTOCOL, *, again: bool = False
@@ -233,16 +259,20 @@ class RunStore:
         if stored is not None:
             return stored
         part = record.sequence.part
-        found: dict[Which, Trajectory | None] = {
-            "online": self.trajectory(record.run_id, "online"),
-            "final": self.trajectory(record.run_id, "final"),
-        }
-        truth = self.ground_truth(part)
-        metrics = evaluate_run(record, found, truth, lambda: self.timestamps(part), protocol)
+        metrics = evaluate_run(
+            record,
+            lambda which: self.trajectory(record.run_id, which),
+            lambda: self.ground_truth(part),
+            lambda: self.timestamps(part),
+            protocol,
+        )
         if record.kind == "imported":  # it has only one trajectory
             online = (self.folder(record.run_id) / "trajectory_online.txt").is_file()
             metrics = metrics.model_copy(update={"trajectory": "online" if online else "final"})
-        self.add_metrics(metrics)
+        try:
+            self.add_metrics(metrics)
+        except DynslamError as error:  # a store that can only be read can be scored all the same
+            LOGGER.info("the metrics of run %s are not kept: %s", record.run_id, error)
         return metrics
 
     def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL) -> pd.DataFrame:
@@ -262,29 +292,30 @@ class RunStore:
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
         """The ``online`` or ``final`` trajectory of a run; None if there is none or no frame was tracked."""
         path = self.folder(run_id) / f"trajectory_{which}.txt"
-        if not path.is_file() or not any(line and line[0] != "#" for line in path.read_text().splitlines()):
+        if not path.is_file() or not any(line.strip() and line[0] != "#" for line in read_lines(path, kind=RunError)):
             return None
         return read_tum(path)
 
     def ground_truth(self, part: str) -> Trajectory | None:
         """The ground truth of a sequence's part; None if it has none."""
-        path = self.root / "sequences" / part / "groundtruth.txt"
-        return read_tum(path) if path.is_file() else None
+        path = self._part(part) / "groundtruth.txt"
+        return _read_truth(path, path.stat().st_mtime_ns) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
         """Stamps in seconds of all input frames of a sequence's part.
 
         Raises:
-            RunError: They are not stored.
+            RunError: They are not stored, or damaged.
         """
-        path = self.root / "sequences" / part / "timestamps.txt"
+        path = self._part(part) / "timestamps.txt"
+        lines = read_lines(path, kind=RunError)
         try:
-            return np.array([float(line) for line in path.read_text().split()], dtype=np.float64)
-        except (OSError, ValueError) as error:
+            return np.array([float(line) for line in lines if line.strip()], dtype=np.float64)
+        except ValueError as error:
             raise RunError(f"cannot read {path}: {error}", "the results folder is incomplete") from error
 
     def _metric_file(self, run_id: str, protocol_digest: str) -> Path:
-        return self.root / "metrics" / protocol_digest / f"{run_id}.json"
+        return self.root / "metrics" / protocol_digest / f"{self.folder(run_id).name}.json"
 
     def _forget_metrics(self, run_id: str) -> None:
         for metrics in (self.root / "metrics").glob(f"*/{run_id}.json"):
@@ -296,6 +327,21 @@ class RunStore:
         with contextlib.suppress(OSError):  # a file system without links: the run is stored all the same
             fresh.symlink_to(target.relative_to(self.root))
             fresh.replace(link)
+
+
+def _checked(name: str, what: str) -> str:
+    """A name that data gives to a folder of the store, if it is one that this package makes."""
+    if not _RUN_ID.fullmatch(name):
+        raise RunError(f"{name[:100]!r} is not {what}: expected 16 hexadecimal digits")
+    return name
+
+
+@lru_cache(maxsize=64)
+def _read_truth(path: Path, _changed_ns: int) -> Trajectory:
+    """A ground truth, which many runs share; nobody may write into it."""
+    truth = read_tum(path)
+    truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
+    return truth
 
 
 def _abandoned(name: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,8 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.images import read_image
+from dynslam_bench.core.reading import read_json
 
 from ..classes import COCO_NAMES
 from ..networks.images import boxes_of, check_mask_shape
@@ -54,8 +55,10 @@ class RecordedSegmenter:
                 "name all by stamp or all by index",
             )
         try:
-            numbers = [float(file.stem) if stamped else int(file.stem) for file in files]
-        except ValueError as error:
+            numbers = [float(file.stem if stamped else int(file.stem)) for file in files]
+            if not np.isfinite(numbers).all():
+                raise ValueError("a stamp is not finite")
+        except (ValueError, OverflowError) as error:
             raise SegmentationError(
                 f"{self.folder}: a mask file is named neither by stamp nor by index: {error}",
                 "for example 1311868164.363181.png or 000012.png",
@@ -73,9 +76,15 @@ class RecordedSegmenter:
             SegmentationError: No file for the frame, an unreadable file, a wrong size, an object without a class.
         """
         path = self._find(frame)
-        image: NDArray[Any] | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise SegmentationError(f"cannot read the mask {path}", "it is damaged or no PNG")
+        height, width = frame.rgb.shape[:2]
+        image = read_image(
+            path,
+            size=(width, height),
+            mismatch=f"but the frame is {width}x{height}",
+            hint="record the masks at the size of the frames",
+            flags=cv2.IMREAD_UNCHANGED,
+            kind=SegmentationError,
+        )
         labels = _one_channel(image, path)
         check_mask_shape(labels, frame.rgb.shape, str(path))
         values = [int(value) for value in np.unique(labels) if value != 0]
@@ -142,8 +151,8 @@ def _read_classes(path: Path) -> dict[int, str] | None:
     if not path.is_file():
         return None
     try:
-        names = {int(key): str(name) for key, name in json.loads(path.read_text()).items()}
-    except (OSError, ValueError, AttributeError) as error:
+        names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
+    except (ValueError, AttributeError) as error:
         raise SegmentationError(f"cannot read {path}: {error}", 'expected {"1": "person", ...}') from error
     unknown = sorted({name for name in names.values() if name not in COCO_NAMES})
     if unknown:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.harmless import inside
+from dynslam_bench.core.images import read_image
+from dynslam_bench.core.reading import TABLE_BYTES, read_json, read_lines
 from dynslam_bench.core.records import digest
 
 from ..classes import COCO_NAMES
@@ -19,6 +21,8 @@ from .labelled import LabelledImage
 
 FINER = 4
 """Polygons are filled at this many times the image's resolution."""
+FARTHEST_PX = 1e6
+"""Corners of polygons farther away than any image is wide are refused: OpenCV counts in 32 bits."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
@@ -44,25 +48,25 @@ class CocoImages:
     def __init__(self, annotations: Path, images: Path | None = None) -> None:
         self.path = annotations.expanduser()
         folder = images.expanduser() if images is not None else self.path.parent
+        content = read_json(self.path, limit=TABLE_BYTES, kind=SegmentationError)
         try:
-            content = json.loads(self.path.read_text())
             names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
             shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
             for entry in content["annotations"]:
                 if not entry.get("iscrowd"):
                     shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
-            self._entries = [
-                _Entry(folder / entry["file_name"], tuple(shapes[int(entry["id"])])) for entry in content["images"]
-            ]
-        except OSError as error:
-            raise SegmentationError(f"cannot read {self.path}: {error.strerror}") from error
-        except (ValueError, KeyError, TypeError) as error:
+            images_named = [(str(entry["file_name"]), int(entry["id"])) for entry in content["images"]]
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             raise SegmentationError(
-                f"{self.path} is not in COCO's annotation format: {type(error).__name__} {error}",
+                f"{self.path} is not in COCO's annotation format: {type(error).__name__} {str(error)[:200]}",
                 "it needs images, annotations and categories",
             ) from error
-        if not self._entries:
+        if not images_named:
             raise SegmentationError(f"{self.path} lists no images")
+        self._entries = [
+            _Entry(inside(folder, name, where=str(self.path), kind=SegmentationError), tuple(shapes[number]))
+            for name, number in images_named
+        ]
 
     @property
     def name(self) -> str:
@@ -122,14 +126,15 @@ class YoloImages:
         rgb = _read(path)
         label = self.folder / "labels" / path.relative_to(self.folder / "images").with_suffix(".txt")
         masks, names = [], []
-        for number, line in enumerate(label.read_text().splitlines() if label.is_file() else [], 1):
+        for number, line in enumerate(read_lines(label, kind=SegmentationError) if label.is_file() else [], 1):
             if not line.strip():
                 continue
             try:
                 kind, *points = line.split()
-                name = COCO_NAMES[int(kind)]
+                name = COCO_NAMES[_positive(kind)]
                 polygon = np.array(points, np.float64).reshape(-1, 2) * [rgb.shape[1], rgb.shape[0]]
-            except (ValueError, IndexError) as error:
+                _check_polygon(polygon)
+            except (ValueError, IndexError, OverflowError) as error:
                 raise SegmentationError(
                     f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
                 ) from error
@@ -143,9 +148,7 @@ def _files_digest(paths: list[Path]) -> str:
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise SegmentationError(f"cannot read the image {path}", "it is missing or damaged")
+    image = read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)
     return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
@@ -172,29 +175,57 @@ def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArra
     return mask
 
 
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise ValueError(f"{number} is no class")
+    return number
+
+
+def _check_polygon(polygon: NDArray[np.float64]) -> None:
+    """Raise ValueError where a corner is no number or far outside of any image."""
+    if not (np.abs(polygon) < FARTHEST_PX).all():  # also catches NaN
+        raise ValueError(f"a corner is not finite, or more than {FARTHEST_PX:g} pixels away")
+
+
 def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
-    if isinstance(segmentation, list):
-        return _fill([np.array(points, np.float64).reshape(-1, 2) for points in segmentation], shape)
-    if isinstance(segmentation, dict) and "counts" in segmentation and "size" in segmentation:
-        counts = segmentation["counts"]
-        runs = decode_runs(counts) if isinstance(counts, str) else [int(count) for count in counts]
-        height, width = (int(value) for value in segmentation["size"])
-        flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-        if (height, width) == tuple(shape) and flat.size == height * width:
-            return np.ascontiguousarray(flat.reshape(width, height).T)
-        raise SegmentationError(
-            f"{where}: a mask of {width}x{height} with {flat.size} pixels, the image is {shape[1]}x{shape[0]}"
-        )
+    try:
+        if isinstance(segmentation, list):
+            polygons = [np.array(points, np.float64).reshape(-1, 2) for points in segmentation]
+            for polygon in polygons:
+                _check_polygon(polygon)
+            return _fill(polygons, shape)
+        if isinstance(segmentation, dict) and "counts" in segmentation and "size" in segmentation:
+            return _from_runs(segmentation["counts"], segmentation["size"], shape)
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
+        raise SegmentationError(f"{where}: a segmentation is damaged: {str(error)[:200]}") from error
     raise SegmentationError(f"{where}: a segmentation is neither polygons nor run lengths")
 
 
+def _from_runs(counts: Any, size: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The mask of run lengths, column by column; raises ValueError where they do not fill the image exactly."""
+    runs = decode_runs(counts) if isinstance(counts, str) else [int(count) for count in counts]
+    height, width = (int(value) for value in size)
+    total = sum(runs)
+    if (height, width) != tuple(shape) or total != height * width or min(runs) < 0:
+        raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
+    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    return np.ascontiguousarray(flat.reshape(width, height).T)
+
+
 def decode_runs(text: str) -> list[int]:
-    """COCO's compressed run lengths: base-32 digits, least first, differences to the run two before."""
+    """COCO's compressed run lengths: base-32 digits, least first, differences to the run two before.
+
+    Raises:
+        ValueError: The text ends within a number, or a number is longer than any image.
+    """
     runs: list[int] = []
     position = 0
     while position < len(text):
         value = shift = 0
         while True:
+            if position == len(text) or shift > 60:
+                raise ValueError(f"the run lengths are damaged at character {position} of {len(text)}")
             digit = ord(text[position]) - 48
             position += 1
             value |= (digit & 0x1F) << shift

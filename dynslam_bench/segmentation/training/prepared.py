@@ -11,7 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import atomic_folder
+from dynslam_bench.core.reading import TABLE_BYTES, read_json
 from dynslam_bench.core.records import digest
 
 from ..networks.images import boxes_of
@@ -20,6 +22,7 @@ from .labelled import LabelledImage, LabelledImages
 MIN_VISIBLE_PX = 16
 """Objects with fewer pixels at the network's input size are not taught."""
 
+_AGAIN = "delete the folder, they are prepared again"
 Progress = Callable[[int, int], None]
 
 
@@ -48,12 +51,20 @@ class PreparedImages:
     Args:
         folder: Written by `prepare`.
         classes: The names to learn, in order; other objects become background.
+
+    Raises:
+        SegmentationError: The folder is damaged.
     """
 
     def __init__(self, folder: Path, classes: Sequence[str]) -> None:
-        self.images: NDArray[np.uint8] = np.load(folder / "images.npy", mmap_mode="r")
-        self.labels: NDArray[np.uint8] = np.load(folder / "labels.npy", mmap_mode="r")
-        self.names: list[list[str]] = json.loads((folder / "names.json").read_text())
+        try:
+            self.images: NDArray[np.uint8] = np.load(folder / "images.npy", mmap_mode="r", allow_pickle=False)
+            self.labels: NDArray[np.uint8] = np.load(folder / "labels.npy", mmap_mode="r", allow_pickle=False)
+        except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
+            raise SegmentationError(f"the prepared images in {folder} are damaged: {error}", _AGAIN) from error
+        self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
+        if not len(self.images) == len(self.labels) == len(self.names):
+            raise SegmentationError(f"the prepared images in {folder} are damaged: their numbers differ", _AGAIN)
         self.classes = tuple(classes)
 
     def __len__(self) -> int:

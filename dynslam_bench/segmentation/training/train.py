@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.reading import read_json
 
 from ..classes import COCO_NAMES, PRESETS
 from ..networks.mask_rcnn.config import NetworkConfig, embedded_config, resnet18_config
@@ -91,7 +92,9 @@ def _check_settings(settings: TrainSettings, output: Path, resume: bool) -> bool
     """Write down the settings of a new run; True if this is one."""
     path = output / "settings.json"
     if resume and path.is_file():
-        before = json.loads(path.read_text())
+        before = read_json(path, kind=SegmentationError)
+        if not isinstance(before, dict):
+            raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
         now = json.loads(settings.model_dump_json())
         changed = sorted(key for key in now if before.get(key) != now[key] and key not in ("iterations", "patience"))
         if changed:

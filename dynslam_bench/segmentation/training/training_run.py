@@ -161,8 +161,8 @@ class TrainingRun:
             self.optimiser.load_state_dict(content["optimiser"])
             self.step, self.rows = int(content["step"]), json.loads(content["rows"])
             self.best, self.recent = json.loads(content["best"]), json.loads(content["recent"])
-        except (KeyError, RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
+        except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise SegmentationError(f"{self.output / 'last.pt'} does not fit these settings: {reason}") from error
 
 

@@ -9,19 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
-
-Image = NDArray[np.integer | np.floating]
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_PNG_END = b"IEND\xaeB`\x82"
+from dynslam_bench.core.images import read_image
 
 
-def read_colour(path: Path) -> NDArray[np.uint8]:
+def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.uint8]:
     """The image as uint8 ``[H, W, 3]``, red first; grey images are repeated over the channels.
 
+    Args:
+        path: An image of 8 bits a channel.
+        size: Width and height that it has to have; None for any.
+        mismatch: Ends the message where it has another one.
+
     Raises:
-        SequenceError: The file is missing, empty, truncated, no image, or has more than 8 bits a channel.
+        SequenceError: The file is missing, empty, truncated, of another size, no image, or has more than 8 bits a
+            channel.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = read_image(
+        path, size=size, mismatch=mismatch, hint="name the right camera with --camera", kind=SequenceError
+    )
     if image.dtype != np.uint8:
         raise SequenceError(
             f"colour image {path} has {image.dtype.itemsize * 8} bits a channel, expected 8",
@@ -33,17 +38,23 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 
 
-def read_depth(path: Path, depth_factor: float) -> NDArray[np.float32]:
+def read_depth(
+    path: Path, depth_factor: float, *, size: tuple[int, int] | None = None, mismatch: str = ""
+) -> NDArray[np.float32]:
     """The image as float32 ``[H, W]`` in metres, 0 where the depth is missing.
 
     Args:
         path: A 16-bit image of one channel.
         depth_factor: Raw units a metre.
+        size: Width and height that it has to have; None for any.
+        mismatch: Ends the message where it has another one.
 
     Raises:
-        SequenceError: The file is missing, empty, truncated, no image, or not of 16 bits in one channel.
+        SequenceError: The file is missing, empty, truncated, of another size, no image, or not of 16 bits in one
+            channel.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    hint = "set the preprocessing's width and height to resize both"
+    image = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise SequenceError(
@@ -52,20 +63,3 @@ def read_depth(path: Path, depth_factor: float) -> NDArray[np.float32]:
             f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
         )
     return image.astype(np.float32) / np.float32(depth_factor)
-
-
-def _decode(path: Path, flags: int) -> Image:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SequenceError(f"cannot read image {path}: {error.strerror}") from error
-    if not data:
-        raise SequenceError(f"image {path} is empty (0 bytes)", "fetch the sequence again")
-    truncated = data.startswith(_PNG_START) and _PNG_END not in data[-64:]
-    if not truncated:
-        # some OpenCV versions fill what is missing of a truncated PNG with zeros, hence the check above
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        if image is not None:
-            return np.asarray(image)
-    state = "is truncated" if truncated else "cannot be decoded"
-    raise SequenceError(f"image {path} {state} ({len(data)} bytes)", "fetch the sequence again")

@@ -11,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.reading import read_lines
+
+MOST_LINES = 1_000_000
+"""Nine hours at 30 frames a second; a longer list is refused before it fills the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +133,12 @@ def read_stamped_lines(path: Path) -> list[tuple[float, list[str]]]:
     """Lines of a TUM list file, split at white space and commas, with the first part as seconds.
 
     Raises:
-        SequenceError: The file cannot be read, or a first part is not a number; names the line.
+        SequenceError: The file cannot be read, a first part is not a number (names the line), or there are too many.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SequenceError(
-            f"{path} is not a text file (byte {error.start} is {error.object[error.start]:#x})"
-        ) from error
-    except OSError as error:
-        raise SequenceError(f"cannot read {path}: {error.strerror}") from error
     rows: list[tuple[float, list[str]]] = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_lines(path, kind=SequenceError), start=1):
+        if number > MOST_LINES:
+            raise SequenceError(f"{path} has more than {MOST_LINES} lines, too many for a list of images")
         parts = line.replace(",", " ").split()
         if parts and not parts[0].startswith("#"):
             rows.append((_number(parts[0], f"{path} line {number}"), parts[1:]))
@@ -151,7 +149,7 @@ def _number(text: str, where: object) -> float:
     try:
         return float(text)
     except ValueError:
-        raise SequenceError(f"{where}: '{text}' is not a timestamp in seconds") from None
+        raise SequenceError(f"{where}: '{text[:40]}' is not a timestamp in seconds") from None
 
 
 def _count_unsorted(stamps: list[float]) -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, MaskSource
 from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.harmless import inside
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.camera import Camera
@@ -197,21 +198,17 @@ class TumSequence:
         from .images import read_colour, read_depth
 
         index = range(len(self))[index]
-        rgb = read_colour(self.folder / self._colour[index])
-        depth = read_depth(self.folder / self._depth[index], self.camera.depth_factor)
-        expected = (self.camera.height, self.camera.width)
-        if rgb.shape[:2] != expected:
-            raise SequenceError(
-                f"colour image {self.folder / self._colour[index]} is {_size(rgb)}, but the camera of {self.id} is "
-                f"{expected[1]}x{expected[0]}",
-                "name the right camera with --camera",
-            )
-        if depth.shape != expected and not self._any_depth_size:
-            raise SequenceError(
-                f"depth image {self.folder / self._depth[index]} is {_size(depth)}, but its colour image is "
-                f"{_size(rgb)}",
-                "set the preprocessing's width and height to resize both",
-            )
+        size = (self.camera.width, self.camera.height)
+        expected = f"{size[0]}x{size[1]}"
+        rgb = read_colour(
+            self.folder / self._colour[index], size=size, mismatch=f"but the camera of {self.id} is {expected}"
+        )
+        depth = read_depth(
+            self.folder / self._depth[index],
+            self.camera.depth_factor,
+            size=None if self._any_depth_size else size,
+            mismatch=f"but its colour image is {expected}",
+        )
         return Frame(index, float(self._timestamps[index]), rgb, depth)
 
     def __repr__(self) -> str:
@@ -236,7 +233,14 @@ class TumSequence:
 
 
 def _list_images(folder: Path, fps: float | None) -> tuple[ImageList, ImageList, bool]:
-    """Colour list, depth list, and whether they are paired already."""
+    """Colour list, depth list, and whether they are paired already; every file named lies in the folder."""
+    colour, depth, paired = _read_lists(folder, fps)
+    for file in (*colour.files, *depth.files):
+        inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+    return colour, depth, paired
+
+
+def _read_lists(folder: Path, fps: float | None) -> tuple[ImageList, ImageList, bool]:
     if not (folder / "rgb.txt").is_file() and not (folder / "depth.txt").is_file():
         for name in ASSOCIATIONS:
             if (folder / name).is_file():
@@ -334,7 +338,3 @@ def _count(
         frames_without_ground_truth=without,
         largest_hole_s=hole,
     )
-
-
-def _size(image: NDArray[np.generic]) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"

@@ -18,9 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.reading import parse_json
 
 LOGGER = logging.getLogger(__name__)
 """Told, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
+
+
+LONGEST_LINE = 1 << 26
+"""Bytes of the longest line that is taken from a program: a final trajectory of half a million poses."""
 
 
 class Program:
@@ -110,15 +115,13 @@ class Program:
         line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
         text = self._exchange(line, timeout_s, doing)
         try:
-            answer = json.loads(text)
-        except ValueError as error:
+            answer = parse_answer(text)
+        except TrackerError as error:
             self.kill()
-            raise TrackerError(
-                f"{self.name} {doing}: answered no JSON: '{text[:80]}': {error}", "one JSON object a line"
-            ) from None
+            raise TrackerError(f"{self.name} {doing}: {error.args[0]}", "one JSON object a line") from None
         if answer.get("error"):
             raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
-        return dict(answer)
+        return answer
 
     def close(self, timeout_s: float) -> None:
         """Ask it to end, wait, and kill it if it does not; may be called more than once."""
@@ -175,6 +178,9 @@ class Program:
                 self._selector.unregister(key.fileobj)
             *lines, rest = (self._partial[channel] + data).split(b"\n")
             self._partial[channel] = rest
+            if len(rest) > LONGEST_LINE:
+                self.kill()
+                raise TrackerError(f"{self.name}: wrote a line of more than {LONGEST_LINE >> 20} MB, killed")
             for raw in lines:
                 text = raw.decode(errors="replace")
                 if channel == "out" and text.lstrip().startswith("{"):
@@ -202,6 +208,18 @@ class Program:
         self.kill()
         said = f"; its last line: '{words}'" if words else "; it wrote no message"
         return TrackerError(f"{self.name} {doing}: the program {_describe(code)}{said}")
+
+
+def parse_answer(text: str) -> dict[str, Any]:
+    """A program's answer.
+
+    Raises:
+        TrackerError: It is no JSON object; the name of the program is still to be added.
+    """
+    answer = parse_json(text, f"its answer '{text[:80]}'", kind=TrackerError)
+    if not isinstance(answer, dict):
+        raise TrackerError(f"its answer '{text[:80]}' is no JSON object")
+    return answer
 
 
 class _Said:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from dynslam_bench.contracts.result import TrackingState, TrackResult
+from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import DynslamError, TrackerError
 from dynslam_bench.core.seeding import derive_seed
-from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
+from .answers import read_final_answer, read_track_answer
 from .exchange import ImageExchange
 from .program import Program, files_of_command
 from .settings import ProgramSettings, SubprocessSettings
@@ -114,17 +114,7 @@ class ProgramTracker:
         images = exchange.put(frame)
         request = {"op": "track", "index": frame.index, "timestamp": frame.timestamp, **images}
         answer = program.ask(request, self.limits.frame_timeout_s, doing)
-        state = answer.get("state")
-        if state not in get_args(TrackingState):
-            known = ", ".join(get_args(TrackingState))
-            raise TrackerError(f"{self.name} {doing}: answered state {state!r}", f"known: {known}")
-        pose = self._pose(answer.get("T_world_cam"), doing)
-        if pose is None and state == "ok":
-            raise TrackerError(f"{self.name} {doing}: answered state 'ok' without T_world_cam")
-        stats = self._numbers(answer.get("stats"), "stats", doing)
-        timings = self._numbers(answer.get("timings"), "timings", doing)
-        timings["transfer"] = max(0.0, time.perf_counter() - start - sum(timings.values()))
-        return TrackResult(pose, cast(TrackingState, state), stats, timings)
+        return read_track_answer(answer, f"{self.name} {doing}", lambda: time.perf_counter() - start)
 
     def close(self) -> None:
         """End the program (killed if it does not end by itself) and remove the exchanged files."""
@@ -140,25 +130,6 @@ class ProgramTracker:
             raise TrackerError(f"{self.name} was used before reset() or after close()")
         return self._program, self._exchange
 
-    def _pose(self, value: Any, doing: str) -> np.ndarray[Any, np.dtype[np.float64]] | None:
-        if value is None:
-            return None
-        try:
-            pose = np.asarray(value, dtype=np.float64).reshape(4, 4)
-        except (TypeError, ValueError):
-            raise TrackerError(
-                f"{self.name} {doing}: T_world_cam is not 16 numbers: {str(value)[:80]}", "row by row, camera to world"
-            ) from None
-        if not se3.is_pose(pose):
-            raise TrackerError(f"{self.name} {doing}: T_world_cam is no rigid pose: {pose.tolist()}")
-        return pose
-
-    def _numbers(self, value: Any, what: str, doing: str) -> dict[str, float]:
-        try:
-            return {str(key): float(number) for key, number in (value or {}).items()}
-        except (AttributeError, TypeError, ValueError):
-            raise TrackerError(f"{self.name} {doing}: {what} is not an object of numbers: {str(value)[:80]}") from None
-
 
 class FinalizingProgramTracker(ProgramTracker):
     """A program that also answers ``finalize``."""
@@ -171,21 +142,7 @@ class FinalizingProgramTracker(ProgramTracker):
         """
         program, _ = self._running()
         answer = program.ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
-        try:
-            rows = np.asarray(answer.get("trajectory"), dtype=np.float64).reshape(-1, 8)
-            norms = np.linalg.norm(rows[:, 4:], axis=1)
-            if not (np.abs(norms - 1) < 1e-3).all():  # also catches NaN
-                raise TrackerError(
-                    f"{self.name} at finalize: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:g}"
-                )
-            return Trajectory(rows[:, 0], se3.from_quaternion(rows[:, 1:4], rows[:, 4:]))
-        except (TypeError, ValueError):
-            raise TrackerError(
-                f"{self.name} at finalize: 'trajectory' is not a list of rows of 8 numbers",
-                "timestamp tx ty tz qx qy qz qw",
-            ) from None
-        except DynslamError as error:
-            raise TrackerError(f"{self.name} at finalize: {error}") from error
+        return read_final_answer(answer, f"{self.name} at finalize")
 
 
 def files(settings: SubprocessSettings) -> list[Path]:

@@ -92,7 +92,7 @@ def compose(
     """
     from dynslam_bench.core.stage_cache import StageCache
     from dynslam_bench.features.build_extractor import build_extractor
-    from dynslam_bench.features.cached import CachedExtractor
+    from dynslam_bench.features.cached import cached_extractor
     from dynslam_bench.flow.build_flow import build_flow
     from dynslam_bench.segmentation.cached import cache_segmenter
     from dynslam_bench.slam.backend import RgbdBackend
@@ -103,7 +103,7 @@ def compose(
     cached: dict[str, CachedStage] = {}
     extractor = build_extractor(settings.features)
     if cache is not None:
-        extractor = cached["features"] = CachedExtractor(extractor, settings.features, cache, context.threads)
+        extractor = cached["features"] = cached_extractor(extractor, settings.features, cache, context.threads)
     masks = _mask_stage(settings, context, filters, deferred=cache is not None)
     if masks is not None and cache is not None:
         segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from quick_dense import QUICK_DENSE
 
 import dynslam_bench
 from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
@@ -53,7 +54,7 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch) 
     monkeypatch.setattr(dense, "aggregate_and_choose", spy)
     assert chosen is aggregation.aggregate_and_choose
     context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
-    quick = {"flow.dense_budget": 16, "flow.dense_sweeps": 1, "flow.dense_candidates": 2}
+    quick = QUICK_DENSE | {"flow.dense_second_round": True}
     for name, kind, terms in (("emfoa-oft", SparseDaisyFlow, 1), ("emfoa-oft-paper", DensePointFlow, 3)):
         calls.clear()
         tracker = build_tracker(name, {"segmentation.source": "oracle", **(quick if terms == 3 else {})}, context)

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from quick_dense import quick
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry.camera import Camera
@@ -77,7 +78,7 @@ def test_a_missed_person_is_bridged_for_as_long_as_promised(
 ) -> None:
     promised = spec.settings().segmentation.compensate
     assert promised == OWN.get(spec.id, SegmentationSettings().compensate)
-    settings = {"segmentation.source": f"recorded:{recorded}", "segmentation.schedule": "every"}
+    settings = {"segmentation.source": f"recorded:{recorded}", "segmentation.schedule": "every"} | quick(spec.settings)
     tracker = build_tracker(spec, settings, TrackerContext())
     assert isinstance(tracker, SlamPipeline)
     tracker.reset(CAMERA, rng=np.random.default_rng(0))

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from ...classes import COCO_IDS
 
 COCO_CLASSES: tuple[str, ...] = tuple(COCO_IDS.get(number, "") for number in range(1, 91))
 """Names of classes 1..90 as torchvision's COCO models number them; unused numbers are empty."""
+
+Count = Annotated[int, Field(ge=1, le=4096)]
+"""Of channels, layers or pixels; a file's shape may not ask for more than any such network has."""
+Blocks = Annotated[int, Field(ge=1, le=64)]
+Side = Annotated[float, Field(gt=0, le=1e5)]
 
 
 class NetworkConfig(BaseModel):
@@ -45,27 +50,27 @@ class NetworkConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    blocks: tuple[int, int, int, int] = (3, 4, 6, 3)
+    blocks: tuple[Blocks, Blocks, Blocks, Blocks] = (3, 4, 6, 3)
     bottleneck: bool = True
-    stem: int = 64
-    channels: int = 256
+    stem: Count = 64
+    channels: Count = 256
     cfpn: bool = True
-    classes: tuple[str, ...] = COCO_CLASSES
-    anchor_sizes: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)
-    anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)
-    box_hidden: int = 1024
-    mask_channels: int = 256
-    mask_layers: int = 4
-    mask_pool: int = 14
-    canonical: float = 224.0
-    mask_canonical: float = 224.0
-    min_side: int = 800
-    max_side: int = 1333
-    divisor: int = 32
-    pre_nms: int = 1000
-    post_nms: int = 1000
+    classes: tuple[str, ...] = Field(default=COCO_CLASSES, max_length=4096)
+    anchor_sizes: tuple[Side, ...] = Field(default=(32.0, 64.0, 128.0, 256.0, 512.0), min_length=5, max_length=5)
+    anchor_ratios: tuple[Side, ...] = Field(default=(0.5, 1.0, 2.0), min_length=1, max_length=16)
+    box_hidden: Count = 1024
+    mask_channels: Count = 256
+    mask_layers: Blocks = 4
+    mask_pool: Count = 14
+    canonical: Side = 224.0
+    mask_canonical: Side = 224.0
+    min_side: Count = 800
+    max_side: Count = 1333
+    divisor: Count = 32
+    pre_nms: Count = 1000
+    post_nms: Count = 1000
     rpn_nms: float = 0.7
-    max_detections: int = 100
+    max_detections: Count = 100
     exact_paste: bool = False
     norm: Literal["frozen", "batch"] = "frozen"
 

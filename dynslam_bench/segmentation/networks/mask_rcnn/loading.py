@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import re
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -26,8 +25,10 @@ _RENAMES = (
     (re.compile(r"^(backbone\.fpn\.(?:inner|layer)_blocks\.\d+)\.(weight|bias)$"), r"\1.0.\2"),
     (re.compile(r"^(rpn\.head\.conv)\.(weight|bias)$"), r"\1.0.0.\2"),
 )
-_MASK_FCN = re.compile(r"^roi_heads\.mask_head\.mask_fcn(\d+)\.(weight|bias)$")
+_MASK_FCN = re.compile(r"^roi_heads\.mask_head\.mask_fcn([1-9][0-9]?)\.(weight|bias)$")
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
+MOST_GROWTH = 4
+"""Most bytes that a byte of a checkpoint may unpack to; torch stores weights as they are."""
 NAMED = 4
 """So many keys are named in an error before the rest is only counted."""
 
@@ -49,6 +50,8 @@ def load_network(path: Path) -> MaskRCNN:
     state = canonical_names(state)
     if config is None:
         config = infer_config(state, str(path))
+    with torch.device("meta"):  # compares the shapes before any memory is taken for what the file claims
+        _check_fit(MaskRCNN(config), state, str(path))
     network = MaskRCNN(config)
     load_strictly(network, state, str(path))
     return network.eval()
@@ -67,8 +70,9 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     except OSError as error:
         raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
     try:
+        _check_size(path, size)
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+    except Exception as error:  # a damaged file makes torch's reader raise whatever it likes
         reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
         raise SegmentationError(
             f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}", "it is truncated or foreign"
@@ -76,6 +80,15 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     if not isinstance(content, Mapping):
         raise SegmentationError(f"{path} holds a {type(content).__name__}, not a table of weights")
     return content
+
+
+def _check_size(path: Path, size: int) -> None:
+    """Raise ValueError where the file would unpack to far more than it is."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > MOST_GROWTH * size:
+            raise ValueError(f"it claims to unpack to {unpacked} bytes")
 
 
 def split(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], NetworkConfig | None]:
@@ -89,9 +102,9 @@ def split(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], Ne
         if content["format"] != FORMAT:
             raise SegmentationError(f"{where} has the format {content['format']!r}, this version reads {FORMAT!r}")
         try:
-            config = NetworkConfig.model_validate_json(content["config"])
-        except (ValidationError, TypeError) as error:
-            raise SegmentationError(f"{where}: the network's shape is not understood: {error}") from error
+            config = NetworkConfig.model_validate_json(str(content["config"]))
+        except ValidationError as error:
+            raise _not_understood(error, where) from error
     for key in _WRAPPERS:
         if isinstance(content.get(key), Mapping):
             content = content[key]
@@ -99,7 +112,22 @@ def split(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], Ne
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
         raise SegmentationError(f"{where} holds no weights; its keys: {_some(map(str, content))}")
+    odd = next((key for key, value in state.items() if not _is_plain(value)), None)
+    if odd is not None:
+        raise SegmentationError(f"{where}: {odd[:100]!r} is no plain array of numbers")
     return state, config
+
+
+def _not_understood(error: ValidationError, where: str) -> SegmentationError:
+    first = error.errors()[0]
+    return SegmentationError(f"{where}: the network's shape is not understood: {first['loc']}: {first['msg']}")
+
+
+def _is_plain(value: Tensor) -> bool:
+    """Whether a tensor holds the numbers that its shape claims: no view that repeats a few, nothing sparse."""
+    if value.layout != torch.strided or value.is_quantized or value.is_meta or value.is_complex():
+        return False
+    return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def canonical_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -154,17 +182,20 @@ def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
     ratios = int(state["rpn.head.cls_logits.weight"].shape[0])
     if ratios != 3:
         raise SegmentationError(f"{where} has {ratios} anchors a cell, torchvision's models have 3")
-    return NetworkConfig(
-        blocks=blocks,
-        bottleneck=bottleneck,
-        stem=int(state["backbone.body.conv1.weight"].shape[0]),
-        channels=int(state["backbone.fpn.inner_blocks.0.0.weight"].shape[0]),
-        classes=names,
-        box_hidden=int(state["roi_heads.box_predictor.cls_score.weight"].shape[1]),
-        mask_channels=int(state["roi_heads.mask_head.0.0.weight"].shape[0]),
-        mask_layers=len({k.split(".")[2] for k in state if k.startswith("roi_heads.mask_head.")}),
-        cfpn=True,
-    )
+    try:
+        return NetworkConfig(
+            blocks=blocks,
+            bottleneck=bottleneck,
+            stem=int(state["backbone.body.conv1.weight"].shape[0]),
+            channels=int(state["backbone.fpn.inner_blocks.0.0.weight"].shape[0]),
+            classes=names,
+            box_hidden=int(state["roi_heads.box_predictor.cls_score.weight"].shape[1]),
+            mask_channels=int(state["roi_heads.mask_head.0.0.weight"].shape[0]),
+            mask_layers=len({k.split(".")[2] for k in state if k.startswith("roi_heads.mask_head.")}),
+            cfpn=True,
+        )
+    except ValidationError as error:
+        raise _not_understood(error, where) from error
 
 
 def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> None:
@@ -173,6 +204,14 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
     Raises:
         SegmentationError: Keys are missing or unknown, shapes differ, or a weight is not finite.
     """
+    _check_fit(network, state, where)
+    for key, value in state.items():
+        if value.is_floating_point() and not math.isfinite(float(value.abs().sum())):
+            raise SegmentationError(f"{where}: {key} holds NaN or infinite values")
+    network.load_state_dict(dict(state), strict=False)
+
+
+def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> None:
     own = {key: value for key, value in network.state_dict().items() if not key.endswith("num_batches_tracked")}
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
@@ -186,10 +225,6 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
     faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in found if keys]
     if faults:
         raise SegmentationError(f"{where} does not fit the network: " + "; ".join(faults))
-    for key, value in state.items():
-        if value.is_floating_point() and not math.isfinite(float(value.abs().sum())):
-            raise SegmentationError(f"{where}: {key} holds NaN or infinite values")
-    network.load_state_dict(dict(state), strict=False)
 
 
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
