@@ -137,7 +137,7 @@ class SegmentationSettings(Settings):
         fields = {
             "oracle": ("confidence", "mask_threshold", "nms_iou", "network_side"),
             "recorded": ("mask_threshold", "nms_iou", "network_side"),
-            "embedded": ("network_side",),
+            "embedded": ("network_side", "classes"),  # it knows people alone
             "onnx": ("network_side",),
         }
         return dict.fromkeys(fields.get(kind, ()), f"segmentation.source is {self.source!r}")

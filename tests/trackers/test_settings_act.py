@@ -35,7 +35,32 @@ def offered() -> dict[str, tuple[str, Parameter]]:
 
 
 OFFERED = offered()
-CASES: dict[str, tuple[str, dict[str, object]]] = {}
+MANY = {
+    "backend.keyframes.tracked_share": 0.95, "backend.keyframes.established": 1, "backend.keyframes.moved_share": 1.0,
+    "backend.keyframes.view_share": 0.98,
+}  # fmt: skip
+"""A keyframe nearly every frame."""
+FEW_KEYFRAMES = {
+    "backend.keyframes.tracked_share": 0.4, "backend.keyframes.moved_share": 0.8, "backend.keyframes.view_share": 0.5,
+}  # fmt: skip
+JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
+"""F judges every frame."""
+NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
+CASES: dict[str, tuple[str, dict[str, object]]] = {
+    "backend.tracking.local_map": ("orb-slam2", MANY),
+    "backend.keyframes.max_gap": ("orb-slam2", FEW_KEYFRAMES),
+    "backend.keyframes.redundant_share": ("orb-slam2", MANY),
+    "backend.mapping.neighbours": ("orb-slam2", MANY),
+    "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
+    "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
+    **{f"backend.relocalisation.{name}": ("orb-slam2", MANY)
+       for name in ("searched", "candidates", "iterations", "max_distance")},
+    "segmentation.mask_threshold": NETWORK,
+    "segmentation.nms_iou": NETWORK,
+    "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
+    **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
+    **{f"epipolar.{name}": ("emfoa-oft-paper-sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
+}  # fmt: skip
 """Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
 
 

@@ -41,9 +41,9 @@ def test_objectives_are_logarithms_of_ratios_by_hand() -> None:
 
 def test_what_cannot_be_an_objective_is_one_clear_line() -> None:
     default = {block: outcome(block, 0.02) for block in PLAIN}
-    with pytest.raises(StudyError, match="'robustness' counts degraded blocks alone, but none .*degrade=blur:0.5"):
+    with pytest.raises(StudyError, match=r"'robustness' counts degraded blocks alone, but none .*degrade=blur:0.5"):
         OBJECTIVES["robustness"].value(default, default)
-    with pytest.raises(StudyError, match="unknown objective 'sped'.*'speed'"):
+    with pytest.raises(StudyError, match=r"unknown objective 'sped'.*'speed'"):
         find_objective("sped")
 
     def nothing_at_all(run: Outcome) -> float:
@@ -112,5 +112,5 @@ def test_a_front_gives_three_presets_in_either_order(objectives: list[str], tmp_
     assert "processor time x 0.500" in text and "Judged on" in text
     page = write_page(tuner, summary).read_text()
     assert "x real time" not in page and "real-time factor" not in page
-    with pytest.raises(StudyError, match="no preset 'fats'.*'fast'"):
+    with pytest.raises(StudyError, match=r"no preset 'fats'.*'fast'"):
         read_preset_text(study, tmp_path, "fats")

@@ -87,7 +87,5 @@ def test_small_changes_are_small_and_change_something() -> None:
         found = small_change(space, base, np.random.default_rng(seed))
         assert set(found) == {"gain", "wobble"} and found != {name: base[name] for name in found}
         assert 0.8 < found["gain"] < 1.9 and isinstance(found["wobble"], int)
-    only = small_change(
-        [each for each in parameters(ToySettings) if each.name == "mode"], base, np.random.default_rng(0)
-    )
-    assert only == {"mode": "crash"}, "where there are no numbers"
+    choices = [each for each in parameters(ToySettings) if each.name == "mode"]
+    assert small_change(choices, base, np.random.default_rng(0)) == {"mode": "crash"}, "where there are no numbers"

@@ -18,7 +18,8 @@ from dynslam_bench.tuning.blocks import Block
 from dynslam_bench.tuning.evaluate import Outcome
 from dynslam_bench.tuning.importance import FEWEST_TRIALS, importances, inert_parameters
 from dynslam_bench.tuning.statistics import bounds, by_scene, centre, upper
-from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, choose, compared, conclude
+from dynslam_bench.tuning.ratio import Ratio, compared
+from dynslam_bench.tuning.summary import Candidate, StudySummary, choose, conclude
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 CONFIRM = Ratio(ratio=0.7, low=0.6, high=0.82, n=8, sequences=4, bound=0.85)
