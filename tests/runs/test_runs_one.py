@@ -40,7 +40,7 @@ def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
     assert (store.root / "latest").resolve() == folder.resolve()
     assert leftovers(store) == []
     assert record.tracker.id == "toy" and record.settings["noise.clip"] == 3.0 and record.overrides == {"noise.clip": 3}
-    assert list(record.timings) == ["read", "total", "features", "tracking"]
+    assert list(record.timings) == ["read", "total", "processor", "features", "tracking"]
     assert record.timings["tracking"].median_s == record.timings["tracking"].p95_s == 0.002
     assert record.peak_memory_mb and 20 < record.peak_memory_mb < 4000
     assert record.machine and record.machine.cores >= 1 and record.versions["numpy"] == np.__version__
