@@ -98,7 +98,8 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
         "metrics": metrics,
         "trackers": [_tracker(board, key, at) for at, key in enumerate(keys)],
         "sequences": [
-            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])} for n in names
+            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])}
+            for n in names
         ],
         "still": [significant(board.never_move.get(name), 5) for name in names],
         "runs": runs,
@@ -133,7 +134,10 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     found = [
         ("ate", "ATE", "m", "ate_rmse_m"),
         *(("rpe", f"RPE over {spec.describe()}", "m", f"rpe_{spec.key}_trans_rmse_m") for spec in protocol.rpe),
-        *(("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg") for spec in protocol.rpe),
+        *(
+            ("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg")
+            for spec in protocol.rpe
+        ),
         ("rotation", "absolute rotation", "deg", "ape_rot_rmse_deg"),
     ]
     return [

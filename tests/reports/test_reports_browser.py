@@ -70,7 +70,9 @@ def run_of(report, label, sequence):
 
 
 def see_everything(browser):
-    browser.run("document.querySelectorAll('main details:not(.toolbar details)').forEach((fold) => { fold.open = true; })")
+    browser.run(
+        "document.querySelectorAll('main details:not(.toolbar details)').forEach((fold) => { fold.open = true; })"
+    )
     browser.run("document.querySelectorAll('.figure').forEach(draw)")
     browser.settle()
 
@@ -96,7 +98,9 @@ def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report
         folder = report.html.parent.absolute().as_uri()
         assert browser.fetched and all(url.startswith((folder, "data:")) for url in browser.fetched)
         assert browser.run("document.documentElement.scrollWidth") == width
-        figures = browser.run("[...document.querySelectorAll('.chart svg')].map((each) => each.getBoundingClientRect().right)")
+        figures = browser.run(
+            "[...document.querySelectorAll('.chart svg')].map((each) => each.getBoundingClientRect().right)"
+        )
         assert len(figures) >= 4 and max(figures) <= width
 
 
@@ -106,7 +110,9 @@ def test_the_leaderboard_fits_and_keeps_the_tracker_in_sight(browser, report):
     browser.open(report.html, 360)
     browser.run("leaderboard.parentElement.scrollLeft = 9999")
     browser.settle()
-    box = browser.run("(({left, right}) => [left, right])(document.querySelector('#leaderboard tbody .sticky').getBoundingClientRect())")
+    box = browser.run(
+        "(({left, right}) => [left, right])(document.querySelector('#leaderboard tbody .sticky').getBoundingClientRect())"
+    )
     assert 0 <= box[0] < box[1] <= 200
 
 

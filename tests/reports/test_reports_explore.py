@@ -17,7 +17,9 @@ def explore(browser, report, anchor=""):
 
 
 def press(browser, place, text):
-    browser.run(f"[...document.querySelectorAll('#{place} button')].find((each) => each.textContent === '{text}').click()")
+    browser.run(
+        f"[...document.querySelectorAll('#{place} button')].find((each) => each.textContent === '{text}').click()"
+    )
 
 
 def test_search_tags_and_ranked_only(browser, report):
@@ -67,9 +69,13 @@ def test_numbers_are_those_of_the_table_below(browser, report):
 
 def test_a_failure_is_hatched_says_how_and_is_never_best(browser, report):
     explore(browser, report)
-    failed = browser.run("[...document.querySelectorAll('#explore-table tbody small a')].filter((each) => each.textContent === '✕').map((each) => each.title)")
+    failed = browser.run(
+        "[...document.querySelectorAll('#explore-table tbody small a')].filter((each) => each.textContent === '✕').map((each) => each.title)"
+    )
     assert failed == ["seed 1, crashed at 30/120"]
-    best = browser.run("[...document.querySelectorAll('#explore-table .best')].map((cell) => cell.parentElement.cells[0].textContent)")
+    best = browser.run(
+        "[...document.querySelectorAll('#explore-table .best')].map((cell) => cell.parentElement.cells[0].textContent)"
+    )
     assert best and not any("DS-SLAM" in name for name in best)
 
 
@@ -79,7 +85,9 @@ def test_a_cell_leads_to_its_run_and_the_run_to_its_like(browser, report):
     browser.open(report.run, anchor="#" + link.partition("#")[2])
     browser.until("document.querySelector('.card')")
     assert "DynaSLAM" in browser.run("document.title") and browser.faults == []
-    browser.run("(() => { const select = document.querySelectorAll('#run-choice select')[0]; select.selectedIndex = select.options.length - 1; select.dispatchEvent(new Event('change')); })()")
+    browser.run(
+        "(() => { const select = document.querySelectorAll('#run-choice select')[0]; select.selectedIndex = select.options.length - 1; select.dispatchEvent(new Event('change')); })()"
+    )
     browser.until("!document.title.includes('DynaSLAM')")
     assert browser.run("document.querySelectorAll('.card').length") >= 4 and browser.faults == []
 
@@ -92,7 +100,9 @@ def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
     text = browser.run("document.querySelector('main').innerText")
     assert "dynslam-bench run ours" in text and "a log" in text and "20 of 50 features culled" in text
     assert "image that shows people (%)" in browser.run("document.querySelector('#over-time svg').textContent")
-    gaps = browser.run("document.querySelector('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1")
+    gaps = browser.run(
+        "document.querySelector('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1"
+    )
     assert gaps == 2  # the lost frame breaks the line
 
 
@@ -101,19 +111,25 @@ def test_the_slider_moves_image_track_and_cursor(browser, report):
     state = "[document.querySelector('#looks .caption').textContent, document.querySelector('#over-time .cursor').getAttribute('d'), document.querySelector('#looks canvas').toDataURL()]"
     browser.until("document.querySelector('#over-time .cursor')")
     last = browser.run(state)
-    browser.run("(() => { const slider = document.querySelector('#looks input[type=range]'); slider.value = 0; slider.dispatchEvent(new Event('input')); })()")
+    browser.run(
+        "(() => { const slider = document.querySelector('#looks input[type=range]'); slider.value = 0; slider.dispatchEvent(new Event('input')); })()"
+    )
     browser.settle()
     first = browser.run(state)
     assert "frame 0" in first[0] and "frame 39" in last[0]
     assert all(a != b for a, b in zip(first, last, strict=True))
     compare = "document.querySelectorAll('#frames .view')[document.querySelectorAll('#frames .view').length - 1].style.clipPath"
-    browser.run("(() => { const slider = [...document.querySelectorAll('#frames input[type=range]')].at(-1); slider.value = 80; slider.dispatchEvent(new Event('input')); })()")
+    browser.run(
+        "(() => { const slider = [...document.querySelectorAll('#frames input[type=range]')].at(-1); slider.value = 80; slider.dispatchEvent(new Event('input')); })()"
+    )
     assert "80%" in browser.run(compare)
 
 
 def test_error_against_dynamic_pixels_rises_as_it_was_made(browser, report):
     explore(browser, report)
-    figure = browser.run("$('explore-share').chart.figure.data.filter((trace) => trace.name.startsWith('Ours')).map((trace) => trace.y)")
+    figure = browser.run(
+        "$('explore-share').chart.figure.data.filter((trace) => trace.name.startsWith('Ours')).map((trace) => trace.y)"
+    )
     assert len(figure) == 1
     known = [value for value in figure[0] if value is not None]
     assert len(known) >= 3 and known == sorted(known) and known[-1] > 2 * known[0]
@@ -136,7 +152,9 @@ def test_a_figure_hides_what_is_clicked_and_tells_what_is_pointed_at(browser, re
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
     browser.open(report.run, anchor="#" + "0" * 16)
     browser.until("document.querySelector('main .note')")
-    assert browser.run("document.querySelector('main .note').textContent") == f"There is no run {'0' * 16} in this report."
+    assert (
+        browser.run("document.querySelector('main .note').textContent") == f"There is no run {'0' * 16} in this report."
+    )
     victim = report.html.parent / "data" / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
     kept = victim.read_text()
     victim.unlink()
@@ -154,8 +172,8 @@ def test_print_shows_all(browser, report, tmp_path):
     browser.call("Emulation.setEmulatedMedia", media="print")
     browser.size(1045)
     browser.run("preparePrint()")
-    wide = browser.run("[...document.querySelectorAll('main table')].map((each) => Math.round(each.getBoundingClientRect().right))")
+    wide = browser.run(
+        "[...document.querySelectorAll('main table')].map((each) => Math.round(each.getBoundingClientRect().right))"
+    )
     browser.call("Emulation.setEmulatedMedia", media="")
     assert len(wide) >= 8 and max(wide) <= 1046
-
-

@@ -325,6 +325,7 @@ class RunStore:
         if latest.is_symlink() and not latest.exists():
             latest.unlink(missing_ok=True)
 
+
 def _checked(name: str, what: str) -> str:
     """A name that data gives to a folder of the store, if it is one that this package makes."""
     if not _RUN_ID.fullmatch(name):
@@ -338,4 +339,3 @@ def _read_truth(path: Path, _changed_ns: int) -> Trajectory:
     truth = read_tum(path)
     truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
     return truth
-
