@@ -31,6 +31,8 @@ WHERE_SAID = {
     "reason": "reason",
 }
 """Columns that are there only if a run has something to say in them."""
+SPARE = ("not moving (m)", "masks", "repeat", "coverage", "settings", "ms/frame", "part", "from the store")
+"""Columns that give way on a narrow terminal, the first one first."""
 
 
 def show_runs(
@@ -44,7 +46,7 @@ def show_runs(
     names = {name: title for name, title in TITLES.items() if name != "part" or any(row["part"] for row in rows)}
     names |= {name: title for name, title in WHERE_SAID.items() if any(row[name] for row in rows)}
     cells = [[row[name] for name in names] for row in rows]
-    write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence"))
+    write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
 
 
 def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> None:

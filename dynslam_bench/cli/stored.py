@@ -8,6 +8,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from . import completion
 from .options import AsJson, ProtocolId, Results
 from .output import write, write_fields, write_json, write_table
 from .run_rows import part_words, show_runs
@@ -18,7 +19,10 @@ app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 @app.command("list")
 def list_(
     results: Results = Path("results"),
-    status: Annotated[Optional[str], typer.Option(help="Only runs that ended so, e.g. ok or crashed.")] = None,  # noqa: UP045
+    status: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Only runs that ended so, e.g. ok or crashed.", autocompletion=completion.statuses),
+    ] = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -112,6 +116,8 @@ def rm(
 
     store = RunStore(results)
     chosen = [store.find(run) for run in runs or ()]
+    if failed and not store.runs.is_dir():
+        raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     if failed:
         chosen += [record.run_id for record in store.all()[0] if record.failed]
     if not chosen and not failed:
