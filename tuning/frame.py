@@ -59,22 +59,23 @@ class Study:
         """All trials.
 
         Returns:
-            One line a trial, in order. ``Int64``: trial (0 is the default), runs (that it was evaluated on).
-            ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned
-            or failed; missing else). ``boolean``: feasible (all constraints hold; missing where nothing was measured).
-            ``float64``, nan where unknown: one column for each objective, named after ``value_``, as told to Optuna
-            (accuracy: mean natural logarithm of the ATE ratio to the default settings, less is better; speed:
-            real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is better than the default;
-            nan if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second), duration_s (seconds from
-            the start of the trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
-            ``float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
+            One line a trial, in order; whatever is missing is ``pd.NA``. ``Int64``: trial (0 is the default), runs
+            (that it was evaluated on). ``string``: state (``complete``, ``pruned``, ``fail``, ``running``,
+            ``waiting``), reason (why it was pruned or failed; missing else). ``boolean``: feasible (all constraints
+            hold; missing where nothing was measured). ``Float64``: one column for each objective, named after
+            ``value_``, as told to Optuna (accuracy: mean natural logarithm of the ATE ratio to the default settings,
+            less is better; speed: real-time factor, more is better), ratio (the geometric-mean ATE ratio, below 1 is
+            better than the default; missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a
+            second), duration_s (seconds from the start of the trial to its end). Then a column ``params.NAME`` for
+            each tuned setting, in its own unit: ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its
+            condition did not hold.
         """
         import pandas as pd
 
         trials = self.study.get_trials(deepcopy=False)
         objectives = [f"value_{objective}" for objective in self.spec.objectives]
-        kinds = {"trial": "Int64", "state": "string"} | dict.fromkeys([*objectives, "ratio"], "float64")
-        kinds |= {"duration_s": "float64", "coverage": "float64", "fps": "float64"}
+        kinds = {"trial": "Int64", "state": "string"} | dict.fromkeys([*objectives, "ratio"], "Float64")
+        kinds |= dict.fromkeys(["duration_s", "coverage", "fps"], "Float64")
         kinds |= {"runs": "Int64", "feasible": "boolean", "reason": "string"}
         names = sorted({name for trial in trials for name in trial.params})
         lines = [self._line(trial) for trial in trials]
@@ -121,4 +122,4 @@ def _dtype(values: list[Any]) -> str:
         return "boolean"
     if kinds == {int}:
         return "Int64"
-    return "float64" if kinds <= {int, float} else "string"
+    return "Float64" if kinds <= {int, float} else "string"

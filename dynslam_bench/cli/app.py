@@ -11,6 +11,7 @@ import typer
 from dynslam_bench import __version__
 from dynslam_bench.core.download_progress import show_downloads
 from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.harmless import printable
 
 from . import (
     caches,
@@ -116,5 +117,5 @@ def expand_lists(arguments: list[str]) -> list[str]:
 
 
 def _say(text: str) -> None:
-    line = " ".join(text.split())
+    line = printable(" ".join(text.split()))
     sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")

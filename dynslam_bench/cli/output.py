@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from dynslam_bench.core.download_progress import Report
+from dynslam_bench.core.harmless import printable
 
 if TYPE_CHECKING:
     from dynslam_bench.reports.tables.table import Table
@@ -33,8 +34,11 @@ def for_scripts(asked: bool) -> bool:
 
 
 def write(text: str = "", *, now: bool = False) -> None:
-    """Write a line to standard output; `now` also where nobody watches, ahead of what follows."""
-    sys.stdout.write(text + "\n")
+    """Write a line to standard output; `now` also where nobody watches, ahead of what follows.
+
+    What it names may come from anywhere: a terminal is never handed what it would act upon.
+    """
+    sys.stdout.write(printable(text) + "\n")
     if now:
         sys.stdout.flush()
 
@@ -42,12 +46,12 @@ def write(text: str = "", *, now: bool = False) -> None:
 def note(text: str) -> None:
     """Write a line for people to standard error, only if they watch and nobody asked for JSON."""
     if sys.stderr.isatty() and not _for_scripts:
-        sys.stderr.write(text + "\n")
+        complain(text)
 
 
 def complain(text: str) -> None:
-    """Write a line to standard error, whoever watches: what was asked for and cannot be had."""
-    sys.stderr.write(text + "\n")
+    """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
+    sys.stderr.write(printable(text) + "\n")
 
 
 def write_json(value: Any) -> None:
@@ -180,7 +184,7 @@ def heartbeat() -> Iterator[Callable[[str], None]]:
         now = time.monotonic()
         if now - told >= HEARTBEAT_S and not _for_scripts:
             told = now
-            sys.stderr.write(f"{text}, {now - began:.0f} s\n")
+            complain(f"{text}, {now - began:.0f} s")
             sys.stderr.flush()
 
     yield beat
@@ -202,7 +206,7 @@ class _Lines:
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            sys.stderr.write(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far\n")
+            complain(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 
@@ -233,13 +237,14 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
     amount = DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
-    columns = [TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn()]
+    columns = [TextColumn("{task.description}", markup=False), BarColumn(), amount, TimeRemainingColumn()]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(label, total=1)
+        task = bar.add_task(printable(label), total=1)
 
         def told(done: float, total: float | None, what: str = "") -> None:
             shown = f"{label}: {what}" if what else label
-            bar.update(task, completed=done, total=total if total is not None else done + 1, description=shown)
+            total = total if total is not None else done + 1
+            bar.update(task, completed=done, total=total, description=printable(shown))
 
         yield told
 
@@ -260,7 +265,7 @@ def _text(value: object) -> str:
         return f"{value:.4g}"
     if isinstance(value, (list, tuple, set, frozenset)):
         return ", ".join(_text(part) for part in (sorted(value) if isinstance(value, (set, frozenset)) else value))
-    return str(value)
+    return printable(" ".join(str(value).splitlines()))
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -10,7 +9,7 @@ import typer
 
 from . import completion
 from .options import AsJson, ProtocolId, Results
-from .output import write, write_fields, write_json, write_table
+from .output import complain, write, write_fields, write_json, write_table
 from .run_rows import part_words, show_runs
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
@@ -41,7 +40,7 @@ def list_(
     records, unreadable = store.all()
     show_runs([record for record in records if status in (None, record.status)], store, protocol, as_json=as_json)
     for bad in unreadable:
-        sys.stderr.write(f"unreadable: {bad.path}: {bad.reason}\n")
+        complain(f"unreadable: {bad.path}: {bad.reason}")
 
 
 @app.command()

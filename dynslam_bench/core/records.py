@@ -61,8 +61,6 @@ class Record(BaseModel):
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"])) or "file"
             raise DynslamError(f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}") from error
-        except (ValueError, RecursionError) as error:  # a number of thousands of digits, nested too deeply
-            raise DynslamError(f"{where} is not a valid {cls.__name__}: {error}") from error
 
 
 def digest(value: Any, length: int = 12) -> str:

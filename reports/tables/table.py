@@ -91,7 +91,7 @@ class Table:
         shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
         values: The numbers behind it with all their digits, in the units that the caption and the headings name
             (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
-            ``Int64`` if all their numbers are whole, else ``float64``; missing where the cell has no number. Columns
+            ``Int64`` if all their numbers are whole, else ``Float64``; ``pd.NA`` where the cell has no number. Columns
             of text are ``string``.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
@@ -204,7 +204,7 @@ def _values(column: Column, shown: pd.Series) -> pd.Series:
     found = [cell.value for cell in shown]
     present = [value for value in found if value is not None]
     whole = bool(present) and all(isinstance(value, int) for value in present)
-    return pd.Series(found, dtype="Int64" if whole else "float64", name=column.key)
+    return pd.Series(found, dtype="Int64" if whole else "Float64", name=column.key)
 
 
 def _words(cell: TableCell) -> str:

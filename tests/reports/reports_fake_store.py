@@ -78,7 +78,7 @@ def add_run(
     """
     stamps, truth = stamps_of(n)[offset:], truth_of(sequence, n)
     n = len(stamps)
-    part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:12]
+    part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:16]
     store.prepare()
     store.add_sequence(part, stamps, truth if ground_truth else None)
     identity = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,

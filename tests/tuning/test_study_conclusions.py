@@ -130,7 +130,7 @@ def test_a_study_is_a_frame_and_its_page_tells_what_holds_up(folders: list[str],
     assert frame["trial"].tolist() == list(range(len(trials))) and len(trials) == 5
     assert frame["state"].tolist() == [trial.state.name.lower() for trial in trials]
     assert frame["ratio"][0] == pytest.approx(1.0) and frame["value_accuracy"][0] == pytest.approx(0.0, abs=1e-12)
-    assert {str(kind) for kind in frame.dtypes} <= {"Int64", "string", "float64", "boolean"}
+    assert {str(kind) for kind in frame.dtypes} <= {"Int64", "string", "Float64", "boolean"}
     assert frame["params.gain"].tolist() == [trial.params["gain"] for trial in trials]
     assert frame["params.anger"].isna().tolist() == ["anger" not in trial.params for trial in trials]
     assert (frame["duration_s"] > 0).all()
