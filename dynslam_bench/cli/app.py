@@ -28,6 +28,7 @@ from . import (
 )
 from .ending import leave_interrupted
 from .output import drawn_download, for_scripts
+from .panels import CARE, MEASURE, REPORT, START
 
 INTERRUPT_CODE = 130
 app = typer.Typer(
@@ -39,16 +40,16 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 presentation.add_demo(app)
-app.add_typer(sequences.app, name="sequences")
-app.add_typer(trackers.app, name="trackers")
+app.add_typer(sequences.app, name="sequences", rich_help_panel=START)
+app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
 running.add(app)
-app.add_typer(stored.app, name="runs")
+app.add_typer(stored.app, name="runs", rich_help_panel=MEASURE)
 evaluating.add(app)
-app.add_typer(studies.app, name="tune")
+app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 presentation.add_report(app)
 imports.add(app)
-app.add_typer(segmenters.app, name="segmenter")
-app.add_typer(caches.app, name="cache")
+app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
+app.add_typer(caches.app, name="cache", rich_help_panel=CARE)
 environments.add(app)
 
 

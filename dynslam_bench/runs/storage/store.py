@@ -176,7 +176,8 @@ class RunStore:
         """Ids of all stored runs, sorted."""
         if not self.runs.is_dir():
             return []
-        return sorted(path.name for path in self.runs.iterdir() if _RUN_ID.fullmatch(path.name) and path.is_dir())
+        with os.scandir(self.runs) as entries:
+            return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
 
     def read(self, run_id: str) -> RunRecord:
         """The record of a run.
@@ -185,18 +186,23 @@ class RunStore:
             RunError: There is no such run.
             DynslamError: Its record is damaged.
         """
-        return self._read(self.find(run_id))
+        return self.read_whole(self.find(run_id))
 
     def get(self, run_id: str) -> RunRecord | None:
         """The record of a run by its full id, None if it is not stored or damaged."""
         if not (self.folder(run_id) / RUN_FILE).is_file():
             return None
         try:
-            return self._read(run_id)
+            return self.read_whole(run_id)
         except DynslamError:
             return None
 
-    def _read(self, run_id: str) -> RunRecord:
+    def read_whole(self, run_id: str) -> RunRecord:
+        """The record of a run by its full id.
+
+        Raises:
+            DynslamError: It is missing or damaged, or names itself otherwise.
+        """
         path = self.folder(run_id) / RUN_FILE
         record = RunRecord.read(path)
         if record.run_id != run_id:
@@ -208,7 +214,7 @@ class RunStore:
         records, unreadable = [], []
         for run_id in self.ids():
             try:
-                records.append(self._read(run_id))
+                records.append(self.read_whole(run_id))
             except DynslamError as error:
                 unreadable.append(Unreadable(self.folder(run_id), str(error)))
         return sorted(records, key=lambda record: (record.started, record.run_id)), unreadable
