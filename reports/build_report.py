@@ -15,6 +15,7 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
+from .html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
 from .model.board import Board, On, make_board
@@ -29,7 +30,8 @@ class ReportPaths:
     """The files of a report.
 
     Attributes:
-        html: The page, complete in one file.
+        html: The page; what it shows on demand lies in ``data/`` and ``frames/`` beside it.
+        run: The page that shows one run.
         markdown: The tables as Markdown.
         latex: The main tables as LaTeX.
         csv: The tables as CSV, by name.
@@ -38,6 +40,7 @@ class ReportPaths:
     """
 
     html: Path
+    run: Path
     markdown: Path
     latex: Path
     csv: dict[str, Path]
@@ -53,6 +56,7 @@ def build_report(
     reference: str | None = None,
     on: On = "common",
     rank_seen: bool = False,
+    picture_seconds: float = PICTURE_SECONDS,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = unheard,
@@ -69,6 +73,7 @@ def build_report(
             run on every ranked sequence, a camera that never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
+        picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -84,16 +89,19 @@ def build_report(
     board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
     again = command or _command([store.root for store in stores], output, board)
     draft = Draft()
+    on_progress(0, None, "writing a page for every run")
+    explored = write_explore(board, loaded, protocol, output, title=title, picture_seconds=picture_seconds)
     on_progress(0, None, "comparing on common frames")
     sections.add_leaderboard(draft, board, protocol, loaded)
+    sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
     add_paper(draft, board, protocol)
     on_progress(0, None, "drawing trajectories")
-    sections.add_trajectories(draft, board, protocol, loaded)
+    sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
-    sections.add_failures(draft, board, output)
+    sections.add_failures(draft, board)
     sections.add_provenance(draft, board, again)
     data = ReportData(
         title=title,
@@ -121,6 +129,7 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
     names = [*(table.id for table in draft.tables), "runs"]
     paths = ReportPaths(
         html=output / "index.html",
+        run=output / RUN_PAGE,
         markdown=output / "report.md",
         latex=output / "report.tex",
         csv={name: output / "csv" / f"{name}.csv" for name in names},

@@ -153,7 +153,7 @@ def demo(
     results: Results = Path("results"),
     frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 300,
     jobs: Jobs = 2,
-    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 10,
+    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
     from .demo import run_demo

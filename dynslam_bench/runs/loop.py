@@ -21,6 +21,7 @@ from dynslam_bench.geometry.tum_file import write_tum
 from .frame_row import FRAMES_FILE, FrameRow
 from .process.failures import at
 from .sheet_collector import SHEET_FILE, SheetWriter
+from .snapshots import SnapshotWriter
 from .spec import RunSpec
 from .video import VideoWriter
 
@@ -106,11 +107,14 @@ class _Recorder:
 
     def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
         self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
+        self._snapshots = SnapshotWriter(folder, len(env.sequence))
+        self._env = env
         self._video = VideoWriter(folder, env) if spec.video else None
         self.sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
 
     def add(self) -> None:
         self._frames.write()
+        self._snapshots.add(self._env.episode.outcomes[-1], self._env.frame.rgb.shape, self._env.result)
         if self._video is not None:
             self._video.add()
         if self.sheet is not None:
@@ -118,6 +122,7 @@ class _Recorder:
 
     def close(self) -> None:
         self._frames.close()
+        self._snapshots.write()
         if self._video is not None:
             self._video.close()
 
@@ -182,19 +187,23 @@ class _FrameWriter:
     def write(self) -> None:
         outcomes = self._env.episode.outcomes
         for outcome in outcomes[self._written :]:
-            overlap = self._mask_iou(outcome.index) if outcome is outcomes[-1] else None
-            self._log.write(FrameRow.of(outcome, overlap).to_json())
+            masked = self._masks(outcome.index) if outcome is outcomes[-1] else (None, None)
+            self._log.write(FrameRow.of(outcome, *masked).to_json())
         self._log.flush()
         self._written = len(outcomes)
 
     def close(self) -> None:
         self._log.close()
 
-    def _mask_iou(self, index: int) -> float | None:
-        """Overlap of the tracker's mask with the exact one of people; None where one is missing or both are empty."""
-        predicted = self._env.result.dynamic_mask
-        if predicted is None or self._env.sequence.masks is None:
-            return None
+    def _masks(self, index: int) -> tuple[float | None, float | None]:
+        """Overlap of the tracker's mask with the exact one of people, and the share of the image that shows people.
+
+        None where a mask is missing; the overlap also where both are empty.
+        """
+        if self._env.sequence.masks is None:
+            return None, None
         truth = self._env.sequence.masks[index]
         people = [number for number, name in truth.class_names.items() if name == "person"]
-        return compare_masks(np.asarray(predicted, dtype=bool), np.isin(truth.instances, people)).iou
+        exact, predicted = np.isin(truth.instances, people), self._env.result.dynamic_mask
+        overlap = None if predicted is None else compare_masks(np.asarray(predicted, dtype=bool), exact).iou
+        return overlap, float(exact.mean())

@@ -160,6 +160,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         trajectory=which,
         metrics={} if evaluation is None else dict(evaluation.metrics),
         final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
+        final_metrics={} if scored.final is None else dict(scored.final.metrics),
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         held_ate_m=held_error(store, record, protocol, evaluation, still),
         never_move_m=still,
