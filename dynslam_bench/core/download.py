@@ -79,19 +79,24 @@ def download(
                 _complete(url, part, report, attempts, wait_s, timeout_s, bounds)
             found = file_sha256(here, report)
             if sha256 is not None and not found.startswith(sha256):
-                size = here.stat().st_size
-                here.unlink()
-                forget(part)
-                raise DownloadError(
-                    f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
-                    "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
-                )
+                raise _discard(here, part, f"{url} has the checksum {found}", sha256)
             if here is part:
                 part.replace(target)
             forget(part)  # also what a process left that was killed between these two lines
             return found
     except OSError as error:
         raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
+
+
+def _discard(here: Path, part: Path, what: str, expected: str) -> DownloadError:
+    """Throw away bytes whose checksum is not the expected one."""
+    size = here.stat().st_size
+    here.unlink()
+    forget(part)
+    return DownloadError(
+        f"{what} ({size} bytes), expected {expected}",
+        "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
+    )
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ import errno
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from dynslam_bench.core.download import Report, download, file_sha256
+from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha256
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
@@ -137,12 +137,10 @@ def fetch(
     entry, address = found.entry, url or found.entry.url
     archive = find_data_root(data_root) / ".downloads" / _archive_name(address, entry)
     expected = entry.sha256 if checksum else None
-    most = {} if entry.size_bytes is None or not checksum else {"most_bytes": entry.size_bytes}
+    how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
+    how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
     try:
-        sha256 = download(
-            address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s,
-            timeout_s=timeout_s, **most,
-        )  # fmt: skip
+        sha256 = download(address, archive, sha256=expected, **how)
     except DownloadError as error:
         raise SequenceError(str(error.args[0]), error.hint) from error
     try:
