@@ -89,8 +89,10 @@ def build_report(
     board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
     again = command or _command([store.root for store in stores], output, board)
     draft = Draft()
-    on_progress(0, None, "making the runs' pages")
-    explored = write_explore(board, loaded, protocol, output, title=title, picture_seconds=picture_seconds)
+    explored = write_explore(
+        board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
+        progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
+    )  # fmt: skip
     on_progress(0, None, "comparing on common frames")
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_explore(draft, explored)

@@ -90,6 +90,29 @@ def show_top(leaderboard: Table, most: int = 5) -> None:
 
 
 @report.command()
+def publish(
+    results: Annotated[list[Path], typer.Argument(help="Results folders.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")],
+    study: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder of a study with its page, as `tune report` names it."),
+    ] = None,
+    title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
+    protocol: ProtocolId = "tum-rgbd/v1",
+    as_json: AsJson = False,
+) -> None:
+    """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
+    from dynslam_bench.reports import publish as publish_site
+
+    with progress("site") as advance:
+        site = publish_site(results, output, study=study, title=title, protocol=protocol, on_progress=advance)
+    if as_json:
+        write_json({"index": site.index, "files": site.files, "size_mb": site.size_mb})
+    else:
+        write(f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
+
+
+@report.command()
 def compare(
     a: Annotated[Path, typer.Argument(help="Results folder, or folder of a report.")],
     b: Annotated[Path, typer.Argument(help="The other one.")],
