@@ -20,7 +20,6 @@ from dynslam_bench.reports.tables.table import Column, Table, TableCell, number,
 
 from .blocks import Block, scenes
 from .importance import FEWEST_TRIALS, importances, inert_parameters
-from .objectives import find_objective
 from .preset import preset_text
 from .ratio import Ratio
 from .samplers import is_feasible
@@ -144,7 +143,7 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     study, spec = tuner.study, tuner.spec
     several = len(spec.objectives) > 1
     target: Callable[[FrozenTrial], float] | None = (lambda trial: float(trial.values[0])) if several else None
-    named = [f"log ratio of {find_objective(each).what} to the default (less is better)" for each in spec.objectives]
+    named = [f"log ratio of {each.what} to the default (less is better)" for each in tuner.objectives]
     name = named[0]
     finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     shared = sorted({key for trial in finished for key in trial.params})
@@ -313,7 +312,7 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
                 *(_value(trial.params.get(name)) for name in names),
             ]
         )
-    headings = [f"ratio of {find_objective(each).what}" for each in objectives]
+    headings = [f"ratio of {each.what}" for each in tuner.objectives]
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings)]
     columns += numbers("coverage", "fps", *names)
     caption = f"Reasons of dropped (pruned) and failed trials stand behind their state.{_apart(summary)}"

@@ -1,19 +1,23 @@
 """Ending trials of two objectives early: what each rule costs, what it keeps of the front, what it tells the sampler.
 
-    python tests/benchmarks/early_endings.py
+    python tests/benchmarks/early_endings.py [STUDIES]
 
-Simulated: trials with a true log ATE ratio and a true log time ratio, seen on each block through chaos (0.3 and 0.03, as
-measured). Every rule sees the same trials on the same blocks, in the same order. A value is told falsely if it is told as
-complete and is not the mean over all blocks.
+Simulated: trials with a true log ATE ratio and a true log time ratio, seen on each block through chaos (0.3 and 0.03,
+as measured). Every rule sees the same trials on the same blocks, in the same order. A value is told falsely if it is
+told as complete and is not the mean over all blocks.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
 
 from dynslam_bench.tuning.race import FIRST_STEP, is_dropped, steps
 
@@ -158,6 +162,6 @@ def compare(studies: int, seed: int = 0) -> dict[str, Result]:
 if __name__ == "__main__":
     print(f"| {TRIALS} trials, {BLOCKS} blocks | runs | front lost | hypervolume lost | told falsely |")
     print("| --- | --- | --- | --- | --- |")
-    for name, result in compare(200).items():
+    for name, result in compare(int(sys.argv[1]) if sys.argv[1:] else 30).items():
         share = " | ".join(f"{100 * value:.1f} %" for value in (result.runs, result.lost, result.regret))
         print(f"| {name} | {share} | {result.false:.1f} |")

@@ -75,7 +75,7 @@ def test_blocks_may_be_given_as_blocks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"start": [{"gian": 1.0}]}, "unknown 'gian'.*'gain'"),
+        ({"start": [{"gian": 1.0}]}, "sets 'gian', which there is not.*'gain'"),
         ({"start": [{"mode": "crash"}]}, "sets mode = 'crash', but the study holds it at 'fine'"),
         ({"start": [{"gain": 99.0}]}, "sets gain = 99.0, outside the range"),
         ({"objective": "sped"}, "unknown objective 'sped'.*'speed'"),

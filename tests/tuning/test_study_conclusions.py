@@ -17,8 +17,8 @@ from dynslam_bench.tuning import Study, StudySpec, finish, run_study, write_page
 from dynslam_bench.tuning.blocks import Block
 from dynslam_bench.tuning.evaluate import Outcome
 from dynslam_bench.tuning.importance import FEWEST_TRIALS, importances, inert_parameters
-from dynslam_bench.tuning.statistics import bounds, by_scene, centre, upper
 from dynslam_bench.tuning.ratio import Ratio, compared
+from dynslam_bench.tuning.statistics import bounds, by_scene, centre, upper
 from dynslam_bench.tuning.summary import Candidate, StudySummary, choose, conclude
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
