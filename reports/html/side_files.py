@@ -39,7 +39,7 @@ def write_side(output: Path, name: str, value: Any) -> Path:
 
 def packed(values: ArrayLike) -> list[float | str]:
     """One series of numbers ``[N]`` as `packed_rows` writes it."""
-    return packed_rows([values])[0]
+    return packed_rows(np.asarray(values)[None])[0]
 
 
 def packed_rows(rows: ArrayLike) -> list[list[float | str]]:
