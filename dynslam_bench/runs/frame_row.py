@@ -28,6 +28,8 @@ FIXED = (
     *("reward_m", "mask_iou"),
 )
 """Columns of every ``frames.csv``; after them come ``<stage>_s``, seconds of every stage, and ``stat_<name>``."""
+_SHARE = "dynamic_share"
+"""A column of sequences with exact masks only."""
 _STAT = "stat_"
 _SECONDS = "_s"
 
@@ -51,6 +53,7 @@ class FrameRow:
         stats: The tracker's diagnostics by name.
         pose: Tracked camera-to-world pose ``tx ty tz qx qy qz qw``; None unless the state is ``ok``. Not in
             ``frames.csv``: ``trajectory_online.txt`` holds it.
+        dynamic_share: Share of the pixels that show people, by the exact masks, 0 to 1; None without such masks.
     """
 
     index: int
@@ -65,9 +68,10 @@ class FrameRow:
     timings: Mapping[str, float] = field(default_factory=dict)
     stats: Mapping[str, float] = field(default_factory=dict)
     pose: Sequence[float] | None = None
+    dynamic_share: float | None = None
 
     @classmethod
-    def of(cls, outcome: FrameOutcome, mask_iou: float | None = None) -> FrameRow:
+    def of(cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None) -> FrameRow:
         """The row of a frame that an environment has tracked."""
         error = outcome.error
         pose = None
@@ -87,13 +91,15 @@ class FrameRow:
             timings=dict(outcome.timings),
             stats=dict(outcome.stats),
             pose=pose,
+            dynamic_share=dynamic_share,
         )
 
     def cells(self) -> dict[str, Any]:
-        """The row by the columns of ``frames.csv``: `FIXED`, ``<stage>_s`` and ``stat_<name>``."""
+        """The row by the columns of ``frames.csv``: `FIXED`, the dynamic share, ``<stage>_s`` and ``stat_<name>``."""
+        share = {} if self.dynamic_share is None else {_SHARE: self.dynamic_share}
         times = {stage + _SECONDS: value for stage, value in self.timings.items()}
         stats = {_STAT + name: value for name, value in self.stats.items()}
-        return {name: getattr(self, name) for name in FIXED} | times | stats
+        return {name: getattr(self, name) for name in FIXED} | share | times | stats
 
     def to_json(self) -> str:
         """The row as one line of the child's log, with its newline."""
@@ -208,6 +214,7 @@ def _parse(line: Mapping[str, str]) -> FrameRow:
         mask_iou=cells.get("mask_iou"),
         timings=timings,
         stats=stats,
+        dynamic_share=cells.get(_SHARE),
     )
 
 

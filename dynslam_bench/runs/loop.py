@@ -20,8 +20,10 @@ from dynslam_bench.geometry.tum_file import write_tum
 
 from .frame_row import FRAMES_FILE, FrameRow
 from .process.failures import at
-from .sheet_collector import SheetWriter
+from .sheet_collector import SHEET_FILE, SheetWriter
+from .snapshots import SnapshotWriter
 from .spec import RunSpec
+from .video import VideoWriter
 
 Send = Callable[[dict[str, Any]], None]
 
@@ -105,11 +107,14 @@ class _Recorder:
 
     def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
         self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
-        self._video = _Video(folder / "video.mp4", env) if spec.video else None
-        self.sheet = SheetWriter(folder / "sheet.png", env) if spec.sheet else None
+        self._snapshots = SnapshotWriter(folder, len(env.sequence))
+        self._env = env
+        self._video = VideoWriter(folder, env) if spec.video else None
+        self.sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
 
     def add(self) -> None:
         self._frames.write()
+        self._snapshots.add(self._env.episode.outcomes[-1], self._env.frame.rgb.shape, self._env.result)
         if self._video is not None:
             self._video.add()
         if self.sheet is not None:
@@ -117,6 +122,7 @@ class _Recorder:
 
     def close(self) -> None:
         self._frames.close()
+        self._snapshots.write()
         if self._video is not None:
             self._video.close()
 
@@ -162,7 +168,7 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
             sheet.write(outputs, env.online_trajectory() if final is None else final)
         outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
     elif sheet is not None:
-        notes.append("no sheet.png: the tracker offers neither keyframes nor a map")
+        notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
     if env.device.startswith("cuda"):
         import torch
 
@@ -181,42 +187,23 @@ class _FrameWriter:
     def write(self) -> None:
         outcomes = self._env.episode.outcomes
         for outcome in outcomes[self._written :]:
-            overlap = self._mask_iou(outcome.index) if outcome is outcomes[-1] else None
-            self._log.write(FrameRow.of(outcome, overlap).to_json())
+            masked = self._masks(outcome.index) if outcome is outcomes[-1] else (None, None)
+            self._log.write(FrameRow.of(outcome, *masked).to_json())
         self._log.flush()
         self._written = len(outcomes)
 
     def close(self) -> None:
         self._log.close()
 
-    def _mask_iou(self, index: int) -> float | None:
-        """Overlap of the tracker's mask with the exact one of people; None where one is missing or both are empty."""
-        predicted = self._env.result.dynamic_mask
-        if predicted is None or self._env.sequence.masks is None:
-            return None
+    def _masks(self, index: int) -> tuple[float | None, float | None]:
+        """Overlap of the tracker's mask with the exact one of people, and the share of the image that shows people.
+
+        None where a mask is missing; the overlap also where both are empty.
+        """
+        if self._env.sequence.masks is None:
+            return None, None
         truth = self._env.sequence.masks[index]
         people = [number for number, name in truth.class_names.items() if name == "person"]
-        return compare_masks(np.asarray(predicted, dtype=bool), np.isin(truth.instances, people)).iou
-
-
-class _Video:
-    """Writes the rendered frames as MPEG-4."""
-
-    def __init__(self, path: Path, env: SlamEnv) -> None:
-        self._path, self._env = path, env
-        self._writer: Any = None
-
-    def add(self) -> None:
-        import cv2
-
-        image = self._env.render()
-        assert image is not None
-        if self._writer is None:
-            size = (image.shape[1], image.shape[0])
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._writer = cv2.VideoWriter(str(self._path), code, self._env.sequence.fps, size)
-        self._writer.write(np.ascontiguousarray(image[:, :, ::-1]))
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.release()
+        exact, predicted = np.isin(truth.instances, people), self._env.result.dynamic_mask
+        overlap = None if predicted is None else compare_masks(np.asarray(predicted, dtype=bool), exact).iou
+        return overlap, float(exact.mean())

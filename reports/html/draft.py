@@ -28,10 +28,10 @@ class Draft:
         if section.blocks or section.notes:
             self.sections.append(section)
 
-    def table(self, table: Table, title: str = "") -> Block:
+    def table(self, table: Table, title: str = "", *, folded: bool = False) -> Block:
         """A block that shows a table."""
         self.tables.append(table)
-        return Block(kind="table", title=title, table=table)
+        return Block(kind="table", title=title, table=table, folded=folded)
 
     def figure(self, name: str, figure: Figure, caption: str = "", title: str = "") -> Block:
         """A block that shows a figure."""
@@ -39,5 +39,5 @@ class Draft:
         return Block(kind="figure", title=title, figure=name, caption=caption)
 
     def titled(self, table: Table | None) -> list[Block]:
-        """A block that shows a table below its own title; none for no table."""
-        return [] if table is None else [self.table(table, table.title)]
+        """A block that shows a table behind its own title, closed at first; none for no table."""
+        return [] if table is None else [self.table(table, table.title, folded=True)]

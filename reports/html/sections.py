@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.trajectory import Trajectory
 
 from ..figures import leaderboard as figures
-from ..figures.sequence import sequence_figures
+from ..figures.style import colours, safe
 from ..model.board import Board
 from ..model.common import common_errors, representatives
 from ..model.missing import missing_commands, missing_note
-from ..model.published import is_excerpt, reported_for
+from ..model.published import is_excerpt, least_length_s, reported_for
 from ..model.rows import Loaded
 from ..model.statistics import FEWEST, power_note
 from ..tables import fairness as fairness_tables
@@ -22,6 +19,7 @@ from ..tables import sequences as sequence_tables
 from ..tables.formats import significant_text
 from ..tables.metric import metric_table
 from .draft import Draft
+from .explore import Explored
 from .page import Block, Section
 
 _MOST_NOTES = 60
@@ -65,6 +63,14 @@ def _leaderboard_notes(board: Board, loaded: Loaded) -> list[str]:
     return notes
 
 
+def add_explore(draft: Draft, explored: Explored) -> None:
+    """The table that leads to every run."""
+    section = Section("explore", "Explore", "Explore", blocks=[Block("explore")])
+    if explored.note:
+        section.notes.append(f"Frames without a picture: {explored.note}.")
+    draft.add(section)
+
+
 def add_speed(draft: Draft, board: Board) -> None:
     """Accuracy against speed."""
     figure = figures.speed_figure(board)
@@ -92,6 +98,15 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)
+    beside = {cell.sequence for cell in published}
+    unsure = sorted(
+        {row.sequence for row in board.rows if board.sequence(row) in beside and not least_length_s(row.sequence)}
+    )
+    if unsure:
+        section.notes.append(
+            f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
+            "are of the whole recordings is not checked."
+        )
     table_of_errors = sequence_tables.per_sequence(board, protocol, published)
     section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
     common, frames = common_errors(board, protocol, loaded)
@@ -107,36 +122,28 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
     draft.add(section)
 
 
-def add_trajectories(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
-    """Paths and errors over time of one run a tracker, by sequence."""
+def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Protocol) -> None:
+    """Paths and errors over time of one run a tracker, by sequence; drawn of the runs' side files when it opens."""
     section = Section("trajectories", "Trajectories and error over time", "Trajectories")
-    for position, sequence in enumerate(board.sequences):
+    palette = colours(board)
+    shown = (board.ranked_order() or board.trackers)[:6] + ([board.reference] if board.reference else [])
+    for sequence in board.sequences:
         chosen = representatives(board, sequence, loaded)
-        estimates: dict[str, Trajectory] = {}
-        truth = None
-        for key, run in chosen.items():
-            trajectory = run.trajectory(protocol.trajectory)
-            truth = truth or run.ground_truth()
-            if trajectory is not None and run.row.metrics:
-                estimates[key] = trajectory
-        if truth is None or not estimates:
-            continue
-        paths, errors = sequence_figures(board, truth, estimates, protocol)
-        draft.figures |= {f"path-{position}": paths, f"error-{position}": errors}
-        caption = (
-            f"The run with the median error of each tracker, aligned ({protocol.alignment}), seen along the three "
-            "axes. Lines are broken where a gap exceeds twice the median interval. Click a name to show or hide it."
-        )
-        over_time = "Absolute translational error of the same runs, frame by frame."
-        section.blocks.append(
-            Block(
-                kind="details",
-                summary=sequence,
-                small=", ".join(filter(None, (board.groups[sequence], f"{len(estimates)} trackers"))),
-                open=position == 0,
-                figures=[(f"path-{position}", caption), (f"error-{position}", over_time)],
+        tracks = [
+            {"run": run.row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}
+            for key, run in chosen.items()
+        ]
+        if tracks:
+            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} trackers")))
+            section.blocks.append(
+                Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks)
             )
+    if section.blocks:
+        caption = (
+            f"The run with the median error of each tracker, aligned ({protocol.alignment}). Lines are broken where a "
+            "gap exceeds twice the median interval. Click a name to show or hide it."
         )
+        section.blocks.insert(0, Block("caption", text=caption))
     draft.add(section)
 
 
@@ -175,9 +182,9 @@ def add_masks(draft: Draft, board: Board) -> None:
     draft.add(section)
 
 
-def add_failures(draft: Draft, board: Board, output: Path) -> None:
+def add_failures(draft: Draft, board: Board) -> None:
     """Every run that failed, or that none did."""
-    table = run_tables.failures(board, output)
+    table = run_tables.failures(board)
     nothing = Block(kind="list", entries=[f"None of {len(board.rows)} runs failed."])
     draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
 
@@ -197,5 +204,5 @@ def add_provenance(draft: Draft, board: Board, again: str) -> None:
         shown = notes[:_MOST_NOTES]
         if len(notes) > len(shown):
             shown.append(f"... and {len(notes) - len(shown)} more in report.json")
-        section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown))
+        section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown, folded=True))
     draft.add(section)

@@ -30,7 +30,7 @@ def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
 
 
 def shortened(names: Sequence[str]) -> dict[str, str]:
-    """Names without the folders, and without the ``@...`` or ``?...`` behind them, that all of them share.
+    """Names without the folders, and without the ``@...`` and the ``?...`` behind them, that all of them share.
 
     The part of a sequence, `` [0:60]``, always stays.
     """
@@ -40,11 +40,13 @@ def shortened(names: Sequence[str]) -> dict[str, str]:
     shared = 0
     while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
         shared += 1
-    tails = {_split(name)[1] for name in names}
+    marks = [_split(name)[1].partition("?") for name in names]
+    instances, queries = {mark for mark, _, _ in marks}, {query for _, _, query in marks}
     short = {}
-    for name in names:
-        stem, tail, part = _split(name)
-        short[name] = "/".join(stem.split("/")[shared:]) + ("" if len(tails) == 1 else tail) + part
+    for name, (mark, sign, query) in zip(names, marks, strict=True):
+        stem, _, part = _split(name)
+        tail = (mark if len(instances) > 1 else "") + (sign + query if len(queries) > 1 else "")
+        short[name] = "/".join(stem.split("/")[shared:]) + tail + part
     return short if len(set(short.values())) == len(names) else {name: name for name in names}
 
 

@@ -1,4 +1,4 @@
-"""Which cells of the board are empty, and the commands that fill them."""
+"""Which cells of the board are empty, the commands that fill them, and the one that makes a run again."""
 
 from __future__ import annotations
 
@@ -54,6 +54,16 @@ def missing_commands(board: Board) -> list[str]:
             words = ["dynslam-bench", "run", row.tracker, *names, *part, *repeats, *_settings(row)]
             commands.append(shlex.join(words))
     return commands
+
+
+def run_command(row: RunRow) -> str:
+    """The command that makes one run again; empty for an imported trajectory."""
+    if row.imported:
+        return ""
+    words = ["dynslam-bench", "run", row.tracker, row.place or row.sequence, *row.part_options]
+    words += ["--seed", str(row.seed)] if row.seed else []
+    words += ["--offset", str(row.offset)] if row.offset else []
+    return shlex.join([*words, *_settings(row)])
 
 
 def _candidates(board: Board) -> list[str]:

@@ -50,6 +50,7 @@ class RunRow(Record):
         trajectory: Which trajectory the metrics are of; an import may hold the final one only.
         metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
         final_ate_m: ATE of the final trajectory; None if there is none.
+        final_metrics: All errors of the final trajectory; empty if there is none, or in reports of older versions.
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
         held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
@@ -103,6 +104,7 @@ class RunRow(Record):
     trajectory: Which = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
     final_ate_m: float | None = None
+    final_metrics: dict[str, float] = Field(default_factory=dict)
     rotation_uncertainty_deg: float | None = None
     held_ate_m: float | None = None
     never_move_m: float | None = None

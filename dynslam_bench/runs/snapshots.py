@@ -1,0 +1,133 @@
+"""What the tracker saw on some frames of a run: its features, kept or culled, and its mask; for pictures afterwards."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.core.errors import RunError
+
+if TYPE_CHECKING:
+    from dynslam_bench.envs.episode import FrameOutcome
+
+SNAPSHOTS_FILE = "snapshots.npz"
+SPREAD = 24
+"""Frames that are kept evenly spread over a run."""
+WORST = 6
+"""Frames that are kept besides, those with the largest frame-to-frame error."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """One frame as the tracker saw it.
+
+    Attributes:
+        index: Index of the frame in the run's part of the sequence.
+        points: int16 ``[N, 2]``, pixels of the features.
+        kept: bool ``[N]``, which of them were kept.
+        mask: bool ``[H, W]``, pixels held for dynamic; None where the tracker gave no mask.
+    """
+
+    index: int
+    points: NDArray[np.int16]
+    kept: NDArray[np.bool_]
+    mask: NDArray[np.bool_] | None
+
+
+def spread(frames: int, count: int = SPREAD) -> list[int]:
+    """At most `count` frames evenly spread over so many, the first and the last among them."""
+    return sorted({int(index) for index in np.linspace(0, max(frames - 1, 0), min(count, frames)).round()})
+
+
+class SnapshotWriter:
+    """Collects snapshots while a run goes on; nothing is written for trackers that show neither features nor masks.
+
+    Args:
+        folder: The run's.
+        frames: Frames of the run's part of the sequence.
+    """
+
+    def __init__(self, folder: Path, frames: int) -> None:
+        self._path, self._spread = folder / SNAPSHOTS_FILE, set(spread(frames))
+        self._even: list[Snapshot] = []
+        self._worst: list[tuple[float, Snapshot]] = []
+        self._size = (0, 0)
+
+    def add(self, outcome: FrameOutcome, shape: tuple[int, ...], result: TrackResult) -> None:
+        """Keep the frame if it is one of those spread over the run, or among the worst so far."""
+        if result.keypoints_xy is None and result.dynamic_mask is None:
+            return
+        self._size = (shape[0], shape[1])
+        error = None if outcome.error is None else outcome.error.frame_trans_m
+        if outcome.index in self._spread:
+            self._even.append(_taken(outcome.index, result))
+        elif error is not None and (len(self._worst) < WORST or error > self._worst[-1][0]):
+            self._worst.append((error, _taken(outcome.index, result)))
+            self._worst = sorted(self._worst, key=lambda pair: -pair[0])[:WORST]
+
+    def write(self) -> None:
+        """Write what was kept."""
+        shots = sorted([*self._even, *(shot for _, shot in self._worst)], key=lambda shot: shot.index)
+        if not shots:
+            return
+        masks = [np.zeros(self._size, bool) if shot.mask is None else shot.mask for shot in shots]
+        np.savez_compressed(
+            self._path,
+            index=np.array([shot.index for shot in shots], np.int32),
+            count=np.array([len(shot.points) for shot in shots], np.int32),
+            points=np.concatenate([shot.points for shot in shots]),
+            kept=np.concatenate([shot.kept for shot in shots]),
+            size=np.array(self._size, np.int32),
+            masked=np.array([shot.mask is not None for shot in shots]),
+            masks=np.packbits(np.stack(masks), axis=2),
+        )
+
+
+def _taken(index: int, result: TrackResult) -> Snapshot:
+    points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
+    kept = result.keypoints_keep
+    mask = result.dynamic_mask
+    return Snapshot(
+        index,
+        np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
+        np.ones(len(points), bool) if kept is None else np.array(kept, dtype=bool),
+        None if mask is None else np.array(mask, dtype=bool),
+    )
+
+
+def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
+    """The snapshots of a stored run.
+
+    Args:
+        folder: The run's.
+
+    Returns:
+        Height and width of the images in pixels, and the snapshots in order; none for runs without any (imported, of
+        older versions, of trackers that show neither features nor masks).
+
+    Raises:
+        RunError: The file is damaged.
+    """
+    path = folder / SNAPSHOTS_FILE
+    if not path.is_file():
+        return (0, 0), []
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            found = {name: stored[name] for name in stored.files}
+        height, width = found["size"].tolist()
+        ends = np.cumsum(found["count"])[:-1]
+        points, kept = np.split(found["points"], ends), np.split(found["kept"], ends)
+        masks = np.unpackbits(found["masks"], axis=2, count=width).astype(bool)
+        shots = [
+            Snapshot(int(index), points[at], kept[at], masks[at] if found["masked"][at] else None)
+            for at, index in enumerate(found["index"])
+        ]
+    except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
+        raise RunError(f"{path} holds no snapshots: {error}") from error
+    return (height, width), shots

@@ -1,0 +1,172 @@
+"""Pictures of frames for the pages of runs: drawn when the report is made, from the sequence itself, once a frame."""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.records import write_atomic
+from dynslam_bench.envs.source import open_frames
+from dynslam_bench.runs.snapshots import Snapshot, read_snapshots, spread
+from dynslam_bench.sequences.part import part_of
+
+from ..figures.style import significant
+from ..model.rows import LoadedRun
+from .run_data import RunFrames
+from .side_files import write_side
+
+FOLDER = "frames"
+EVEN, WORST = 16, 4
+"""Frames of a run that are shown evenly spread, and those with the largest frame-to-frame error."""
+_WIDTH, _QUALITY = 480, 62
+_MASK_WIDTH, _LOSSLESS = 160, 101
+
+
+@dataclass
+class PictureBook:
+    """Draws the frames that runs show, as long as there is time for it; what is there already is not drawn again.
+
+    Args:
+        output: Folder of the report.
+        seconds: Time that opening and drawing may take altogether.
+
+    Attributes:
+        runs: Runs that have pictures.
+        missing: Why some frames have none, with their number.
+    """
+
+    output: Path
+    seconds: float
+    runs: set[str] = field(default_factory=set)
+    missing: dict[str, int] = field(default_factory=dict)
+    _spent: float = 0.0
+    _opened: dict[tuple[Any, ...], Sequence | str] = field(default_factory=dict)
+
+    def add(self, run: LoadedRun, frames: RunFrames) -> None:
+        """Draw the frames that a run shows and write what was seen on them as ``data/looks-<run id>.js``."""
+        if not len(frames):
+            return
+        try:
+            size, shots = read_snapshots(run.store.folder(run.row.run_id))
+        except DynslamError as error:
+            self._miss(str(error))
+            return
+        began = time.perf_counter()
+        by_index = {shot.index: shot for shot in shots}
+        looks = [self._look(run, index, by_index.get(index), size) for index in _chosen(frames, sorted(by_index))]
+        self._spent += time.perf_counter() - began
+        known = [look for look in looks if look.get("image") or look.get("points")]
+        if not known:
+            return
+        errors = dict(zip(frames.columns["index"].tolist(), (1000 * frames.errors_m).tolist(), strict=True))
+        for look in known:
+            look["error_mm"] = significant(errors.get(look["index"]))
+        write_side(self.output, f"looks-{run.row.run_id}", {"looks": known, "stored": bool(shots)})
+        self.runs.add(run.row.run_id)
+
+    def _miss(self, reason: str) -> None:
+        self.missing[reason] = self.missing.get(reason, 0) + 1
+
+    def note(self) -> str:
+        """Why some runs have no pictures; empty if all have them."""
+        return "; ".join(f"{count} frames: {reason}" for reason, count in self.missing.items())
+
+    def _look(self, run: LoadedRun, index: int, shot: Snapshot | None, size: tuple[int, int]) -> dict[str, Any]:
+        try:
+            look: dict[str, Any] = {"index": index, "image": self._image(run, index)}
+        except DynslamError as error:
+            self._miss(str(error))
+            look = {"index": index}
+        return look if shot is None else look | _seen(shot, size)
+
+    def _image(self, run: LoadedRun, index: int) -> str:
+        """Relative path of the picture of a frame; drawn if it is not there yet.
+
+        Raises:
+            DynslamError: The sequence cannot be opened, is another one by now, or the time is over.
+        """
+        record = run.record
+        number = (record.frames or (0, None))[0] + (index * record.stride) + record.offset
+        path = self.output / FOLDER / (record.sequence.block or record.sequence.part) / f"{number}.webp"
+        if not path.is_file():
+            if self._spent > self.seconds:
+                raise DynslamError(f"not drawn within {self.seconds:.0f} s", "make the report again: it goes on there")
+            began = time.perf_counter()
+            image = self._sequence(run)[index].rgb
+            self._spent += time.perf_counter() - began
+            write_atomic(path, _webp(_shrunk(image[:, :, ::-1], _WIDTH), _QUALITY))
+        return path.relative_to(self.output).as_posix()
+
+    def _sequence(self, run: LoadedRun) -> Sequence:
+        record = run.record
+        key = (record.place or record.sequence.id, record.frames, record.offset, record.stride, record.sequence.content)
+        if key not in self._opened:
+            try:
+                self._opened[key] = _open(run)
+            except DynslamError as error:
+                self._opened[key] = str(error)
+        found = self._opened[key]
+        if isinstance(found, str):
+            raise DynslamError(found)
+        return found
+
+
+def _open(run: LoadedRun) -> Sequence:
+    """The sequence of a run as its tracker saw it, before any preprocessing.
+
+    Raises:
+        DynslamError: It is not here, or not the one that was run on.
+    """
+    record = run.record
+    start, stop = record.frames or (0, None)
+    sequence = open_frames(record.place or record.sequence.id, None, None, (start + record.offset, stop), record.stride)
+    if record.sequence.content and part_of(sequence, record.offset).content != record.sequence.content:
+        raise DynslamError(f"the content of {record.sequence.id} has changed since the run")
+    return sequence
+
+
+def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
+    """Frames to show: some spread over the run, and the worst; of those that the run has stored, if it has any."""
+    indices = frames.columns["index"]
+    order = np.argsort(-np.nan_to_num(frames.errors_m, nan=-1.0), kind="stable")
+    bad = [int(indices[at]) for at in order if np.isfinite(frames.errors_m[at])]
+    if not stored:
+        return sorted({int(indices[at]) for at in spread(len(frames), EVEN)} | set(bad[:WORST]))
+    even = {stored[at] for at in spread(len(stored), EVEN)}
+    return sorted(even | set([index for index in bad if index in set(stored)][:WORST]))
+
+
+def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
+    """Features (two bytes each: x and y in 255ths of the image), which were kept, and the mask as a small image."""
+    height, width = size
+    places = np.clip(shot.points * 255.0 / (width, height), 0, 255).round().astype(np.uint8)
+    order = np.argsort(shot.kept, kind="stable")  # culled ones first
+    seen = {"points": base64.b64encode(places[order].tobytes()).decode(), "culled": int((~shot.kept).sum())}
+    seen |= {"width": width, "height": height}
+    if shot.mask is None or not shot.mask.any():
+        return seen | {"share": None if shot.mask is None else 0.0}
+    mask = _shrunk(shot.mask.astype(np.uint8) * 255, _MASK_WIDTH)
+    coded = base64.b64encode(_webp(cv2.merge([mask, mask, mask]), _LOSSLESS)).decode()
+    return seen | {"mask": f"data:image/webp;base64,{coded}", "share": significant(100 * float(shot.mask.mean()), 3)}
+
+
+def _shrunk(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    height = round(image.shape[0] * width / image.shape[1])
+    return np.asarray(cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _webp(image: NDArray[np.uint8], quality: int) -> bytes:
+    done, coded = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise DynslamError("this OpenCV cannot write WebP")
+    return bytes(coded)

@@ -1,0 +1,244 @@
+"""What the page of one run shows: its facts, its frames over time, its track beside the true one, its log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.evaluation.evaluate import pose_errors
+from dynslam_bench.evaluation.protocol import Protocol, RPESpec
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.runs.frame_row import CSV_FILE
+
+from ..figures.sequence import broken
+from ..figures.style import significant
+from ..model.missing import run_command
+from ..model.rows import LoadedRun
+from .side_files import packed_rows
+
+Array = NDArray[np.float64]
+
+MOST_FRAMES = 400
+"""Frames of a run that its page shows; of longer ones every second, third, ..."""
+_LOG_BYTES = 20_000
+_COUNTS = ("keypoints", "culled", "matches", "inliers")
+_STATS = {f"stat_{name}" for name in (*_COUNTS, "mask_fraction")}
+_NEEDED = {"index", "timestamp", "state", "frame_error_trans_m"}
+
+
+@dataclass(frozen=True, eq=False)
+class RunFrames:
+    """The frames of a run.
+
+    Attributes:
+        columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an imported trajectory.
+        share: Share of the pixels that show people ``[N]``, nan where it is not known.
+        share_source: Where that comes from, in words; empty where nothing is known.
+        fault: Why there are no frames though there is a table; empty otherwise.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    share: Array
+    share_source: str
+    fault: str = ""
+
+    def __len__(self) -> int:
+        return len(self.share)
+
+    @property
+    def errors_m(self) -> Array:
+        """Frame-to-frame translational errors ``[N]`` in metres, nan where there is none."""
+        return np.asarray(self.columns["frame_error_trans_m"], dtype=np.float64)
+
+
+def read_frames(run: LoadedRun, exact: Mapping[int, float]) -> RunFrames:
+    """The frames of a run with the share of dynamic pixels: the exact one if it is known, else by its own masks.
+
+    Args:
+        run: The run.
+        exact: Frame in the numbering of the run's part without offset to the exact share.
+    """
+    path = run.store.folder(run.row.run_id) / CSV_FILE
+    if not path.is_file() or not path.stat().st_size:
+        return RunFrames({}, np.zeros(0), "")
+    try:
+        table = pd.read_csv(path, usecols=_is_shown)
+    except (ValueError, OSError) as error:
+        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} is damaged: {error}")
+    columns = {str(name): table[name].to_numpy() for name in table}
+    if not len(table) or not _NEEDED <= set(columns):
+        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} holds no frames")
+    if exact:
+        share = np.array([exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()])
+        return RunFrames(columns, share, "exact masks")
+    own = columns.get("stat_mask_fraction")
+    if own is not None:
+        return RunFrames(columns, own.astype(np.float64), "the tracker's own masks")
+    return RunFrames(columns, np.full(len(table), np.nan), "")
+
+
+def _is_shown(name: str) -> bool:
+    """Whether the page shows a column of ``frames.csv``."""
+    return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
+
+
+def exact_share(path: Path, offset: int) -> dict[int, float]:
+    """Frame (before the offset) to its exact share of dynamic pixels, of a ``frames.csv`` that knows it; else empty."""
+    if not path.is_file():
+        return {}
+    with path.open() as file:
+        if "dynamic_share" not in file.readline().rstrip("\n").split(","):
+            return {}
+    table = pd.read_csv(path, usecols=["index", "dynamic_share"]).dropna()
+    return {int(index) + offset: float(share) for index, share in table.itertuples(index=False)}
+
+
+def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:
+    """Everything that the page of a run shows, as the page's script reads it.
+
+    Args:
+        run: The run.
+        frames: Its frames.
+        protocol: How its errors are computed.
+        truth: Ground truth of its part of the sequence.
+    """
+    row, record = run.row, run.record
+    return {
+        "id": row.run_id,
+        "status": row.status,
+        "ending": row.ending,
+        "reason": row.reason,
+        "facts": _facts(run, protocol.rpe),
+        "settings": {name: _plain(value) for name, value in record.settings.items()},
+        "overrides": sorted(record.overrides),
+        "stages": [
+            [name, *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s))]
+            for name, time in record.timings.items()
+        ],
+        "protocol": protocol.describe(),
+        "started": row.started,
+        "machine": row.machine,
+        "notes": [*row.notes, *filter(None, [frames.fault])],
+        "command": run_command(row),
+        "asked": row.command,
+        "log": _log(run),
+        "frames": _series(frames),
+        "track": _track(run, protocol, truth),
+    }
+
+
+def _facts(run: LoadedRun, rpe: Sequence[RPESpec]) -> list[list[str | float | None]]:
+    """Name, number and unit of what is known of a run."""
+    row, record = run.row, run.record
+    facts: list[tuple[str, float | None, str]] = [
+        ("ATE, lost frames held", None if row.score_m is None else 1000 * row.score_m, "mm"),
+        ("ATE of the tracked frames", _scaled(row.metrics.get("ate_rmse_m"), 1000), "mm"),
+        ("ATE of the final trajectory", _scaled(row.final_ate_m, 1000), "mm"),
+        *((f"RPE over {s.describe()}", _scaled(row.metrics.get(f"rpe_{s.key}_trans_rmse_m"), 1000), "mm") for s in rpe),
+        ("coverage", 100 * row.coverage, "%"),
+        ("frame time", row.frame_ms, "ms"),
+        ("real time", row.real_time_factor, "×"),
+        ("memory", row.peak_memory_mb, "MB"),
+        ("keyframes", record.keyframes, ""),
+        ("map points", record.map_points, ""),
+        ("mask overlap (IoU)", row.mask_iou, ""),
+    ]
+    return [[name, significant(value), unit] for name, value, unit in facts if value is not None]
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, str | int | bool) or value is None else str(value)
+
+
+def _log(run: LoadedRun) -> str:
+    path = run.store.folder(run.row.run_id) / "log.txt"
+    if not path.is_file():
+        return ""
+    text = path.read_bytes()
+    cut = f"... {len(text) - _LOG_BYTES} bytes before\n" if len(text) > _LOG_BYTES else ""
+    return cut + text[-_LOG_BYTES:].decode(errors="replace")
+
+
+def _series(frames: RunFrames) -> dict[str, Any]:
+    """The frames over time, thinned and packed."""
+    columns = frames.columns
+    if not columns:
+        return {}
+    step = -(-len(frames) // MOST_FRAMES)
+    stamps, start = columns["timestamp"], float(columns["timestamp"][0])
+    stages = [name for name in columns if name.endswith("_s") and name not in ("total_s", "read_s")]
+    counts = [name for name in _COUNTS if f"stat_{name}" in columns]
+    rows = [stamps - start, 1000 * frames.errors_m, 100 * frames.share]
+    rows += [columns[f"stat_{name}"] for name in counts] + [1000 * columns[name] for name in stages]
+    t, error, share, *others = packed_rows([np.asarray(row, dtype=np.float64)[::step] for row in rows])
+    found: dict[str, Any] = {
+        "count": len(frames),
+        "step": step,
+        "start": start,
+        "t": t,
+        "states": "".join(state[:1] for state in columns["state"][::step].tolist()),
+        "frame_error_mm": error,
+        "share_source": frames.share_source,
+        "counts": dict(zip(counts, others, strict=False)),
+        "stages": {name[:-2]: row for name, row in zip(stages, others[len(counts) :], strict=True)},
+    }
+    return found | {"share": share} if np.isfinite(frames.share).any() else found
+
+
+def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:
+    """The aligned track beside the true one; without ground truth the track alone; empty if nothing was tracked.
+
+    Where the time between two poses exceeds twice the median interval, all series have a gap.
+    """
+    try:
+        estimate = run.trajectory(run.row.trajectory)
+        if estimate is None or len(estimate) < 2:
+            return {}
+        if truth is None or not run.row.metrics:
+            return _packed_track(estimate, {"xyz": estimate.positions, "angles": _angles(estimate, estimate)})
+        aligned, true, series = pose_errors(estimate, truth, protocol)
+    except DynslamError as error:
+        return {"reason": str(error)}
+    columns = {
+        "error_mm": 1000 * series["trans_m"],
+        "rotation_deg": series["rot_deg"],
+        "xyz": aligned.positions,
+        "true_xyz": true.positions,
+        "angles": _angles(aligned, true),
+        "true_angles": _angles(true, true),
+    }
+    return _packed_track(aligned, columns) | {"alignment": protocol.alignment}
+
+
+def _packed_track(track: Trajectory, columns: Mapping[str, Array]) -> dict[str, Any]:
+    """Series along a track ``[N]`` or ``[N, 3]``, thinned, broken at gaps and packed."""
+    start = float(track.timestamps[0])
+    widths = [1 if values.ndim == 1 else values.shape[1] for values in columns.values()]
+    together = np.column_stack(list(columns.values()))
+    stamps, values = broken(track.timestamps - start, together, MOST_FRAMES)
+    t, *rows = packed_rows(np.vstack([stamps, values.T]))
+    found: dict[str, Any] = {"start": start, "t": t}
+    for name, width in zip(columns, widths, strict=True):
+        found[name] = rows[0] if width == 1 else rows[:width]
+        rows = rows[width:]
+    return found
+
+
+def _angles(track: Trajectory, true: Trajectory) -> Array:
+    """Yaw, pitch and roll (about the camera's y, x and z) from the first true pose, in degrees ``[N, 3]``."""
+    turned = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
+    yaw = np.arctan2(turned[:, 0, 2], turned[:, 2, 2])
+    pitch = np.arcsin(np.clip(-turned[:, 1, 2], -1, 1))
+    roll = np.arctan2(turned[:, 1, 0], turned[:, 1, 1])
+    return np.asarray(np.degrees(np.unwrap(np.stack([yaw, pitch, roll], axis=1), axis=0)))
