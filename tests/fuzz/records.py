@@ -24,9 +24,8 @@ from dynslam_bench.runs.storage.evaluating import evaluate_run
 from dynslam_bench.runs.storage.frame_table import load_frames
 from dynslam_bench.runs.storage.frames import FrameLog
 from dynslam_bench.sequences.fetch import Receipt
-from dynslam_bench.tuning import StudySummary, cmaes_state
+from dynslam_bench.tuning import Study, StudySummary, cmaes_state, python_study
 from dynslam_bench.tuning import frame as study_frame
-from dynslam_bench.tuning.frame import Study
 
 from .mutate import mutate, mutate_json, mutate_lines
 from .target import Target, at
@@ -215,12 +214,12 @@ TARGETS = [
         _repacked,
     ),
     Target("study's summary", **_summary(StudySummary, "studies/small/summary.json")),
-    Target("stored study", _read_study, _study_seeds, (Study.open, study_frame._spec_of), mutate_json),
+    Target("stored study", _read_study, _study_seeds, (Study.open, python_study._spec_of), mutate_json),
     Target(
         "journal of a study",
         _read_journal,
         lambda: [_stored("studies/small/journal.log")],
-        (Study.open, Study.frame, Study._line),
+        (Study.open, Study.frame, study_frame._line),
         mutate_lines,
     ),
     Target(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / room) for room in ("envs", "core")]
 
 from envs_toys import write_folder
 
