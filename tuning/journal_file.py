@@ -5,7 +5,8 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,10 +26,14 @@ class WholeLines(JournalFileBackend):
 
     Args:
         path: The file; begun if it is missing.
+
+    Raises:
+        StudyError: It cannot be begun.
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(str(path))
+        with _clear(path):
+            super().__init__(str(path))
         self.path = path
 
     def append_logs(self, logs: Sequence[dict[str, Any]]) -> None:
@@ -38,17 +43,23 @@ class WholeLines(JournalFileBackend):
             StudyError: They cannot be written; then the file is as it was.
         """
         text = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode()
-        try:
-            with self.path.open("r+b", buffering=0) as file:
-                fcntl.flock(file, fcntl.LOCK_EX)
-                end = end_of_whole_lines(file)
-                file.truncate(end)
-                _append(file, end, text)
-        except OSError as error:
-            raise StudyError(
-                f"cannot write {self.path}: {error.strerror}",
-                "free some space, if that is it; the same command goes on from there",
-            ) from error
+        with _clear(self.path), self.path.open("r+b", buffering=0) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            end = end_of_whole_lines(file)
+            file.truncate(end)
+            _append(file, end, text)
+
+
+@contextmanager
+def _clear(path: Path) -> Iterator[None]:
+    """What a file system refuses is one clear error."""
+    try:
+        yield
+    except OSError as error:
+        raise StudyError(
+            f"cannot write {path}: {error.strerror}",
+            "free some space, if that is it; the same command goes on from there",
+        ) from error
 
 
 def end_of_whole_lines(file: IO[bytes]) -> int:

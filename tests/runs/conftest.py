@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / room) for room in ("envs", "core")]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "core"))
 
 from envs_toys import write_folder
 

@@ -86,7 +86,7 @@ class RunStore:
             RunError: The folder cannot be written.
         """
         try:
-            with self.work_folder("0" * 16):
+            with temporary_folder(self.runs / "probe"):
                 pass
         except DynslamError as error:
             raise RunError(str(error.args[0]), "name another folder with --results") from error
