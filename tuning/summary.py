@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from dynslam_bench.core.records import Record
 
@@ -46,6 +46,14 @@ class Candidate(Record):
     default_frame_ms: float | None = None
     feasible: bool = True
     failed: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_an_older_version(cls, values: Any) -> Any:
+        """What is ``confirm`` now were fresh repeats on the tune split."""
+        if isinstance(values, dict) and "tune" in values:
+            return {**{key: value for key, value in values.items() if key != "tune"}, "confirm": values["tune"]}
+        return values
 
     @property
     def bound(self) -> float:
@@ -111,6 +119,12 @@ class StudySummary(Record):
     recorded: list[str] = Field(default_factory=list)
     picks: dict[str, int | None] = Field(default_factory=dict)
     split_notes: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_an_older_version(cls, values: Any) -> Any:
+        """The repeats are told by the blocks now."""
+        return {key: value for key, value in values.items() if key != "repeats"} if isinstance(values, dict) else values
 
     @property
     def verdict(self) -> str:
