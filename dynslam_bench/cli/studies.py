@@ -114,13 +114,13 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a study, or go on with it; then run the best again, check them on the held-out split, write the page."""
-    from dynslam_bench.tuning import finish, read_study, write_page
+    from dynslam_bench.tuning import read_study, write_page
 
     spec = read_study(study, note)
     if trials is not None:
         spec = spec.model_copy(update={"trials": trials})
     tuner = run_trials(spec, results, jobs)
-    summary = finish(tuner, note, jobs=jobs)
+    summary = conclude(tuner, jobs=jobs)
     show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
 
 
@@ -183,7 +183,7 @@ def best(
 @app.command()
 def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Write a study's page; the best are run again if that was not done yet."""
-    from dynslam_bench.tuning import StudySummary, Tuner, finish, read_study, write_page
+    from dynslam_bench.tuning import StudySummary, Tuner, read_study, write_page
     from dynslam_bench.tuning.storage import study_folder
 
     spec = read_study(study, note)
@@ -193,7 +193,7 @@ def report(study: Study, results: Results = Path("results"), as_json: AsJson = F
         summary = StudySummary.read(stored)
     else:
         tuner.reference()
-        summary = finish(tuner, note)
+        summary = conclude(tuner)
     show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
 
 
@@ -209,8 +209,25 @@ def run_trials(spec: StudySpec, results: Path, jobs: int) -> Tuner:
             if event.kind == "finished":
                 note(f"trial {event.number}: {event.text}")
                 advance(event.number + 1, event.total)
+            elif event.kind == "reference":
+                advance(0, spec.trials, f"{spec.tracker} as it is by default on {event.text}")
+            else:
+                advance(event.number, event.total, f"{spec.tracker}, {event.text}")
 
         return run_study(spec, results=results, jobs=jobs, on_event=told)
+
+
+def conclude(tuner: Tuner, jobs: int = 1) -> StudySummary:
+    """Run the best again and check them, with a progress bar."""
+    from dynslam_bench.tuning import finish
+
+    with progress(f"checking the best of {tuner.spec.name}") as advance:
+
+        def told(text: str) -> None:
+            note(text)
+            advance(0, None, text)
+
+        return finish(tuner, told, jobs=jobs)
 
 
 def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bool) -> None:

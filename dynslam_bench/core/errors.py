@@ -78,6 +78,13 @@ class RunError(DynslamError):
     """A run cannot be started, stored or found."""
 
 
+class InfrastructureError(RunError):
+    """What a run needs broke, and not the run: a full disk, a process that was killed.
+
+    It is no outcome of a tracker, so nothing is stored, and the same command goes on from there.
+    """
+
+
 class StudyError(DynslamError):
     """A tuning study is ill-defined or does not fit what is stored under its name."""
 

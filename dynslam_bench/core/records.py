@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticSerializationError
 
 from .errors import DynslamError
 from .files import atomic_folder, write_atomic
@@ -34,7 +33,7 @@ class Record(BaseModel):
         """The record as indented JSON with a final newline; no password, and nothing that UTF-8 cannot hold."""
         try:
             text = self.model_dump_json(indent=2)
-        except (PydanticSerializationError, UnicodeEncodeError):  # half characters, e.g. of a foreign command line
+        except ValueError:  # half characters, e.g. of a foreign command line
             text = type(self).model_validate(storable(self.model_dump())).model_dump_json(indent=2)
         return without_passwords(text) + "\n"
 

@@ -1,1 +1,1 @@
-"""The report's figures as plotly specifications."""
+"""The report's figures as plotly-like specifications."""

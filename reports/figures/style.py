@@ -11,7 +11,7 @@ import numpy as np
 from ..model.board import Board
 
 Figure = dict[str, Any]
-"""A plotly specification: ``data`` and ``layout``."""
+"""A specification in the words of plotly, ``data`` and ``layout``; `html/templates/chart.js` draws what is used of it."""
 
 COLOURS = (
     "#1f6fb4", "#d9542b", "#2a9d6f", "#8a5cc2", "#c9970c", "#3aa6c9", "#c2427f", "#6b7a1f", "#8c564b", "#4b5fd6",
@@ -94,7 +94,7 @@ def rounded(values: Sequence[float]) -> list[float | None]:
 
 
 def safe(text: str) -> str:
-    """Names come from plug-ins; plotly reads labels as markup."""
+    """Names come from plug-ins; figures read labels as markup."""
     return html.escape(text, quote=False)
 
 

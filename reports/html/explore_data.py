@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..figures.style import COLOURS, significant
 from ..model.board import Board
-from ..model.row import RunRow
+from ..model.row import SEEN, RunRow
 from ..tables.leaderboard import middle, rank_cell, timed
 
 Array = NDArray[np.float64]
@@ -83,6 +83,7 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
     for row in sorted(board.rows, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
         values = [significant(_value(row, metric), 5) for metric in metrics]
         flags = (row.run_id in kept) + 2 * (row.run_id in pictured) + 4 * (not row.rotation_reliable)
+        flags += 8 * (row.seen_in_training and not board.rank_seen)
         five = sums.quartiles.get(row.run_id)
         where = [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat]
         runs.append([*where, row.ending, flags, values, five or []])
@@ -91,12 +92,14 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
         tags.setdefault(board.sequence(row), set()).update(row.tags)
     return {
         "protocol": protocol.describe(),
+        "seen": SEEN,
         "reference": None if board.reference is None else place[board.reference],
         "referenceName": board.reference_name,
         "metrics": metrics,
         "trackers": [_tracker(board, key, at) for at, key in enumerate(keys)],
         "sequences": [
-            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])} for n in names
+            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])}
+            for n in names
         ],
         "still": [significant(board.never_move.get(name), 5) for name in names],
         "runs": runs,
@@ -131,7 +134,10 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     found = [
         ("ate", "ATE", "m", "ate_rmse_m"),
         *(("rpe", f"RPE over {spec.describe()}", "m", f"rpe_{spec.key}_trans_rmse_m") for spec in protocol.rpe),
-        *(("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg") for spec in protocol.rpe),
+        *(
+            ("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg")
+            for spec in protocol.rpe
+        ),
         ("rotation", "absolute rotation", "deg", "ape_rot_rmse_deg"),
     ]
     return [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..figures import leaderboard as figures
@@ -137,7 +135,9 @@ def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Proto
         ]
         if tracks:
             small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} trackers")))
-            section.blocks.append(Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks))
+            section.blocks.append(
+                Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks)
+            )
     if section.blocks:
         caption = (
             f"The run with the median error of each tracker, aligned ({protocol.alignment}). Lines are broken where a "
@@ -182,9 +182,9 @@ def add_masks(draft: Draft, board: Board) -> None:
     draft.add(section)
 
 
-def add_failures(draft: Draft, board: Board, output: Path) -> None:
+def add_failures(draft: Draft, board: Board) -> None:
     """Every run that failed, or that none did."""
-    table = run_tables.failures(board, output)
+    table = run_tables.failures(board)
     nothing = Block(kind="list", entries=[f"None of {len(board.rows)} runs failed."])
     draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
 

@@ -47,6 +47,13 @@ class Cell:
         return len(self.kept) == 1 < len(self.rows)
 
     @property
+    def typical(self) -> RunRow:
+        """The run that stands for the cell: the successful one with the (lower) median error, else its first."""
+        scored = [row for row in self.kept if not row.failed and row.score_m is not None]
+        ordered = sorted(scored, key=lambda row: row.score_m or 0.0)
+        return ordered[(len(ordered) - 1) // 2] if ordered else self.rows[0]
+
+    @property
     def seen(self) -> bool:
         """Whether masks of it come from a network that was trained on the scene."""
         return any(row.seen_in_training for row in self.rows)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable
-from pathlib import Path
 from statistics import median
 
 from ..model.board import Board
@@ -14,12 +12,17 @@ from ..model.statistics import FLOOR_M
 from .table import Column, Table, TableCell, number, texts
 
 
-def failures(board: Board, output: Path) -> Table | None:
-    """Every run that failed, with its reason and log; None if there is none."""
+def run_link(row: RunRow) -> str:
+    """Where the page of a run lies, seen from the report's."""
+    return f"run.html#{row.run_id}"
+
+
+def failures(board: Board) -> Table | None:
+    """Every run that failed, with its reason and its page; None if there is none."""
     failed = [row for row in board.rows if row.failed]
     if not failed:
         return None
-    columns = [*texts("tracker", "sequence", "repeat", "ended"), Column("coverage"), *texts("reason", "log")]
+    columns = [*texts("tracker", "sequence", "repeat", "ended"), Column("coverage"), *texts("reason", "run")]
     rows = [
         [
             TableCell(board.labels[row.variant_key]),
@@ -28,7 +31,7 @@ def failures(board: Board, output: Path) -> Table | None:
             TableCell(row.ending),
             TableCell(f"{100 * row.coverage:.1f} %", value=row.coverage),
             TableCell(row.reason),
-            TableCell(row.run_id, link=_relative(row.log, output)),
+            TableCell(row.run_id, link=run_link(row)),
         ]
         for row in _ordered(board, failed)
     ]
@@ -84,7 +87,3 @@ def machines(board: Board) -> Table:
 
 def _ordered(board: Board, rows: Iterable[RunRow]) -> list[RunRow]:
     return sorted(rows, key=lambda row: (board.labels[row.variant_key], board.sequence(row), row.repeat_key))
-
-
-def _relative(path: str, output: Path) -> str:
-    return Path(os.path.relpath(path, output)).as_posix() if path else ""

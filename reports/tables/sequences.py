@@ -17,6 +17,7 @@ from ..model.row import SEEN
 from .formats import mm, significant_text
 from .leaderboard import SEEN_NOTE, sequence_columns, skipped_words
 from .metric import DOUBT, column_marks, metric_table
+from .runs import run_link
 from .table import Column, Emphasis, Table, TableCell
 
 
@@ -152,10 +153,10 @@ def _rotation_doubt(cell: Cell) -> str:
 def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, usual: int) -> TableCell:
     if cell is None or cell.median is None:
         return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
-    coverage = 100 * float(np.mean([row.coverage for row in cell.rows]))
+    coverage, link = 100 * float(np.mean([row.coverage for row in cell.rows])), run_link(cell.typical)
     if not cell.success:
         tip = f"counts as {mm(cell.median)} mm, coverage {coverage:.1f} %"
-        return TableCell(cell.ending, _count(cell, usual), emphasis="failed", tip=tip)
+        return TableCell(cell.ending, _count(cell, usual), emphasis="failed", tip=tip, link=link)
     notes = [_spread(cell), _count(cell, usual), skipped_words(cell)]
     if cell.failed:
         notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
@@ -163,13 +164,13 @@ def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, 
     base = board.reference_median(sequence)
     if base is None:
         shown = mm(cell.median) + SEEN * cell.seen
-        return TableCell(shown, small, cell.median, mark, tip=f"coverage {coverage:.1f} %")
+        return TableCell(shown, small, cell.median, mark, tip=f"coverage {coverage:.1f} %", link=link)
     ratio = cell.median / max(base, 1e-6)
     if cell.seen:
-        return TableCell(mm(cell.median) + SEEN, small, cell.median, mark, tip=SEEN_NOTE)
+        return TableCell(mm(cell.median) + SEEN, small, cell.median, mark, tip=SEEN_NOTE, link=link)
     colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
     tip = f"{ratio:.2f} × the reference, coverage {coverage:.1f} %" + (f"; {cell.ending}" if cell.failed else "")
-    return TableCell(mm(cell.median), small, cell.median, mark, colour, tip)
+    return TableCell(mm(cell.median), small, cell.median, mark, colour, tip, link=link)
 
 
 def _spread(cell: Cell) -> str:

@@ -95,3 +95,9 @@ def test_files_and_functions_stay_readable() -> None:
     }
     assert not long_files
     assert {name for name, lines in _functions() if lines > 60} == set(LONG_FUNCTIONS)
+
+
+def test_kernels_are_compiled_in_one_way() -> None:
+    users = [file for room in ("dynslam_bench", "envs", "tuning", "reports") for file in (ROOT / room).rglob("*.py")]
+    found = [file.relative_to(ROOT) for file in users if re.search(r"\b(njit|jit)\(|@n?jit", file.read_text())]
+    assert found == [Path("dynslam_bench/core/compiled.py")]

@@ -35,7 +35,6 @@ PRIVATE = {
     ),
     "tuning/test_study_trust.py": ({"_cmaes", "_mean"}, "Optuna's module that unpickles, and the state it restores"),
     "trackers/systems/test_method_page.py": ({"_flow"}, "the flow that the page promises is the one that runs"),
-    "trackers/test_steering.py": ({"_built", "_steering"}, "which part took a setting, before any frame shows it"),
     "trackers/systems/test_systems.py": ({"_filters", "_masks"}, "what a system is composed of"),
     "trackers/systems/test_systems_bridging.py": ({"_filters", "_masks"}, "puts known masks in place of a network's"),
     "trackers/systems/test_systems_lost_flow.py": (

@@ -336,7 +336,7 @@ import json, sys
 sys.stderr.write("echo {version}\\n")
 for line in sys.stdin:
     request = json.loads(line)
-    answer = dict(state="ok", T_world_cam=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+    answer = dict(index=request.get("index"), state="ok", T_world_cam=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
     print("on it", flush=True)
     print(json.dumps(answer), flush=True)
 """

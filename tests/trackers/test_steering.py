@@ -11,7 +11,7 @@ from itertools import islice
 
 import pytest
 from quick_dense import quick
-from steering_scene import FRAMES, SmallScene, construct, difference, differing, play
+from steering_scene import FRAMES, SmallScene, construct, difference, differing, play, settings_for
 
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.core.errors import SettingsError
@@ -91,10 +91,6 @@ def unsteered(scene: SmallScene) -> Callable[..., list[TrackResult]]:
     return episode
 
 
-def settings_of(tracker) -> Settings:
-    return tracker._steering._built
-
-
 def at_first(tracker, settings: Settings):
     """Steers before the first frame."""
     return lambda number: tracker.configure(settings) if number == 0 else None
@@ -114,7 +110,7 @@ def until_it_shows(unsteered: list[TrackResult], episode: Iterator[TrackResult])
 def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene, unsteered) -> None:
     spec = SYSTEMS[name]
     tracker = construct(spec, scene)
-    settings = settings_of(tracker)
+    settings = settings_for(spec)
     ends = {p.name: p.low if number % 2 else p.high for number, p in enumerate(steerable_parameters(settings))}
     ends |= {"features.fast_threshold": 12, "features.fast_threshold_min": 3}
     extreme = apply_overrides(settings, ends)
@@ -137,7 +133,7 @@ def test_each_setting_acts_when_steered_where_it_acts_when_built_with(name: str,
         if not (static := until_it_shows(unsteered(system, FRAMES, others), play(built, scene))):
             continue
         tracker = construct(SYSTEMS[system], scene, **others)
-        changed = apply_overrides(settings_of(tracker), {name: value})
+        changed = apply_overrides(settings_for(SYSTEMS[system], **others), {name: value})
         steered = play(tracker, scene, len(static), before=at_first(tracker, changed))
         assert not difference(static, steered), f"{system}: {name} = {value:g}"
         return
@@ -147,7 +143,8 @@ def test_each_setting_acts_when_steered_where_it_acts_when_built_with(name: str,
 def test_a_setting_is_in_force_from_the_very_next_frame(scene: SmallScene) -> None:
     """Both ways, in mid-episode: what lies on people is judged by the confidence that was asked for."""
     tracker = construct(SYSTEMS["mask-rcnn"], scene, **{"segmentation.compensate": 0})
-    sure, any_ = (apply_overrides(settings_of(tracker), {"segmentation.confidence": c}) for c in (0.9, 0.1))
+    settings = settings_for(SYSTEMS["mask-rcnn"], **{"segmentation.compensate": 0})
+    sure, any_ = (apply_overrides(settings, {"segmentation.confidence": c}) for c in (0.9, 0.1))
     asked = [any_, any_, sure, any_, sure, sure, any_]
     results = list(play(tracker, scene, len(asked), before=lambda number: tracker.configure(asked[number])))
     always = {id(each): list(play(tracker, scene, len(asked), before=at_first(tracker, each))) for each in (sure, any_)}

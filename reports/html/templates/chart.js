@@ -188,8 +188,19 @@ function marksOf(panel, shown) {
   return group;
 }
 
+/** Optuna's figures hold their numbers as bytes of a type. */
+function decoded(value) {
+  if (Array.isArray(value)) return value.map(decoded);
+  if (!value || typeof value !== "object") return value;
+  if (typeof value.bdata !== "string") return Object.fromEntries(Object.entries(value).map(([name, part]) => [name, decoded(part)]));
+  const bytes = Uint8Array.from(atob(value.bdata), (letter) => letter.charCodeAt(0));
+  const types = { f8: Float64Array, f4: Float32Array, i4: Int32Array, u4: Uint32Array, i2: Int16Array, u2: Uint16Array, i1: Int8Array, u1: Uint8Array };
+  return Array.from(new types[value.dtype](bytes.buffer));
+}
+
 /** Draw a figure into its element, with a legend that shows and hides, and values where the pointer rests. */
-function drawChart(element, figure) {
+function drawChart(element, given) {
+  const figure = decoded(given);
   const layout = figure.layout ?? {}, hidden = new Set(), chart = { figure, panels: [] };
   const keyOf = (trace) => trace.legendgroup ?? trace.name ?? "";
   for (const trace of figure.data) if (trace.visible === "legendonly") hidden.add(keyOf(trace));

@@ -9,12 +9,13 @@ const $ = (id) => document.getElementById(id);
 function cellsOf(data) {
   const cells = new Map();
   for (const [id, t, s, repeat, ending, flags, values, quartiles] of data.runs) {
-    const key = `${t},${s}`, run = { id, repeat, ending, kept: flags & 1, pictured: flags & 2, doubt: flags & 4, values, quartiles };
+    const key = `${t},${s}`, run = { id, repeat, ending, kept: flags & 1, pictured: flags & 2, doubt: flags & 4, seen: flags & 8, values, quartiles };
     if (!cells.has(key)) cells.set(key, { t, s, runs: [] });
     cells.get(key).runs.push(run);
   }
   for (const cell of cells.values()) {
     cell.failed = cell.runs.filter((run) => run.ending).length;
+    cell.seen = cell.runs.some((run) => run.seen);
     cell.medians = data.metrics.map((_, at) => {
       const values = cell.runs.filter((run) => run.kept && run.values[at] !== null).map((run) => run.values[at]);
       return values.length ? median(values) : null;
@@ -87,7 +88,7 @@ class Explore {
     $("explore-count").textContent = `${trackers.length} of ${all.trackers.length} trackers, ${sequences.length} of ${all.sequences.length} sequences`;
     const unit = ratio ? `ratio to ${all.referenceName}` : { m: "millimetres", deg: "degrees" }[metric?.unit ?? "m"];
     const base = metric?.key === "ate_rmse_m" && metric.which === "online" ? "lost frames held, failures counted as not moving or worse" : "over the runs that succeeded";
-    $("explore-caption").textContent = metric ? `${metric.name} of the ${metric.which} trajectory, ${unit}: median over the repeats, ${base}. Bold: best of the ranked trackers shown. A cell leads to the run with the median error, the numbers behind it to the others. ${all.protocol}.` : "No run has this number.";
+    $("explore-caption").textContent = metric ? `${metric.name} of the ${metric.which} trajectory, ${unit}: median over the repeats, ${base}. Bold: best of the ranked trackers shown.${[...this.cells.values()].some((cell) => cell.seen) ? ` ${this.data.seen} masks of a network that was trained on this scene: takes no part in bold and colour.` : ""} A cell leads to the run with the median error, the numbers behind it to the others. ${all.protocol}.` : "No run has this number.";
     drawExploreFigures(this, trackers, sequences);
   }
 
@@ -111,7 +112,7 @@ class Explore {
 
   best(trackers, sequence, metric) {
     const values = trackers.filter((tracker) => tracker.ranked).map((tracker) => this.cells.get(`${tracker.at},${sequence.at}`))
-      .filter((cell) => cell && !cell.failed && metric && !this.doubted(cell, metric)).map((cell) => cell.medians[metric.at]).filter((value) => value !== null);
+      .filter((cell) => cell && !cell.failed && !cell.seen && metric && !this.doubted(cell, metric)).map((cell) => cell.medians[metric.at]).filter((value) => value !== null);
     return values.length > 1 ? Math.min(...values) : null;
   }
 
@@ -133,9 +134,9 @@ class Explore {
     } else {
       const value = cell.medians[metric.at], under = ratio ? this.base(sequence, metric) : 1;
       const shown = value === null || !under ? null : ratio ? value / under : metric.unit === "m" ? 1000 * value : value;
-      td.append(link(chosen, digits(shown) + (this.doubted(cell, metric) ? "‡" : "")));
+      td.append(link(chosen, digits(shown) + (this.doubted(cell, metric) ? "‡" : "") + (cell.seen ? this.data.seen : "")));
       if (shown !== null) td.dataset.v = shown;
-      if (value !== null && value === best.get(sequence.at) && !cell.failed && tracker.ranked && !this.doubted(cell, metric)) td.classList.add("best");
+      if (value !== null && value === best.get(sequence.at) && !cell.failed && !cell.seen && tracker.ranked && !this.doubted(cell, metric)) td.classList.add("best");
       this.shade(td, cell, sequence, metric);
     }
     const others = runs.filter((run) => run !== chosen).slice(0, 9);
@@ -145,7 +146,7 @@ class Explore {
 
   shade(td, cell, sequence, metric) {
     const base = this.base(sequence, metric), value = cell.medians[metric.at];
-    if (!base || value === null || this.doubted(cell, metric)) return;
+    if (!base || value === null || cell.seen || this.doubted(cell, metric)) return;
     let strength = Math.max(-1, Math.min(1, Math.log(Math.max(value / base, 1e-9)) / Math.log(4)));
     if (cell.failed) strength = Math.max(strength, 0);
     td.dataset.shade = "";

@@ -1,0 +1,174 @@
+"""The report in a real browser: nothing is fetched, nothing faults, everything fits, and every switch does what it says."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reports_browser import Browser, needs_browser
+from reports_fake_store import add_run, fill
+
+from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.evaluation.online import OnlineSample
+from dynslam_bench.reports import build_report
+from dynslam_bench.runs.frame_row import FrameRow, write_csv
+from dynslam_bench.runs.snapshots import SnapshotWriter
+
+sys.path.append(str(Path(__file__).parents[1] / "envs"))
+from envs_toys import write_folder
+
+pytestmark = needs_browser
+WIDTHS = (1400, 768, 360)
+
+
+def add_frames(folder, count):
+    """Frames and snapshots as a run would leave them: the error grows with the share of dynamic pixels."""
+    rows, writer, rng = [], SnapshotWriter(folder, count), np.random.default_rng(0)
+    for at in range(count):
+        share = at / count
+        error = OnlineSample(trans_m=0.01, rot_deg=0.1, frame_trans_m=0.001 * (1 + 9 * share), frame_rot_deg=0.1)
+        stats, times = {"keypoints": 50.0, "culled": 20.0}, {"read": 0.001, "total": 0.02, "features": 0.01}
+        outcome = FrameOutcome(at, 1000.01 + at / 30, "ok", np.eye(4), stats, times, error, -0.001)
+        rows.append(FrameRow.of(outcome, 0.5, share))
+        points, kept = rng.uniform(0, 48, (50, 2)).astype(np.float32), np.arange(50) >= 20
+        mask = np.zeros((48, 64), bool)
+        mask[:, : int(64 * share)] = True
+        writer.add(outcome, (48, 64, 3), TrackResult(np.eye(4), "ok", stats, times, mask, points, kept))
+    writer.write()
+    write_csv(folder / "frames.csv", rows)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    """A report with failures, an import, names that are markup, and runs whose frames are known."""
+    root = tmp_path_factory.mktemp("browser")
+    store = fill(root / "results", seeds=(0, 1))
+    place = write_folder(root / "toy", 40)
+    for name, label in (("ours", "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN}"), ("orb-slam2", "ORB-SLAM2 (our back end)")):
+        run_id = add_run(store, name, "toy", n=40, label=label, place=str(place), lost=(20,), tags=("static",))
+        add_frames(store.folder(run_id), 40)
+    add_run(store, "elsewhere", "synthetic/walking_xyz", kind="imported", label="Elsewhere", frame_s=None)
+    return build_report(store, root / "report")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    page = Browser(tmp_path_factory.mktemp("profile"))
+    yield page
+    page.close()
+
+
+def run_of(report, label, sequence):
+    text = (report.html.parent / "data" / "explore.js").read_text()
+    known = json.loads(re.fullmatch(r'keep\("explore",(.*)\);\n', text, re.DOTALL)[1])
+    tracker = next(at for at, each in enumerate(known["trackers"]) if each["label"].startswith(label))
+    column = next(at for at, each in enumerate(known["sequences"]) if each["name"].startswith(sequence))
+    return next(run[0] for run in known["runs"] if run[1:3] == [tracker, column])
+
+
+def see_everything(browser):
+    browser.run(
+        "document.querySelectorAll('main details:not(.toolbar details)').forEach((fold) => { fold.open = true; })"
+    )
+    browser.run("document.querySelectorAll('.figure').forEach(draw)")
+    browser.settle()
+
+
+PAGES = ("report", "run")
+
+
+def open_page(browser, report, page, width):
+    if page == "report":
+        browser.open(report.html, width)
+        browser.until("document.querySelector('#explore-table tbody tr')")
+    else:
+        browser.open(report.run, width, anchor="#" + run_of(report, "Ours", "toy"))
+        browser.until("document.querySelector('.thumb canvas')")
+    see_everything(browser)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report, page):
+    for width in WIDTHS:
+        open_page(browser, report, page, width)
+        assert browser.faults == []
+        folder = report.html.parent.absolute().as_uri()
+        assert browser.fetched and all(url.startswith((folder, "data:")) for url in browser.fetched)
+        assert browser.run("document.documentElement.scrollWidth") == width
+        figures = browser.run(
+            "[...document.querySelectorAll('.chart svg')].map((each) => each.getBoundingClientRect().right)"
+        )
+        assert len(figures) >= 4 and max(figures) <= width
+
+
+def test_the_leaderboard_fits_and_keeps_the_tracker_in_sight(browser, report):
+    browser.open(report.html, 1400)
+    assert browser.run("(({scrollWidth, clientWidth}) => scrollWidth - clientWidth)(leaderboard.parentElement)") <= 0
+    browser.open(report.html, 360)
+    browser.run("leaderboard.parentElement.scrollLeft = 9999")
+    browser.settle()
+    box = browser.run(
+        "(({left, right}) => [left, right])(document.querySelector('#leaderboard tbody .sticky').getBoundingClientRect())"
+    )
+    assert 0 <= box[0] < box[1] <= 200
+
+
+CONTRAST = """(() => {
+  const pen = Object.assign(document.createElement("canvas"), {width: 1, height: 1}).getContext("2d", {willReadFrequently: true});
+  const layers = (element) => { const found = []; for (let at = element; at; at = at.parentElement) found.unshift(getComputedStyle(at)); return found; };
+  const paint = (colours) => { pen.fillStyle = "white"; pen.fillRect(0, 0, 1, 1); for (const each of colours) { pen.fillStyle = each; pen.fillRect(0, 0, 1, 1); } return pen.getImageData(0, 0, 1, 1).data; };
+  const light = (data) => { const [r, g, b] = [...data].map((v) => v / 255).map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const bad = []; let seen = 0;
+  for (const element of document.querySelectorAll("body *")) {
+    const own = [...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
+    if (!own || element.closest("script, style, option, canvas, .tip, :disabled") || !element.getClientRects().length) continue;
+    const styles = layers(element), ground = styles.map((style) => style.backgroundColor), mine = styles.at(-1);
+    const text = element.namespaceURI.endsWith("svg") ? mine.fill : mine.color;
+    const hatched = styles.some((style) => style.backgroundImage !== "none");
+    if (hatched) ground.push(getComputedStyle(document.documentElement).colorScheme.includes("dark") && DARK ? "#3a201b" : "#fbe4df");
+    const [a, b] = [light(paint([...ground, text])), light(paint(ground))].sort((x, y) => y - x);
+    seen += 1;
+    if ((a + 0.05) / (b + 0.05) < 4.5) bad.push([element.tagName, element.className.baseVal ?? element.className, element.textContent.slice(0, 30), ((a + 0.05) / (b + 0.05)).toFixed(2)].join(" | "));
+  }
+  return [seen, [...new Set(bad)]];
+})()"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_everything_that_is_written_can_be_read(browser, report, scheme):
+    browser.prefer(scheme)
+    for page in PAGES:
+        open_page(browser, report, page, 1400)
+        seen, bad = browser.run(CONTRAST.replace("DARK", "true" if scheme == "dark" else "false"))
+        assert seen > 100 and bad == []
+
+
+def test_the_theme_can_be_chosen_and_stays(browser, report):
+    browser.prefer("light")
+    browser.open(report.html)
+    ground = "getComputedStyle(document.body).backgroundColor"
+    light = browser.run(ground)
+    for label in ("Light", "Dark"):
+        browser.run("document.querySelector('.theme').click()")
+        assert label in browser.run("document.querySelector('.theme').textContent")
+    dark = browser.run(ground)
+    assert dark != light
+    browser.open(report.run)
+    assert browser.run(ground) == dark
+    browser.run("document.querySelector('.theme').click()")
+    assert browser.run(ground) == light
+
+
+def test_tables_sort_with_what_is_missing_last(browser, report):
+    browser.open(report.html)
+    ratios = "[...document.querySelectorAll('#leaderboard tbody tr')].map((row) => row.cells[3].dataset.v ?? null)"
+    before = browser.run(ratios)
+    for up in (True, False):
+        browser.run("document.querySelectorAll('#leaderboard thead tr:last-child button')[3].click()")
+        found = browser.run(ratios)
+        numbers = [float(value) for value in found if value is not None]
+        assert numbers == sorted(numbers, reverse=not up) and len(numbers) >= 6
+        assert sorted(map(str, found)) == sorted(map(str, before)) and None not in found[: len(numbers)]

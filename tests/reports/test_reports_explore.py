@@ -1,0 +1,179 @@
+"""The exploring table and the pages of runs in a real browser: filters, switches, the view in the address, the slider."""
+
+from reports_browser import needs_browser
+from test_reports_browser import browser, open_page, report, run_of
+
+__all__ = ["browser", "report"]  # fixtures
+
+pytestmark = needs_browser
+ROWS = "[...document.querySelectorAll('#explore-table tbody tr')].map((row) => row.cells[0].textContent)"
+HEADS = "[...document.querySelectorAll('#explore-table thead th')].map((head) => head.textContent)"
+CELL = "document.querySelector('#explore-table tbody tr td:last-child a').textContent"
+
+
+def explore(browser, report, anchor=""):
+    browser.open(report.html, anchor=anchor)
+    browser.until("document.querySelector('#explore-table tbody tr')")
+
+
+def press(browser, place, text):
+    browser.run(
+        f"[...document.querySelectorAll('#{place} button')].find((each) => each.textContent === '{text}').click()"
+    )
+
+
+def test_search_tags_and_ranked_only(browser, report):
+    explore(browser, report)
+    everybody, columns = browser.run(ROWS), browser.run(HEADS)
+    assert len(everybody) == 7 and len(columns) == 3 + 5
+    browser.run("$('explore-search').value = 'dyna'; $('explore-search').dispatchEvent(new Event('input'))")
+    assert browser.run(ROWS) == ["DynaSLAM N+G (our back end)"]
+    assert "q=dyna" in browser.run("location.hash")
+    browser.run("$('explore-reset').click()")
+    browser.run("$('explore-ranked').click()")
+    ranked = browser.run(ROWS)
+    assert 2 <= len(ranked) < 7 and "constant velocity" not in ranked
+    browser.run("$('explore-reset').click()")
+    press(browser, "explore-tags", "high dynamic")
+    assert [name for name in browser.run(HEADS) if "sitting" in name or "toy" in name] == []
+    assert len(browser.run(HEADS)) == 3 + 2
+
+
+def test_the_view_is_in_the_address(browser, report):
+    explore(browser, report)
+    press(browser, "explore-kind", "RPE")
+    press(browser, "explore-scale", "ratio")
+    browser.run("document.querySelectorAll('#explore-columns input')[1].click()")
+    wanted = browser.run("[location.hash, document.querySelector('#explore-table').innerText]")
+    assert "kind=rpe" in wanted[0] and "scale=ratio" in wanted[0] and "extra=" in wanted[0]
+    explore(browser, report, wanted[0])
+    assert browser.run("document.querySelector('#explore-table').innerText") == wanted[1]
+    assert "ATE ratio" in browser.run(HEADS)
+    browser.run("document.querySelector('nav a[href=\"#s-errors\"]').click()")
+    assert browser.run("location.hash").startswith("#s-errors&") and "kind=rpe" in browser.run("location.hash")
+
+
+def test_numbers_are_those_of_the_table_below(browser, report):
+    explore(browser, report)
+    name = browser.run("document.querySelector('#explore-table tbody tr').cells[0].textContent")
+    shown = browser.run("Object.fromEntries([...document.querySelector('#explore-table tbody tr').cells].slice(3)"
+                        ".map((cell, at) => [document.querySelectorAll('#explore-table thead th')[at + 3].textContent,"
+                        " cell.querySelector('a')?.textContent ?? cell.textContent]))")  # fmt: skip
+    below = browser.run(f"""(() => {{
+      const table = document.querySelector("#per_sequence"), heads = [...table.tHead.rows].at(-1).cells;
+      const row = [...table.tBodies[0].rows].find((each) => each.cells[0].textContent.trim() === {name!r});
+      return Object.fromEntries([...row.cells].slice(1).map((cell, at) => [heads[at + 1].textContent, cell.firstChild.textContent]));
+    }})()""")
+    assert shown == below and len(shown) == 5
+
+
+def test_a_failure_is_hatched_says_how_and_is_never_best(browser, report):
+    explore(browser, report)
+    failed = browser.run(
+        "[...document.querySelectorAll('#explore-table tbody small a')].filter((each) => each.textContent === '✕').map((each) => each.title)"
+    )
+    assert failed == ["seed 1, crashed at 30/120"]
+    best = browser.run(
+        "[...document.querySelectorAll('#explore-table .best')].map((cell) => cell.parentElement.cells[0].textContent)"
+    )
+    assert best and not any("DS-SLAM" in name for name in best)
+
+
+def test_a_cell_leads_to_its_run_and_the_run_to_its_like(browser, report):
+    explore(browser, report)
+    link = browser.run("document.querySelector('#explore-table td a').href")
+    browser.open(report.run, anchor="#" + link.partition("#")[2])
+    browser.until("document.querySelector('.card')")
+    assert "DynaSLAM" in browser.run("document.title") and browser.faults == []
+    browser.run(
+        "(() => { const select = document.querySelectorAll('#run-choice select')[0]; select.selectedIndex = select.options.length - 1; select.dispatchEvent(new Event('change')); })()"
+    )
+    browser.until("!document.title.includes('DynaSLAM')")
+    assert browser.run("document.querySelectorAll('.card').length") >= 4 and browser.faults == []
+
+
+def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
+    open_page(browser, report, "run", 1400)
+    assert browser.run("document.querySelector('h1').textContent") == "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} on toy"
+    for figure in ("over-time", "poses", "spread", "stage-stack"):
+        browser.until(f"document.querySelector('#{figure} svg .line, #{figure} svg .bar')")
+    text = browser.run("document.querySelector('main').innerText")
+    assert "dynslam-bench run ours" in text and "a log" in text and "20 of 50 features culled" in text
+    assert "image that shows people (%)" in browser.run("document.querySelector('#over-time svg').textContent")
+    gaps = browser.run(
+        "document.querySelector('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1"
+    )
+    assert gaps == 2  # the lost frame breaks the line
+
+
+def test_the_slider_moves_image_track_and_cursor(browser, report):
+    open_page(browser, report, "run", 1400)
+    state = "[document.querySelector('#looks .caption').textContent, document.querySelector('#over-time .cursor').getAttribute('d'), document.querySelector('#looks canvas').toDataURL()]"
+    browser.until("document.querySelector('#over-time .cursor')")
+    last = browser.run(state)
+    browser.run(
+        "(() => { const slider = document.querySelector('#looks input[type=range]'); slider.value = 0; slider.dispatchEvent(new Event('input')); })()"
+    )
+    browser.settle()
+    first = browser.run(state)
+    assert "frame 0" in first[0] and "frame 39" in last[0]
+    assert all(a != b for a, b in zip(first, last, strict=True))
+    compare = "document.querySelectorAll('#frames .view')[document.querySelectorAll('#frames .view').length - 1].style.clipPath"
+    browser.run(
+        "(() => { const slider = [...document.querySelectorAll('#frames input[type=range]')].at(-1); slider.value = 80; slider.dispatchEvent(new Event('input')); })()"
+    )
+    assert "80%" in browser.run(compare)
+
+
+def test_error_against_dynamic_pixels_rises_as_it_was_made(browser, report):
+    explore(browser, report)
+    figure = browser.run(
+        "$('explore-share').chart.figure.data.filter((trace) => trace.name.startsWith('Ours')).map((trace) => trace.y)"
+    )
+    assert len(figure) == 1
+    known = [value for value in figure[0] if value is not None]
+    assert len(known) >= 3 and known == sorted(known) and known[-1] > 2 * known[0]
+
+
+def test_a_figure_hides_what_is_clicked_and_tells_what_is_pointed_at(browser, report):
+    browser.open(report.html)
+    browser.run("draw(document.getElementById('speed'))")
+    count = "document.querySelectorAll('#speed svg .point').length"
+    before = browser.run(count)
+    browser.run("document.querySelector('#speed .legend button').click()")
+    assert browser.run(count) == before - 1
+    browser.run("""(() => {
+      const mark = document.querySelector("#speed svg .point").getBoundingClientRect(), chart = document.querySelector("#speed .chart");
+      chart.dispatchEvent(new PointerEvent("pointermove", {clientX: mark.x + mark.width / 2, clientY: mark.y + mark.height / 2}));
+    })()""")
+    assert "real time" in browser.run("document.querySelector('#speed .tip.on').textContent")
+
+
+def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
+    browser.open(report.run, anchor="#" + "0" * 16)
+    browser.until("document.querySelector('main .note')")
+    assert (
+        browser.run("document.querySelector('main .note').textContent") == f"There is no run {'0' * 16} in this report."
+    )
+    victim = report.html.parent / "data" / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
+    kept = victim.read_text()
+    victim.unlink()
+    browser.open(report.run, anchor="#" + victim.stem.removeprefix("run-"))
+    browser.until("document.querySelector('main .note')")
+    victim.write_text(kept)
+    assert "is missing beside this page" in browser.run("document.querySelector('main .note').textContent")
+
+
+def test_print_shows_all(browser, report, tmp_path):
+    open_page(browser, report, "report", 1400)
+    browser.pdf(tmp_path / "report.pdf")
+    data = (tmp_path / "report.pdf").read_bytes()
+    assert data.startswith(b"%PDF") and len(data) > 50_000
+    browser.call("Emulation.setEmulatedMedia", media="print")
+    browser.size(1045)
+    browser.run("preparePrint()")
+    wide = browser.run(
+        "[...document.querySelectorAll('main table')].map((each) => Math.round(each.getBoundingClientRect().right))"
+    )
+    browser.call("Emulation.setEmulatedMedia", media="")
+    assert len(wide) >= 8 and max(wide) <= 1046
