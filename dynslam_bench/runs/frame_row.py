@@ -71,9 +71,7 @@ class FrameRow:
     dynamic_share: float | None = None
 
     @classmethod
-    def of(
-        cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None
-    ) -> FrameRow:
+    def of(cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None) -> FrameRow:
         """The row of a frame that an environment has tracked."""
         error = outcome.error
         pose = None

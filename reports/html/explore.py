@@ -12,7 +12,7 @@ from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
 from ..model.common import representatives
-from ..model.rows import Loaded, LoadedRun
+from ..model.rows import Loaded
 from .explore_data import FrameSums, explore_content
 from .page import render_run_page
 from .pictures import PictureBook

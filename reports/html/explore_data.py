@@ -25,7 +25,7 @@ FEWEST_FRAMES = 5
 
 
 class FrameSums:
-    """What the exploring part shows of frames: quartiles of a run's errors, and errors by the share of dynamic pixels."""
+    """What the exploring part shows of frames: quartiles of a run's errors, and errors by dynamic share."""
 
     def __init__(self) -> None:
         self.quartiles: dict[str, list[float | None]] = {}
@@ -98,7 +98,8 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
         "metrics": metrics,
         "trackers": [_tracker(board, key, at) for at, key in enumerate(keys)],
         "sequences": [
-            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])} for n in names
+            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])}
+            for n in names
         ],
         "still": [significant(board.never_move.get(name), 5) for name in names],
         "runs": runs,
@@ -133,7 +134,10 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     found = [
         ("ate", "ATE", "m", "ate_rmse_m"),
         *(("rpe", f"RPE over {spec.describe()}", "m", f"rpe_{spec.key}_trans_rmse_m") for spec in protocol.rpe),
-        *(("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg") for spec in protocol.rpe),
+        *(
+            ("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg")
+            for spec in protocol.rpe
+        ),
         ("rotation", "absolute rotation", "deg", "ape_rot_rmse_deg"),
     ]
     return [

@@ -93,16 +93,20 @@ def render(
         footer: Last line.
     """
     explores = any(block.kind == "explore" for section in sections for block in section.blocks)
-    return _environment().from_string(_resource("report.html.j2")).render(
-        title=title,
-        protocol=protocol,
-        facts=facts,
-        sections=sections,
-        footer=footer,
-        css=_joined(_STYLES),
-        figures=Markup(to_script(dict(figures))),
-        javascript=_joined(_CHARTS + (_EXPLORE if explores else ())),
-        explores=explores,
+    return (
+        _environment()
+        .from_string(_resource("report.html.j2"))
+        .render(
+            title=title,
+            protocol=protocol,
+            facts=facts,
+            sections=sections,
+            footer=footer,
+            css=_joined(_STYLES),
+            figures=Markup(to_script(dict(figures))),
+            javascript=_joined(_CHARTS + (_EXPLORE if explores else ())),
+            explores=explores,
+        )
     )
 
 

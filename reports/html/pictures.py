@@ -129,9 +129,7 @@ def _open(run: LoadedRun) -> Sequence:
     """
     record = run.record
     start, stop = record.frames or (0, None)
-    sequence = open_frames(
-        record.place or record.sequence.id, None, None, (start + record.offset, stop), record.stride
-    )
+    sequence = open_frames(record.place or record.sequence.id, None, None, (start + record.offset, stop), record.stride)
     if record.sequence.content and part_of(sequence, record.offset).content != record.sequence.content:
         raise DynslamError(f"the content of {record.sequence.id} has changed since the run")
     return sequence

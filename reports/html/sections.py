@@ -126,7 +126,9 @@ def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Proto
         ]
         if tracks:
             small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} trackers")))
-            section.blocks.append(Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks))
+            section.blocks.append(
+                Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks)
+            )
     if section.blocks:
         caption = (
             f"The run with the median error of each tracker, aligned ({protocol.alignment}). Lines are broken where a "
