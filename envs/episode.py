@@ -26,7 +26,8 @@ class FrameOutcome:
         T_world_cam: Tracked pose ``[4, 4]``; None unless the state is ``ok``.
         stats: The tracker's diagnostics.
         timings: Seconds: ``read`` (decoding or rendering), ``total`` (the tracker's step, segmentation included,
-            reading excluded) and the tracker's stages.
+            reading excluded), ``processor`` (processor time of this process in that step, all threads together; what a
+            foreign program or a GPU does is no part of it) and the tracker's stages.
         error: Causal errors against the ground truth; None where there is none.
         reward: What the frame earned.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -39,7 +40,8 @@ class Canvas:
 
     Left: the image the tracker saw, with kept features in green, culled ones in red and the dynamic mask in orange.
     Right: the estimated camera centres (blue), aligned, over the ground truth (grey), both in the first camera's frame,
-    seen from above: x to the right, z (forward) up, with a scale bar. Below: state, counts and errors.
+    with a scale bar, seen along the axis in which the true path spreads least: from above where there is no truth.
+    Below: state, counts, errors, and from `ALIGN_FROM` frames on the ATE of the frames so far.
 
     Args:
         sequence: The sequence of the episode.
@@ -58,9 +60,9 @@ class Canvas:
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
         picture = self.picture(frame, result)
-        plot = self._plan.draw(episode, self._truth)
-        body = np.concatenate([picture, plot], axis=1)
-        return np.concatenate([body, self._strip(result, episode, body.shape[1])], axis=0)
+        path = _beside_truth(episode, self._truth)
+        body = np.concatenate([picture, self._plan.draw(episode, path)], axis=1)
+        return np.concatenate([body, self._strip(result, episode, path.ate_m, body.shape[1])], axis=0)
 
     def picture(self, frame: Frame, result: TrackResult) -> Image:
         """The image alone with its features and mask, uint8 ``[480, W, 3]``, red first."""
@@ -80,7 +82,7 @@ class Canvas:
                     cv2.circle(image, (x, y), 2, colour, -1, cv2.LINE_AA)
         return image
 
-    def _strip(self, result: TrackResult, episode: Episode, width: int) -> Image:
+    def _strip(self, result: TrackResult, episode: Episode, ate_m: float | None, width: int) -> Image:
         strip = np.full((STRIP, width, 3), 235, np.uint8)
         last = episode.outcomes[-1]
         _text(strip, self._title, (10, 24), _INK, 0.5)
@@ -97,6 +99,8 @@ class Canvas:
                 parts.append(f"frame error {1000 * last.error.frame_trans_m:.1f} mm")
         else:
             parts.append("no ground truth here")
+        if ate_m is not None:
+            parts.append(f"ATE so far {1000 * ate_m:.1f} mm")
         _text(strip, "   ".join(parts), (130, 50), _INK, 0.45)
         x = width - 470
         for name, colour in (("kept", KEPT), ("culled", CULLED), ("mask", MASK)):
@@ -110,29 +114,69 @@ class Canvas:
         return strip
 
 
+@dataclass(frozen=True)
+class Plane:
+    """Two axes of the first camera's frame: what is to the right, what is up, and what the view is called."""
+
+    right: int
+    up: int
+    sign: int
+    name: str
+
+    def __call__(self, positions: Array) -> Array:
+        """Coordinates ``[N, 2]`` of positions ``[N, 3]``, to the right and up."""
+        return positions[:, [self.right, self.up]] * (1, self.sign)
+
+
+PLANES = (
+    Plane(0, 2, 1, "from above: x right, z up"),
+    Plane(0, 1, -1, "from behind: x right, y down"),
+    Plane(2, 1, -1, "from the side: z right, y down"),
+)
+
+
+def main_plane(positions: Array) -> Plane:
+    """The plane in which positions ``[N, 3]`` spread most; that from above for fewer than two, and for a tie."""
+    spread = positions.std(axis=0) if len(positions) > 1 else np.zeros(3)
+    return max(PLANES, key=lambda plane: float(np.round(spread[plane.right] + spread[plane.up], 9)))
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Estimated centres ``[N, 3]`` in the truth's frame, the pieces without a gap, and the ATE where it is known."""
+
+    centres: Array
+    pieces: list[slice]
+    ate_m: float | None = None
+
+
 class _Plan:
-    """A square map of the trajectory seen from above."""
+    """A square map of the trajectory."""
 
     def __init__(self, truth: dict[int, Array]) -> None:
-        self._known = np.array([pose[[0, 2], 3] for _, pose in sorted(truth.items())]).reshape(-1, 2)
+        self._truth = {index: pose[:3, 3] for index, pose in sorted(truth.items())}
+        places = np.array(list(self._truth.values())).reshape(-1, 3)
+        self._plane = main_plane(places)
+        self._known = self._plane(places)
 
-    def draw(self, episode: Episode, truth: dict[int, Array]) -> Image:
+    def draw(self, episode: Episode, path: _Path) -> Image:
         plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
-        estimate, runs = _estimate_beside_truth(episode, truth)
+        estimate = self._plane(path.centres)
         to_pixel, metres_a_pixel = self._view(estimate)
         _grid(plot, to_pixel, metres_a_pixel)
         if len(self._known) > 1:
             _polyline(plot, to_pixel(self._known), TRUTH_AHEAD, 1)
         now = episode.outcomes[-1].index
-        seen = np.array([pose[[0, 2], 3] for index, pose in sorted(truth.items()) if index <= now]).reshape(-1, 2)
+        seen = self._known[: sum(index <= now for index in self._truth)]
         if len(seen) > 1:
             _polyline(plot, to_pixel(seen), TRUTH, 2)
-        for run in runs:
-            _polyline(plot, to_pixel(estimate[run]), ESTIMATE, 2)
+        for piece in path.pieces:
+            _polyline(plot, to_pixel(estimate[piece]), ESTIMATE, 2)
         if len(estimate):
             x, y = to_pixel(estimate[-1:])[0].round().astype(int).tolist()
             cv2.circle(plot, (x, y), 5, ESTIMATE, -1, cv2.LINE_AA)
         _scale_bar(plot, metres_a_pixel)
+        _text(plot, self._plane.name, (HEIGHT - 215, HEIGHT - 13), (120, 120, 120), 0.42)
         cv2.rectangle(plot, (0, 0), (HEIGHT - 1, HEIGHT - 1), (200, 200, 200), 1)
         return plot
 
@@ -164,27 +208,29 @@ def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
     return {i: origin @ pose for i, pose in known.items()}
 
 
-def _estimate_beside_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice]]:
-    """Estimated centres (x, z) in the truth's frame, and runs without a gap.
+def _beside_truth(episode: Episode, truth: dict[int, Array]) -> _Path:
+    """The estimate in the truth's frame.
 
     They are joined at the first frame that has both, and aligned by least squares over all frames so far (as for the
     ATE) from `ALIGN_FROM` frames on.
     """
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
-        return np.zeros((0, 2)), []
+        return _Path(np.zeros((0, 3)), [])
     poses = np.array([pose for _, pose in tracked])
     both = [row for row, (index, _) in enumerate(tracked) if index in truth]
     true = np.array([truth[tracked[row][0]] for row in both])
+    ate_m = None
     if len(both) >= ALIGN_FROM:
         placed = align(poses[both], true, "se3").apply(poses)
+        ate_m = float(np.sqrt(np.square(placed[both][:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean()))
     elif both:
         placed = true[0] @ se3.inverse(poses[both[0]]) @ poses
     else:
         placed = se3.inverse(poses[0]) @ poses
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
     bounds = [0, *breaks.tolist(), len(placed)]
-    return placed[:, [0, 2], 3], [slice(a, b) for a, b in pairwise(bounds)]
+    return _Path(placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m)
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:
@@ -220,7 +266,6 @@ def _scale_bar(plot: Image, metres_a_pixel: float) -> None:
         cv2.line(plot, (x, y - 4), (x, y + 4), _INK, 2)
     name = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
     _text(plot, name, (16, y - 10), _INK, 0.45)
-    _text(plot, "from above: x right, z up", (HEIGHT - 190, y + 5), (120, 120, 120), 0.42)
 
 
 def _text(

@@ -18,11 +18,11 @@ from .html.draft import Draft
 from .html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
-from .model.board import DEFAULT_REFERENCE, Board, On, make_board
+from .model.board import Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
-from .model.rows import load_runs, open_stores
+from .model.rows import OnProgress, load_runs, open_stores, unheard
 from .tables.latex import to_latex
-from .tables.table import csv_text, prose, to_csv, to_markdown
+from .tables.table import Table, csv_text, prose, to_csv, to_markdown
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class ReportPaths:
         latex: The main tables as LaTeX.
         csv: The tables as CSV, by name.
         data: All rows, for `compare`.
+        leaderboard: The table that the page begins with.
     """
 
     html: Path
@@ -44,6 +45,7 @@ class ReportPaths:
     latex: Path
     csv: dict[str, Path]
     data: Path
+    leaderboard: Table
 
 
 def build_report(
@@ -51,12 +53,13 @@ def build_report(
     output: Path | str,
     *,
     protocol: Protocol | str = "tum-rgbd/v1",
-    reference: str = DEFAULT_REFERENCE,
+    reference: str | None = None,
     on: On = "common",
     rank_seen: bool = False,
     picture_seconds: float = PICTURE_SECONDS,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
+    on_progress: OnProgress = unheard,
 ) -> ReportPaths:
     """Make one offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it.
 
@@ -66,13 +69,14 @@ def build_report(
         runs: Results folders, or a store.
         output: Folder of the report; files in it that the report does not make are left alone.
         protocol: How to evaluate.
-        reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
-            never moves takes its place.
+        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Where it was not
+            run on every ranked sequence, a camera that never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
 
     Raises:
         ReportError: There are no runs, or their numbers stem from different protocols.
@@ -81,16 +85,21 @@ def build_report(
     protocol = get_protocol(protocol)
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
-    loaded = load_runs(stores, protocol)
+    loaded = load_runs(stores, protocol, on_progress)
     board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
     again = command or _command([store.root for store in stores], output, board)
     draft = Draft()
-    explored = write_explore(board, loaded, protocol, output, title=title, picture_seconds=picture_seconds)
+    explored = write_explore(
+        board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
+        progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
+    )  # fmt: skip
+    on_progress(0, None, "comparing on common frames")
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
     add_paper(draft, board, protocol)
+    on_progress(0, None, "drawing trajectories")
     sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
@@ -103,6 +112,7 @@ def build_report(
         version=dynslam_bench.__version__,
         rows=board.rows,
     )
+    on_progress(0, None, "writing")
     return _write(draft, board, output, data)
 
 
@@ -110,6 +120,7 @@ def _command(roots: Sequence[Path], output: Path, board: Board) -> str:
     """The command that makes the report again."""
     words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
     words += ["--on", board.on] if board.on != "common" else []
+    words += ["--reference", board.asked_reference] if board.asked_reference else []
     return shlex.join(words + ["--rank-seen"] * board.rank_seen)
 
 
@@ -125,6 +136,7 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
         latex=output / "report.tex",
         csv={name: output / "csv" / f"{name}.csv" for name in names},
         data=output / REPORT_FILE,
+        leaderboard=next(table for table in draft.tables if table.id == "leaderboard"),
     )
     page = render(draft.sections, draft.figures, title=data.title, protocol=data.protocol, facts=facts, footer=footer)
     for table in draft.tables:

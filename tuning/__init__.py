@@ -1,8 +1,8 @@
 """Optuna studies over the environments: search space, trials as runs, held-out check, presets.
 
-`read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on held-out sequences,
-`write_page` shows it all; `Study` opens a stored one and gives its trials as a pandas frame. `search_space` and
-`suggest` serve studies of your own.
+`Study` is all of it from Python: run, pilot, screen, finish, and a stored one as a pandas frame. Its steps by
+themselves: `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on
+held-out blocks, `write_page` shows it all. `search_space` and `suggest` serve studies of your own.
 """
 
 from __future__ import annotations
@@ -10,28 +10,38 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .blocks import Block, parse_blocks
     from .emfoa_sampler import EmfoaSampler
+    from .evaluate import Outcome
     from .final_runs import finish
-    from .frame import Study
     from .page import write_page
+    from .presets import read_preset_text
+    from .python_study import Study
     from .space import search_space, suggest
-    from .study import StudyEvent, Tuner, run_study
+    from .starting import pilot_of, run_study, screen_study
+    from .study import StudyEvent, Tuner
     from .study_file import SpaceSpec, StudySpec, read_study
     from .summary import StudySummary
 
 _HOMES = {
+    "blocks": ("Block", "parse_blocks"),
     "emfoa_sampler": ("EmfoaSampler",),
+    "evaluate": ("Outcome",),
     "final_runs": ("finish",),
-    "frame": ("Study",),
     "page": ("write_page",),
+    "presets": ("read_preset_text",),
+    "python_study": ("Study",),
     "space": ("search_space", "suggest"),
-    "study": ("StudyEvent", "Tuner", "run_study"),
+    "starting": ("pilot_of", "run_study", "screen_study"),
+    "study": ("StudyEvent", "Tuner"),
     "study_file": ("SpaceSpec", "StudySpec", "read_study"),
     "summary": ("StudySummary",),
 }
 
 __all__ = [
+    "Block",
     "EmfoaSampler",
+    "Outcome",
     "SpaceSpec",
     "Study",
     "StudyEvent",
@@ -39,8 +49,12 @@ __all__ = [
     "StudySummary",
     "Tuner",
     "finish",
+    "parse_blocks",
+    "pilot_of",
+    "read_preset_text",
     "read_study",
     "run_study",
+    "screen_study",
     "search_space",
     "suggest",
     "write_page",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,20 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
-from dynslam_bench.reports.html.page import Block, Section, render
+from dynslam_bench.reports.html.page import Block as Piece
+from dynslam_bench.reports.html.page import Section, render
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 
+from .blocks import Block, scenes
 from .importance import FEWEST_TRIALS, importances, inert_parameters
 from .preset import preset_text
+from .ratio import Ratio
 from .samplers import is_feasible
 from .study import Tuner
-from .summary import Candidate, Ratio, StudySummary
+from .summary import Candidate, StudySummary
+from .trials import errors_of
 
 _MODEBAR = {"bgcolor": "rgba(0,0,0,0)", "color": "#c4c9d1", "activecolor": "#1f6fb4"}
-_NAMES = {"accuracy": "log ATE ratio to the default (less is better)", "speed": "real-time factor (more is better)"}
 
 
 def write_page(tuner: Tuner, summary: StudySummary) -> Path:
@@ -37,17 +41,19 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec, study = tuner.spec, tuner.study
-    summary = summary.model_copy(update={"split_notes": tuner.split_notes})  # a stored one may be older than the check
+    summary = summary.model_copy(
+        update={"split_notes": list(tuner.design.notes)}
+    )  # a stored one may be older than the check
     summary = summary.model_copy(update={"inert": _inert(tuner), "importances": _importances(tuner)})
     tables = [_candidates(summary), _trials(tuner, summary)]
     figures = _figures(tuner, summary)
-    result = [Block("table", table=tables[0]), *_shown(figures, "ratios")]
+    result = [Piece("table", table=tables[0]), *_shown(figures, "ratios")]
     sections = [
         Section("result", "What the study found", "Result", [summary.verdict], result),
         Section("preset", "The chosen settings", "Settings", [], _preset(tuner, summary)),
         Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
-        Section("trials", "All trials", "Trials", [], [Block("table", table=tables[1])]),
+        Section("trials", "All trials", "Trials", [], [Piece("table", table=tables[1])]),
     ]
     sections[3].blocks += _shown(figures, "importances", "slices")
     for table in tables:
@@ -60,18 +66,22 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         protocol=summary.protocol,
         facts=[
             (str(sum(states.values())), "trials"),
-            (str(states.get("pruned", 0)), "pruned"),
+            (str(states.get("pruned", 0)), "dropped out of the race"),
             (str(states.get("fail", 0)), "failed"),
-            (str(len(spec.tune)), "tune sequences"),
-            (str(len(spec.held_out)), "held-out sequences"),
-            (str(len(spec.seeds) * len(spec.offsets)), "repeats (seeds x start offsets)"),
+            (_size(tuner.design.race), "to tune on"),
+            (_size(tuner.design.confirm), "to choose on"),
+            (_size(tuner.design.held_out), "held out"),
         ],
-        footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
+        footer=f"Sampler {spec.sampler}, race {spec.race}, Optuna {optuna.__version__}. "
         f"Reproduce: {' '.join(study.user_attrs.get('command', []))}",
     )
     path = tuner.folder / "index.html"
     write_atomic(path, html)
     return path
+
+
+def _size(blocks: Sequence[Block]) -> str:
+    return f"{len(blocks)} runs, {len(scenes(blocks))} scenes" if blocks else "none"
 
 
 def _names(tuner: Tuner) -> list[str]:
@@ -86,14 +96,17 @@ def _importances(tuner: Tuner) -> dict[str, float]:
     return importances(tuner.study, _names(tuner))
 
 
-def _preset(tuner: Tuner, summary: StudySummary) -> list[Block]:
+def _preset(tuner: Tuner, summary: StudySummary) -> list[Piece]:
     """The chosen settings; how to use them stands there only if they hold up on the held-out split."""
-    spec, chosen = tuner.spec, summary.candidates[0]
+    spec = tuner.spec
+    if summary.chosen is None:
+        return []
+    chosen = summary.candidates[0]
     text = preset_text({**spec.space.fixed, **chosen.params}, spec.tracker, summary.verdict)
     if not summary.improves:
-        return [Block("code", title="Not recommended: they do not hold up; shown as a record", text=text)]
+        return [Piece("code", title="Not recommended: they do not hold up; shown as a record", text=text)]
     command = f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"
-    return [Block("code", text=text), Block("code", title="Use them", text=command)]
+    return [Piece("code", text=text), Piece("code", title="Use them", text=command)]
 
 
 def _importance_notes(tuner: Tuner, summary: StudySummary) -> list[str]:
@@ -130,7 +143,8 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     study, spec = tuner.study, tuner.spec
     several = len(spec.objectives) > 1
     target: Callable[[FrozenTrial], float] | None = (lambda trial: float(trial.values[0])) if several else None
-    name = _NAMES[spec.objectives[0]]
+    named = [f"log ratio of {each.what} to the default (less is better)" for each in tuner.objectives]
+    name = named[0]
     finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     shared = sorted({key for trial in finished for key in trial.params})
     figures: dict[str, Any] = {}
@@ -141,7 +155,7 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
             ranked = sorted(shared, key=lambda key: -summary.importances.get(key, 0.0))[:5]
             figures["slices"] = plots.plot_slice(study, params=ranked, target=target, target_name=name)
         if several:
-            figures["front"] = plots.plot_pareto_front(study, target_names=[_NAMES[o] for o in spec.objectives])
+            figures["front"] = plots.plot_pareto_front(study, target_names=named)
     drawn = {key: _plain(figure) for key, figure in figures.items()}
     if summary.importances:
         drawn["importances"] = _importance_figure(summary)
@@ -168,7 +182,8 @@ def _plain(figure: Any) -> dict[str, Any]:
 def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
     """Tune against held-out: each candidate's ratio with its interval on both splits."""
     traces = []
-    for split, colour, symbol in (("tune", "#1f6fb4", "circle"), ("held_out", "#d9542b", "square")):
+    drawn = (("confirm", "#1f6fb4", "circle"), ("held_out", "#d9542b", "square"), ("recorded", "#3a8f5c", "diamond"))
+    for split, colour, symbol in drawn:
         points: list[tuple[str, Ratio]] = [
             (f"trial {candidate.trial}", ratio)
             for candidate in summary.candidates
@@ -182,7 +197,7 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
         height=160 + 50 * len(summary.candidates),
         shapes=[guide(x=1.0)],
         margin={"l": 90, "r": 20, "t": 30, "b": 60},
-        xaxis=axis("ATE ratio to the default settings (left is better)"),
+        xaxis=axis("ratio to the default settings (left is better)"),
         yaxis={"autorange": "reversed", "gridcolor": GRID},
     )
     return {"data": traces, "layout": layout}
@@ -198,15 +213,16 @@ def _ratio_trace(name: str, points: list[tuple[str, Ratio]], colour: str, symbol
     return trace | {"marker": {"size": 11, "color": colour, "symbol": symbol}}
 
 
-def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Block]:
+def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Piece]:
     captions = {
-        "ratios": "Geometric-mean ATE ratio in fresh repeats and its 95 % interval over sequences (Student).",
-        "history": "Every finished trial; trial 0 is the default.",
-        "front": "Accuracy against speed.",
+        "ratios": "Ratio to the default settings and its 95 % interval: on the blocks of the choice (confirm), which "
+        "no trial had seen, and, for the choice alone, on the held-out blocks and on recordings.",
+        "history": "Every trial that came to the end of the race, on its own blocks; trial 0 is the default.",
+        "front": "One objective against the other.",
         "importances": "",
         "slices": "The most important settings against the objective.",
     }
-    return [Block("figure", figure=name, caption=captions[name]) for name in names if name in figures]
+    return [Piece("figure", figure=name, caption=captions[name]) for name in names if name in figures]
 
 
 def _warnings(tuner: Tuner) -> list[str]:
@@ -222,18 +238,16 @@ def _warnings(tuner: Tuner) -> list[str]:
 
 def _copies(tuner: Tuner) -> list[str]:
     """What seeds changed: runs of the same trial that differ in the seed only and are equal to the last bit."""
-    if len(tuner.spec.seeds) < 2:
-        return []
-    errors: dict[tuple[Any, ...], list[float]] = {}
+    errors: dict[tuple[int, Block], list[float]] = {}
     for trial in tuner.study.get_trials(deepcopy=False):
-        for sequence, _, _, ate, _, _, *offset in trial.user_attrs.get("instances", []):
-            errors.setdefault((trial.number, sequence, *offset), []).append(ate)
+        for block, ate in errors_of(trial).items():
+            errors.setdefault((trial.number, replace(block, seed=0)), []).append(ate)
     several = [each for each in errors.values() if len(each) > 1]
     if not several or any(len(set(each)) > 1 for each in several):
         return []
     return [
-        f"The {len(tuner.spec.seeds)} seeds changed nothing: all runs that differ in the seed alone are equal, so they "
-        "count as copies and not as repeats. Name start offsets in place of seeds."
+        "The seeds changed nothing: all runs that differ in the seed alone are equal, so they count as copies and not "
+        "as repeats. Name start offsets in place of seeds."
     ]
 
 
@@ -250,32 +264,31 @@ def _candidates(summary: StudySummary) -> Table:
 
     rows = [
         [
-            TableCell(str(candidate.trial), value=float(candidate.trial), emphasis="best" if place == 0 else ""),
-            number(math.exp(candidate.values[0]), ".3f"),
-            ratio(candidate.tune),
-            ratio(candidate.held_out),
-            time(candidate),
-            TableCell(candidate.failed or ("yes" if candidate.feasible else "no")),
+            TableCell(
+                str(each.trial), value=float(each.trial), emphasis="best" if each.trial == summary.chosen else ""
+            ),
+            number(math.exp(each.values[0]), ".3f"),
+            ratio(each.confirm),
+            number(each.bound if math.isfinite(each.bound) else None, ".3f"),
+            ratio(each.held_out),
+            ratio(each.recorded),
+            time(each),
+            TableCell(each.failed or ("yes" if each.feasible else "no")),
         ]
-        for place, candidate in enumerate(summary.candidates)
+        for each in summary.candidates
     ]
     caption = (
-        "ATE ratios to the default settings on the same sequences and repeats, geometric mean, Student's 95 % "
-        "interval over sequences (of the logarithms). The best on the tune split in fresh repeats is chosen; the "
-        f"held-out split only judges. Frame times without the stage cache.{_repeats(summary)}{_apart(summary)}"
+        "Ratios to the default settings on the same blocks: the median of a scene's starts, the mean over scenes "
+        "(trimmed from ten on), and the 95 % interval over scenes. On blocks that no trial had seen the one with the "
+        "smallest upper bound is chosen, where that lies below 1, and else the default; held-out blocks and recordings "
+        f"only judge the choice. Frame times without the stage cache.{_apart(summary)}"
     )
     optimistic = "the trial's own value, optimistic: it was selected for it"
-    columns = [Column("trial"), Column("in the study", meaning=optimistic), *numbers("tune, fresh repeats", "held-out")]
-    columns += [Column("frame ms"), Column("constraints hold", numeric=False)]
-    return Table("candidates", "The best trials, run again", caption, columns, rows)
-
-
-def _repeats(summary: StudySummary) -> str:
-    return (
-        f" Fresh repeats: {summary.repeats}; for a tracker that draws nothing from its seed, the start alone counts."
-        if summary.repeats
-        else ""
-    )
+    one_sided = "one-sided upper bound for the choice; allows for the number of candidates"
+    columns = [Column("trial"), Column("in the race", meaning=optimistic), *numbers("unseen blocks")]
+    columns += [Column("upper bound", meaning=one_sided), *numbers("held-out", "recorded", "frame ms")]
+    columns += [Column("constraints hold", numeric=False)]
+    return Table("candidates", "The best trials, judged again", caption, columns, rows)
 
 
 def _apart(summary: StudySummary) -> str:
@@ -288,8 +301,7 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     objectives = tuner.spec.objectives
     rows = []
     for trial in tuner.study.get_trials(deepcopy=False):
-        values = zip(objectives, trial.values or [None] * len(objectives), strict=True)
-        shown = [math.exp(v) if v is not None and objective == "accuracy" else v for objective, v in values]
+        shown = [None if value is None else math.exp(value) for value in trial.values or [None] * len(objectives)]
         rows.append(
             [
                 number(float(trial.number), ".0f"),
@@ -300,10 +312,10 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
                 *(_value(trial.params.get(name)) for name in names),
             ]
         )
-    headings = {"accuracy": "ATE ratio", "speed": "real-time factor"}
-    columns = [Column("trial"), Column("state", numeric=False), *numbers(*(headings[each] for each in objectives))]
+    headings = [f"ratio of {each.what}" for each in tuner.objectives]
+    columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings)]
     columns += numbers("coverage", "fps", *names)
-    caption = f"Reasons of pruned and failed trials stand behind their state.{_apart(summary)}"
+    caption = f"Reasons of dropped (pruned) and failed trials stand behind their state.{_apart(summary)}"
     return Table("trials", "All trials", caption, columns, rows)
 
 

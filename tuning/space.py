@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, cast
 
 import optuna
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
-from dynslam_bench.core.settings import Parameter, Scalar, Settings, apply_overrides, field_names, flatten, parameters
+from dynslam_bench.core.settings import (
+    Parameter,
+    Scalar,
+    Settings,
+    apply_overrides,
+    field_names,
+    parameters,
+    value_of,
+)
+from dynslam_bench.core.steering import why_unused
 
 from .study_file import SpaceSpec
 
 
-def search_space(settings: type[Settings], spec: SpaceSpec) -> list[Parameter]:
+def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
     """The parameters of a study, those that conditions refer to before those that depend on them.
+
+    What can have no effect is no part of it: conditions that cannot hold, and what nothing reads as the rest is set.
 
     Args:
         settings: The tracker's settings class.
         spec: Which of them are tuned.
+        sequences: What the study runs on, which decides what the source of masks ``auto`` is.
 
     Raises:
-        StudyError: A pattern matches nothing, or nothing is left to tune.
+        StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is left to tune.
         SettingsError: A fixed value is unknown or unfit.
     """
     apply_overrides(settings(), spec.fixed)
@@ -39,11 +51,17 @@ def search_space(settings: type[Settings], spec: SpaceSpec) -> list[Parameter]:
         and not any(fnmatchcase(parameter.name, pattern) for pattern in spec.exclude)
         and parameter.name not in spec.fixed
     ]
-    base = flatten(apply_overrides(settings(), spec.fixed))
+    fixed = _as_run(apply_overrides(settings(), spec.fixed), list(sequences))
     tuned = {parameter.name for parameter in chosen}
-    chosen = [parameter for parameter in chosen if _possible(parameter, base, tuned)]
+    dead = {parameter.name: why for parameter in chosen if (why := _why_dead(parameter, fixed, tuned))}
+    chosen = [parameter for parameter in chosen if parameter.name not in dead]
     if not chosen:
         raise StudyError("the space is empty: all that matches is excluded, fixed, or switched off by a fixed value")
+    for name in spec.include:
+        if name in dead:
+            raise StudyError(
+                f"'{name}' has no effect in this study: {dead[name]}", "leave it out, or fix that otherwise"
+            )
     return sorted(chosen, key=lambda parameter: len(parameter.when) > 0)
 
 
@@ -92,6 +110,20 @@ def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
     return trial.suggest_float(parameter.name, parameter.low, parameter.high, log=log)
 
 
-def _possible(parameter: Parameter, base: Mapping[str, Any], tuned: set[str]) -> bool:
-    """Whether the parameter's conditions can hold at all."""
-    return all(name in tuned or base.get(name) in allowed for name, allowed in parameter.when)
+def _why_dead(parameter: Parameter, settings: Settings, tuned: set[str]) -> str:
+    """Why a parameter can have no effect, whatever the others are tuned to; empty if it can."""
+    if reason := why_unused(settings, parameter.name):
+        return reason
+    for name, allowed in parameter.when:
+        if name not in tuned and (value := value_of(settings, name)) not in allowed:
+            return f"{name} is {value!r}"
+    return ""
+
+
+def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
+    """The settings with the source of masks that ``auto`` stands for on rendered sequences."""
+    segmentation = getattr(settings, "segmentation", None)
+    rendered = bool(sequences) and all(name.startswith("synthetic/") for name in sequences)
+    if rendered and getattr(segmentation, "source", "") == "auto":
+        return apply_overrides(settings, {"segmentation.source": "embedded"})
+    return settings

@@ -1,63 +1,94 @@
-"""Whether a study's tune and held-out splits are what they say: by content, by the catalogue, by the instances."""
+"""Whether a study's blocks are what they say: apart by content, by the catalogue, by the instances."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from itertools import combinations, product
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.part import Part, part_of
 from dynslam_bench.sequences.synthetic import HELD_OUT_INSTANCES, TUNE_INSTANCES
 
+from .blocks import Block
 from .same_recording import is_rendered, same_recording
-from .study_file import StudySpec
 
 OVERRIDE = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
 
+Split = Literal["tune", "confirm", "held_out"]
 
-def check_splits(spec: StudySpec, *, refuse: bool = True) -> list[str]:
-    """Compare the splits of a study.
 
-    Two sequences overlap if they film the same content, however they are called: other frames or another draw of the
-    noise of a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other
-    file names, other stamps or other image files (`same_recording`). A sequence that the catalogue, or its instance,
-    gives to one split must not stand in the other.
+def check_splits(
+    name: str, splits: Mapping[Split, Sequence[Block]], *, data_root: str | None = None, accept: bool = False
+) -> list[str]:
+    """Open every block of a study and compare its splits.
+
+    Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
+    a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
+    names, other stamps or other image files (`same_recording`). `tune` and `confirm` may share a scene, but no frames
+    from the same start. A sequence that the catalogue, or its instance, gives to one split must not stand in the other.
 
     Args:
-        spec: The study.
-        refuse: Whether to raise what the study does not accept; False to look at a study that was run before.
+        name: Of the study.
+        splits: Its blocks: to tune on, to judge the survivors on, and held out.
+        data_root: Folder of the recorded sequences.
+        accept: Whether the study accepts it (`StudySpec.allow_overlap`).
 
     Returns:
-        What is wrong, a line each, if the study accepts it (`StudySpec.allow_overlap`) or nothing is refused.
+        What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, or one split names the same frames twice; names both spellings.
+        StudyError: Something is wrong and not accepted, a split names the same frames twice, or a block is longer than
+            its sequence, too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
-    opened = {name: _open(name, spec) for name in (*spec.tune, *spec.held_out)}
-    parts = {name: part_of(sequence) for name, sequence in opened.items()}
-    for split, names in (("tune", spec.tune), ("held_out", spec.held_out)):
-        for one, other in combinations(names, 2):
-            if replace(parts[one], id="") == replace(parts[other], id=""):
-                raise StudyError(f"{split} names the same frames twice, as '{one}' and as '{other}'", "leave one out")
+    tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
+    tuned = dict.fromkeys(block.sequence for block in tune)
+    judged = dict.fromkeys(block.sequence for block in held_out)
+    whole: dict[str, Any] = {each: open_sequence(each, data_root=data_root) for each in (*tuned, *judged)}
+    for own in (tune, held_out):
+        _check_repeats(own, whole)
+    parts = {name: part_of(found) for name, found in whole.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
-        for one, other in product(spec.tune, spec.held_out)
-        if _overlap(opened[one], parts[one], opened[other], parts[other])
+        for one, other in product(tuned, judged)
+        if _overlap(whole[one], parts[one], whole[other], parts[other])
     ]
-    faults += [_misplaced(name, "tune", "held-out") for name in spec.tune if _split(opened[name]) == "held-out"]
-    faults += [_misplaced(name, "held-out", "tune") for name in spec.held_out if _split(opened[name]) == "tune"]
-    if faults and refuse and not spec.allow_overlap:
+    faults += [_misplaced(each, "tune", "held-out") for each in tuned if _split(whole[each]) == "held-out"]
+    faults += [_misplaced(each, "held-out", "tune") for each in judged if _split(whole[each]) == "tune"]
+    if faults and not accept:
         more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-        raise StudyError(f"the splits of study '{spec.name}' are not apart: {faults[0]}{more}", OVERRIDE)
+        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}{more}", OVERRIDE)
     return faults
 
 
-def _open(name: str, spec: StudySpec) -> Any:
-    return open_sequence(name, data_root=None if spec.data_root is None else Path(spec.data_root))
+def _check_repeats(blocks: Sequence[Block], whole: Mapping[str, Any]) -> None:
+    """Within a split, blocks of one scene are repeats of the same frames or share no frame."""
+    if len(set(blocks)) < len(blocks):
+        twice = next(block for block in blocks if list(blocks).count(block) > 1)
+        raise StudyError(f"block '{twice}' is named twice", "leave one out")
+    by_scene: dict[str, list[tuple[Block, Part]]] = {}
+    for block in blocks:
+        part = part_of(cast("Any", block.cut(whole[block.sequence])), block.offset)
+        by_scene.setdefault(part.scene, []).append((block, part))
+    for same in by_scene.values():
+        for (one, here), (other, there) in combinations(same, 2):
+            if _seen(one, here) == _seen(other, there):
+                raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
+            if (here.start, here.stop) != (there.start, there.stop) and _common(here, there) > 0:
+                raise StudyError(
+                    f"'{one}' and '{other}' share {_common(here, there)} frames", "write blocks of a sequence apart"
+                )
+
+
+def _seen(block: Block, part: Part) -> tuple[object, ...]:
+    own = (block.offset, block.degradation, block.seed, part.noise, part.start, part.stop, part.stride)
+    return (part.content, *own)
+
+
+def _common(one: Part, other: Part) -> int:
+    return min(one.stop, other.stop) - max(one.start, other.start)
 
 
 def _split(sequence: Any) -> str:

@@ -10,6 +10,8 @@ import optuna
 
 from dynslam_bench.core.errors import StudyError
 
+from .database import open_database
+from .journal_file import WholeLines
 from .storage_address import check_scheme, without_password
 from .study_file import StudySpec
 
@@ -33,13 +35,10 @@ def open_storage(results: Path, spec: StudySpec) -> optuna.storages.BaseStorage:
         if not spec.storage:
             folder = study_folder(results, spec)
             folder.mkdir(parents=True, exist_ok=True)
-            from optuna.storages import JournalStorage
-            from optuna.storages.journal import JournalFileBackend
-
-            return JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+            return optuna.storages.JournalStorage(WholeLines(folder / JOURNAL))
         if spec.storage.startswith("grpc://"):
             return _proxy(spec.storage)
-        return optuna.storages.get_storage(spec.storage)
+        return open_database(spec.storage)
     except Exception as error:  # drivers raise whatever they like
         where = spec.storage or str(study_folder(results, spec))
         line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -9,6 +9,7 @@ from typing import Any
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.reading import read_json
 
+from .old_form import NEW, converted, is_old
 from .study_file import StudySpec
 
 
@@ -22,6 +23,9 @@ def as_stored(spec: StudySpec, file: Path) -> StudySpec:
 
 def same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:
     """Whether two identities agree, but for some keys."""
+    if is_old(stored):
+        stored, _ = converted(stored)
+        but = (*but, *NEW)
     return all(_of(stored, key) == _of(now, key) for key in (stored.keys() | now.keys()) - set(but))
 
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
+from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.toml import read_toml
-from dynslam_bench.sequences.catalogue import entry_of
-from dynslam_bench.sequences.synthetic import parse_synthetic_id
+
+from .blocks import Block, parse_blocks
+from .old_form import converted
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
-PrunerName = Literal["none", "median", "hyperband", "wilcoxon"]
-ObjectiveName = Literal["accuracy", "speed"]
+RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
+EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
+"""Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
 
 
@@ -44,24 +47,34 @@ class StudySpec(_Part):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        tune: Sequences that trials run on.
-        held_out: Sequences that decide at the end whether tuning helped; no trial sees them.
+        tune: Blocks that trials run on, written as `blocks.parse_blocks` reads them:
+            ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
+        confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
+            for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
+        held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.
+        recorded: Blocks of recordings that the choice must not be worse on; None for the first frames of a held-out
+            recording where one is present.
         space: Which settings are tuned.
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
             other split; every table of the study then says so.
-        objectives: ``accuracy``: geometric mean over sequences and repeats of the ATE ratio to the default settings
-            (its logarithm is minimised); ``speed``: real-time factor (maximised).
+        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
+            minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
+            the worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost
+            frames.
+        ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
+            ATE ratio must lie below 1 + this.
+        pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
-        seeds: Seeds that every configuration runs with (common random numbers). A seed changes nothing for a tracker
-            that draws nothing from it.
-        offsets: Start offsets that every configuration runs with: so many leading frames are left out.
+        seeds: Seeds of the blocks that name none. A seed changes nothing for a tracker that draws nothing from it.
+        offsets: Start offsets of the blocks that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the default settings) included.
         timeout_s: No trial begins after this many seconds; None for no limit.
-        top: How many of the best configurations are run again with fresh repeats.
+        top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
-        pruner: Who ends hopeless trials early; several objectives are ended early by dominance instead.
+        race: How trials drop out: by sequential ``halving`` over growing sets of blocks, by successive ``rejection``
+            after every block, by ``wilcoxon``'s test against the best one, or ``none``.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
             ``~/.pgpass``): it is in no file that is written.
@@ -74,10 +87,14 @@ class StudySpec(_Part):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     tracker: str = "emfoa-oft"
     tune: tuple[str, ...] = Field(min_length=1)
+    confirm: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
+    recorded: tuple[str, ...] | None = None
     allow_overlap: bool = False
     space: SpaceSpec = SpaceSpec()
-    objectives: tuple[ObjectiveName, ...] = Field(default=("accuracy",), min_length=1)
+    objectives: tuple[str, ...] = Field(default=("accuracy",), min_length=1)
+    ate_margin: float = Field(default=0.05, gt=0, le=1)
+    pilot: bool = True
     min_coverage: float | None = Field(default=0.95, ge=0, le=1)
     min_fps: float | None = Field(default=None, gt=0)
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
@@ -87,7 +104,7 @@ class StudySpec(_Part):
     top: int = Field(default=3, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
-    pruner: PrunerName = "median"
+    race: RaceName = "halving"
     storage: str = ""
     protocol: str = "tum-rgbd/v1"
     cache: bool = True
@@ -96,22 +113,36 @@ class StudySpec(_Part):
 
     @model_validator(mode="after")
     def _splits_are_apart(self) -> StudySpec:
-        for name, values in (("tune", self.tune), ("held_out", self.held_out), ("seeds", self.seeds),
-                             ("offsets", self.offsets), ("objectives", self.objectives)):  # fmt: skip
+        for name in ("tune", "confirm", "held_out", "recorded", "seeds", "offsets", "objectives"):
+            values = getattr(self, name) or ()
             twice = sorted({str(value) for value in values if list(values).count(value) > 1})
             if twice:
                 raise ValueError(f"{name} names '{twice[0]}' twice")
-        held_out = {_identity(name): name for name in reversed(self.held_out)}
-        both = [(name, held_out[_identity(name)]) for name in self.tune if _identity(name) in held_out]
+        judged = {block.scene: text for text in reversed(self.held_out) for block in self.blocks(text)}
+        both = {block.scene: text for text in (*self.tune, *self.confirm) for block in self.blocks(text)
+                if block.scene in judged}  # fmt: skip
         if both and not self.allow_overlap:
-            one, other = both[0]
-            spelled = "" if one == other else f", held out as '{other}'"
+            scene, one = next(iter(both.items()))
+            spelled = "" if one == judged[scene] else f", held out as '{judged[scene]}'"
             raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{one}'{spelled}")
         return self
 
+    def blocks(self, *texts: str) -> list[Block]:
+        """The blocks that texts of this study name.
+
+        Raises:
+            StudyError: One cannot be read.
+        """
+        return [block for text in texts for block in parse_blocks(text, offsets=self.offsets, seeds=self.seeds)]
+
+    @property
+    def at_equal_accuracy(self) -> bool:
+        """Whether a gain counts only at (nearly) the default's accuracy, as it may be paid for with the error."""
+        return len(self.objectives) > 1 or self.objectives[0] not in EQUALLY_ACCURATE
+
     def digest(self) -> str:
         """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
-        free = {"trials", "timeout_s", "top", "storage"}
+        free = {"trials", "timeout_s", "top", "storage", "pilot"}
         return digest(self.model_dump(mode="json", exclude=free))
 
     def for_others(self) -> dict[str, Any]:
@@ -119,20 +150,30 @@ class StudySpec(_Part):
         return self.model_dump(mode="json") | {"storage": without_passwords(self.storage)}
 
 
-def read_study(path: str | Path) -> StudySpec:
+def read_study(path: str | Path, on_note: Callable[[str], None] | None = None) -> StudySpec:
     """Read a study file.
+
+    Args:
+        path: The file.
+        on_note: Told what was converted, if the file has an old form.
 
     Raises:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    values = read_toml(path, kind=StudyError)
-    values.setdefault("name", path.stem)
-    return make_study(values, path)
+    values, notes = converted({"name": path.stem, **read_toml(path, kind=StudyError)})
+    if on_note is not None:
+        for text in notes:
+            on_note(f"{path} has an old form: {text}")
+    return make_spec(values, str(path))
 
 
-def make_study(values: Any, path: Path) -> StudySpec:
-    """Validate what a study's file holds.
+def make_spec(values: Any, where: str) -> StudySpec:
+    """A study from its values.
+
+    Args:
+        values: Fields of `StudySpec`.
+        where: Where they come from, for messages.
 
     Raises:
         StudyError: An unknown key (with a did-you-mean) or an unfit value, in one line.
@@ -141,24 +182,9 @@ def make_study(values: Any, path: Path) -> StudySpec:
         return StudySpec.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
+        field = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             known = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
-            raise StudyError(f"{path}: unknown key '{where}'", did_you_mean(where, known)) from None
+            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, known)) from None
         text = first["msg"].removeprefix("Value error, ")
-        raise StudyError(f"{path}: {where + ': ' if where else ''}{text}") from None
-
-
-def _identity(name: str) -> str:
-    """What a name stands for, as far as the name alone tells (see `splits.check_splits` for the content).
-
-    The frames that are taken of a sequence, and the draw of its noise, make no other sequence.
-    """
-    if name.startswith("synthetic/"):
-        try:
-            parsed = parse_synthetic_id(name)
-        except SequenceError:
-            return name  # refused with a did-you-mean where it is opened
-        return f"{parsed.name}@{parsed.instance}"
-    entry = entry_of(name)
-    return entry.id if entry is not None else str(Path(name).expanduser().resolve())
+        raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None

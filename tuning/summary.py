@@ -6,79 +6,27 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from pydantic import Field
-from scipy import stats
+from pydantic import Field, model_validator
 
 from dynslam_bench.core.records import Record
 
-from .objective import Instance, Outcome, log_ratio
-
-FEWEST_SEQUENCES = 3
-"""With fewer sequences an interval over sequences means nothing."""
-_LARGEST_LOG = 700.0
-"""Larger logarithms overflow."""
-
-
-class Ratio(Record):
-    """A geometric-mean ATE ratio to the default settings, with its 95 % interval.
-
-    Attributes:
-        ratio: Below 1 is better than the default.
-        low: Lower end of Student's interval over sequences (of the logarithms, n - 1 degrees of freedom); None for one
-            sequence. Summaries of older versions hold a bootstrap interval, which was too narrow.
-        high: Upper end; None for one sequence.
-        n: Paired runs.
-        sequences: How many sequences they come from.
-    """
-
-    ratio: float
-    low: float | None
-    high: float | None
-    n: int
-    sequences: int
-
-    @property
-    def shows_gain(self) -> bool:
-        """Whether the whole interval lies below 1, over enough sequences for an interval."""
-        return self.high is not None and self.high < 1 and self.sequences >= FEWEST_SEQUENCES
-
-    @property
-    def shows_loss(self) -> bool:
-        """Whether the whole interval lies above 1, over enough sequences for an interval."""
-        return self.low is not None and self.low > 1 and self.sequences >= FEWEST_SEQUENCES
-
-    @property
-    def verdict(self) -> str:
-        """What may be concluded."""
-        if self.sequences < FEWEST_SEQUENCES:
-            return (
-                f"on {self.sequences} sequence{'s' * (self.sequences > 1)} only, from which nothing follows for others"
-            )
-        if self.shows_gain:
-            return f"better than the default by {100 * (1 - self.ratio):.1f} %"
-        if self.shows_loss:
-            return f"worse than the default by {100 * (self.ratio - 1):.1f} %"
-        return "no difference to the default that these runs could show"
-
-    @property
-    def interval(self) -> str:
-        """The interval in brackets; empty without one."""
-        return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
-
-    def __str__(self) -> str:
-        return f"ATE x {self.ratio:.3f} {self.interval or 'without an interval'}"
+from .ratio import Ratio
+from .statistics import FEWEST_SCENES
 
 
 class Candidate(Record):
-    """One of the best configurations, run again.
+    """One of the best configurations, judged again.
 
     Attributes:
         trial: Its number.
         params: The tuned settings.
         values: What its trial had been worth.
-        tune: On the tune split in fresh repeats.
-        held_out: On the held-out split; None without one.
+        confirm: On the blocks for the choice, which no trial had seen.
+        held_out: On the held-out split; None without one, or if it was not chosen.
+        recorded: ATE on recordings; None without any, or if it was not chosen.
+        on_confirm: ATE and processor time on the blocks for the choice, by objective.
+        on_held_out: The same on the held-out split.
+        ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
         frame_ms: Mean milliseconds a frame, timed without the stage cache.
         default_frame_ms: The same of the default settings.
         feasible: Whether the constraints hold in the new runs.
@@ -88,12 +36,48 @@ class Candidate(Record):
     trial: int
     params: dict[str, Any]
     values: list[float]
-    tune: Ratio | None = None
+    confirm: Ratio | None = None
     held_out: Ratio | None = None
+    recorded: Ratio | None = None
+    on_confirm: dict[str, Ratio] = Field(default_factory=dict)
+    on_held_out: dict[str, Ratio] = Field(default_factory=dict)
+    ate_margin: float | None = None
     frame_ms: float | None = None
     default_frame_ms: float | None = None
     feasible: bool = True
     failed: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_an_older_version(cls, values: Any) -> Any:
+        """What is ``confirm`` now were fresh repeats on the tune split."""
+        if isinstance(values, dict) and "tune" in values:
+            return {**{key: value for key, value in values.items() if key != "tune"}, "confirm": values["tune"]}
+        return values
+
+    @property
+    def bound(self) -> float:
+        """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
+        known = self.feasible and self.confirm is not None and self.confirm.bound is not None
+        if not self.nothing_lost(self.on_confirm):
+            return math.inf
+        return self.confirm.bound if known and self.confirm is not None and self.confirm.bound is not None else math.inf
+
+    def nothing_lost(self, ratios: Mapping[str, Ratio]) -> bool:
+        """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the default, if that is asked."""
+        bound = ratios["accuracy"].bound if "accuracy" in ratios else None
+        return self.ate_margin is None or (bound is not None and bound < 1 + self.ate_margin)
+
+    @property
+    def worse_on_recordings(self) -> bool:
+        """Whether the whole interval on the recordings, over starts if need be, lies above 1."""
+        return self.recorded is not None and self.recorded.low is not None and self.recorded.low > 1
+
+    @property
+    def holds_up(self) -> bool:
+        """Whether it beats the default on the held-out split and is not worse on recordings."""
+        gain = self.held_out is not None and self.held_out.shows_gain
+        return self.feasible and gain and self.nothing_lost(self.on_held_out) and not self.worse_on_recordings
 
 
 class StudySummary(Record):
@@ -104,16 +88,18 @@ class StudySummary(Record):
         tracker: The tracker.
         protocol: Description of the protocol.
         trials: Trials by state.
-        candidates: The best configurations, run again; the chosen one first.
-        chosen: Number of the trial whose settings became the preset.
-        improves: Whether the chosen settings beat the default on the held-out split: the whole interval below 1, and
-            the splits are apart.
+        candidates: The best configurations, judged again; the chosen one first.
+        chosen: Number of the trial whose settings became the preset; None if the default was chosen.
+        improves: Whether the chosen settings beat the default on the held-out split (the whole interval below 1), are
+            not worse on recordings, and the splits are apart.
         conclusion: One sentence, see `conclude`.
         importances: Shares of the parameters that matter more than chance, see `importance`.
         inert: Parameters that changed nothing, or never took part.
-        held_out: The held-out sequences.
-        tune: The tune sequences.
-        repeats: What the fresh repeats were, in words.
+        tune: The blocks that trials ran on.
+        confirm: Those of the choice.
+        held_out: Those that judged it.
+        recorded: Recordings that it was checked on.
+        picks: Presets of the study by name, and the trial of each; None where the default is the pick.
         split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
     """
 
@@ -122,70 +108,126 @@ class StudySummary(Record):
     protocol: str
     trials: dict[str, int]
     candidates: list[Candidate]
-    chosen: int
+    chosen: int | None
     improves: bool
     conclusion: str
     importances: dict[str, float] = Field(default_factory=dict)
     inert: list[str] = Field(default_factory=list)
-    held_out: list[str] = Field(default_factory=list)
     tune: list[str] = Field(default_factory=list)
-    repeats: str = ""
+    confirm: list[str] = Field(default_factory=list)
+    held_out: list[str] = Field(default_factory=list)
+    recorded: list[str] = Field(default_factory=list)
+    picks: dict[str, int | None] = Field(default_factory=dict)
     split_notes: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_an_older_version(cls, values: Any) -> Any:
+        """The repeats are told by the blocks now."""
+        return {key: value for key, value in values.items() if key != "repeats"} if isinstance(values, dict) else values
 
     @property
     def verdict(self) -> str:
         """One sentence: better or not on the held-out split, by how much, how sure, and whether to keep the default."""
-        return conclude(self.candidates[0], self.split_notes)
+        return conclude(self.candidates, self.chosen, self.split_notes)
 
 
-def paired_ratio(
-    outcomes: Mapping[Instance, Outcome], default: Mapping[Instance, Outcome], instances: Sequence[Instance]
-) -> Ratio:
-    """Geometric-mean ATE ratio over paired runs, with Student's 95 % interval over sequences.
-
-    The sample are the sequences: the repeats of one give its mean logarithm, and are no further evidence about others.
-    """
-    by_sequence: dict[str, list[float]] = {}
-    for instance in instances:
-        ratio = log_ratio(outcomes[instance].ate_m, default[instance].ate_m)
-        by_sequence.setdefault(instance.sequence, []).append(ratio)
-    means = np.array([np.mean(values) for values in by_sequence.values()])
-    centre, count = float(means.mean()), len(means)
-    low = high = None
-    if count > 1:
-        half = float(stats.t.ppf(0.975, count - 1) * means.std(ddof=1) / math.sqrt(count))
-        low, high = math.exp(centre - half), math.exp(min(centre + half, _LARGEST_LOG))
-    return Ratio(ratio=math.exp(centre), low=low, high=high, n=len(instances), sequences=count)
+def choose(candidates: Sequence[Candidate]) -> Candidate | None:
+    """The candidate with the smallest upper bound of its ratio; None, the default, where no bound lies below 1."""
+    best = min(candidates, key=lambda candidate: candidate.bound, default=None)
+    return best if best is not None and best.bound < 1 else None
 
 
-def conclude(chosen: Candidate, split_notes: Sequence[str]) -> str:
+def conclude(candidates: Sequence[Candidate], chosen: int | None, split_notes: Sequence[str]) -> str:
     """One sentence: better or not on the held-out split, by how much, how sure, and whether to keep the default."""
-    text = _conclude(chosen, bool(split_notes))
+    taken = next((candidate for candidate in candidates if candidate.trial == chosen), None)
+    text = _nothing_chosen(candidates) if taken is None else _conclude(taken, bool(split_notes))
     return text + (f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else "")
+
+
+def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
+    """Why the default was chosen."""
+    judged = [each for each in candidates if each.confirm is not None]
+    feasible = [each for each in judged if each.feasible]
+    if not candidates:
+        return "Keep the default: no trial with other settings came to its end."
+    if not judged:
+        return f"Keep the default: trial {candidates[0].trial} failed when run again: {candidates[0].failed}."
+    if not feasible:
+        return f"Keep the default: trial {judged[0].trial} violates a constraint when run again, as do all that were."
+    unsure = [each for each in feasible if not each.nothing_lost(each.on_confirm)]
+    if len(unsure) == len(feasible):
+        return _not_as_accurate(unsure)
+    best = min(feasible, key=lambda each: each.bound)
+    assert best.confirm is not None
+    many = f"none of the {len(judged)} best trials holds" if len(judged) > 1 else "the best trial does not hold"
+    bound = "none" if best.confirm.bound is None else f"{best.confirm.bound:.3f}"
+    return (
+        f"Keep the default: {many} up on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
+        f"{best.confirm}, upper bound {bound})."
+    )
+
+
+def _not_as_accurate(candidates: Sequence[Candidate]) -> str:
+    """That no candidate could be shown to be as accurate as the default."""
+    best = min(candidates, key=lambda each: each.on_confirm["accuracy"].bound or math.inf)
+    ate, margin = best.on_confirm["accuracy"], best.ate_margin or 0.0
+    bound = "none" if ate.bound is None else f"{ate.bound:.3f}"
+    return (
+        f"Keep the default: no trial could be shown to be as accurate on {ate.n} runs that none had seen (trial "
+        f"{best.trial}: {best.confirm}, but {ate}, upper bound {bound}, asked for: below {1 + margin:.2f})."
+    )
 
 
 def _conclude(chosen: Candidate, overlapping: bool) -> str:
     if chosen.failed:
-        return f"Keep the default: trial {chosen.trial} was best, but failed when run again: {chosen.failed}."
-    if not chosen.feasible:
-        return f"Keep the default: trial {chosen.trial} was best, but violates a constraint when run again."
-    held, tune = chosen.held_out, chosen.tune
-    if held is None or tune is None:
+        return f"Keep the default: trial {chosen.trial} was chosen, but failed when it was judged: {chosen.failed}."
+    held, again = chosen.held_out, chosen.confirm
+    if held is None:
         return (
             f"Not judged, keep the default: no held-out split was given, and what trial {chosen.trial} reaches on the "
-            f"sequences that it was chosen on ({tune}) says nothing about others."
+            f"blocks that it was chosen on ({again}) says nothing about others."
         )
-    on = f"on {held.sequences} held-out sequence{'s' * (held.sequences != 1)}"
-    if held.sequences < FEWEST_SEQUENCES:
-        return f"Not judged, keep the default: {held} {on} only, from which nothing follows for others (tune: {tune})."
-    sure = "95 % interval over sequences" + (", rough below five" if held.sequences < 5 else "")
+    on = f"on {held.sequences} held-out scene{'s' * (held.sequences != 1)}"
+    chosen_on = f"where it was chosen: {again}"
+    if held.sequences < FEWEST_SCENES:
+        return f"Not judged, keep the default: {held} {on} only, from which nothing follows for others ({chosen_on})."
+    sure = "95 % interval over scenes" + (", rough below five" if held.sequences < 5 else "")
+    checked = "" if chosen.recorded is None else f"; recorded: {chosen.recorded}"
+    if chosen.worse_on_recordings:
+        return f"Worse on recordings, keep the default: {chosen.recorded} there ({on}: {held}, {sure})."
+    if chosen.ate_margin is not None:
+        checked = f"; {chosen.on_held_out['accuracy']}{checked}" if "accuracy" in chosen.on_held_out else checked
+    if not chosen.nothing_lost(chosen.on_held_out):
+        asked = f"not shown to be as accurate, which asks for an upper bound below {1 + (chosen.ate_margin or 0):.2f}"
+        return f"Not better, keep the default: {held} {on}, but {asked} ({chosen_on}{checked})."
     if held.shows_gain and not overlapping:
         return (
-            f"Better: trial {chosen.trial} has {100 * (1 - held.ratio):.1f} % less error {on} ({held}, {sure}; tune: "
-            f"{tune}), so its settings may replace the default there."
+            f"Better: trial {chosen.trial} has {100 * (1 - held.ratio):.1f} % less {held.what} {on} ({held}, {sure}; "
+            f"{chosen_on}{checked}), so its settings may replace the default there."
         )
     if held.shows_loss:
-        return (
-            f"Worse, keep the default: {100 * (held.ratio - 1):.1f} % more error {on} ({held}, {sure}; tune: {tune})."
-        )
-    return f"Not better, keep the default: {held} {on} shows no gain ({sure}; tune: {tune})."
+        more = f"{100 * (held.ratio - 1):.1f} % more {held.what}"
+        return f"Worse, keep the default: {more} {on} ({held}, {sure}; {chosen_on})."
+    return f"Not better, keep the default: {held} {on} shows no gain ({sure}; {chosen_on}{checked})."
+
+
+def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) -> str:
+    """What a preset is worth, in one sentence.
+
+    Args:
+        name: Of the preset.
+        candidate: Whose settings it holds, judged; None for the default's.
+        split_notes: How the splits are not apart, where the study accepts that.
+    """
+    if candidate is None:
+        return f"The '{name}' pick is the default: no trial was surely better than it."
+    judged = [f"{split}: {ratios['accuracy']}, {ratios['speed']}" for split, ratios in (
+        ("where it was chosen", candidate.on_confirm), ("held out", candidate.on_held_out),
+    ) if ratios]  # fmt: skip
+    if candidate.recorded is not None:
+        judged.append(f"recorded: {candidate.recorded}")
+    if candidate.failed:
+        judged.append(f"failed when it was judged: {candidate.failed}")
+    apart = f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else ""
+    return f"The '{name}' pick is trial {candidate.trial} ({'; '.join(judged)}).{apart}"

@@ -11,6 +11,7 @@ import typer
 from dynslam_bench import __version__
 from dynslam_bench.core.download_progress import show_downloads
 from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.harmless import printable
 
 from . import (
     caches,
@@ -25,8 +26,11 @@ from . import (
     studies,
     trackers,
 )
+from .ending import leave_interrupted
 from .output import drawn_download, for_scripts
+from .panels import CARE, MEASURE, REPORT, START
 
+INTERRUPT_CODE = 130
 app = typer.Typer(
     name="dynslam-bench",
     help="Benchmark and tune visual SLAM in dynamic scenes.",
@@ -36,16 +40,16 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 presentation.add_demo(app)
-app.add_typer(sequences.app, name="sequences")
-app.add_typer(trackers.app, name="trackers")
+app.add_typer(sequences.app, name="sequences", rich_help_panel=START)
+app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
 running.add(app)
-app.add_typer(stored.app, name="runs")
+app.add_typer(stored.app, name="runs", rich_help_panel=MEASURE)
 evaluating.add(app)
-app.add_typer(studies.app, name="tune")
+app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 presentation.add_report(app)
 imports.add(app)
-app.add_typer(segmenters.app, name="segmenter")
-app.add_typer(caches.app, name="cache")
+app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
+app.add_typer(caches.app, name="cache", rich_help_panel=CARE)
 environments.add(app)
 
 
@@ -66,9 +70,6 @@ def _root(
     show_downloads(drawn_download)
 
 
-_INTERRUPTED = "interrupted; what is finished is stored, the same command goes on from there"
-
-
 def start(arguments: list[str] | None = None) -> None:
     """Run the program and exit.
 
@@ -84,12 +85,9 @@ def start(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader went away, e.g. `| head`
         sys.exit(0)
-    except KeyboardInterrupt:
-        _say(_INTERRUPTED)
-        sys.exit(130)
     except SystemExit as ended:  # typer turns an interrupt within a command into this
-        if ended.code == 130:
-            _say(_INTERRUPTED)
+        if ended.code == INTERRUPT_CODE:
+            leave_interrupted()
         raise
     finally:
         for_scripts(False)
@@ -115,5 +113,5 @@ def expand_lists(arguments: list[str]) -> list[str]:
 
 
 def _say(text: str) -> None:
-    line = " ".join(text.split())
+    line = printable(" ".join(text.split()))
     sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")

@@ -6,11 +6,12 @@ import typer
 
 from .options import AsJson
 from .output import write, write_json
+from .panels import START
 
 
 def add(app: typer.Typer) -> None:
     """Add the verb."""
-    app.command()(envs)
+    app.command(rich_help_panel=START)(envs)
 
 
 def envs(as_json: AsJson = False) -> None:

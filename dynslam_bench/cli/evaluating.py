@@ -10,6 +10,7 @@ import typer
 
 from .options import AsJson, ProtocolId
 from .output import write, write_json, write_table
+from .panels import MEASURE
 
 protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
 Estimate = Annotated[Path, typer.Argument(help="Trajectory file in TUM format.")]
@@ -18,8 +19,8 @@ GroundTruth = Annotated[Path, typer.Argument(help="Ground-truth file in TUM form
 
 def add(app: typer.Typer) -> None:
     """Add the verbs."""
-    app.command("eval")(evaluate)
-    app.add_typer(protocols, name="protocols")
+    app.command("eval", rich_help_panel=MEASURE)(evaluate)
+    app.add_typer(protocols, name="protocols", rich_help_panel=MEASURE)
 
 
 def evaluate(

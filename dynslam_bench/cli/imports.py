@@ -8,12 +8,13 @@ from typing import Annotated
 import typer
 
 from .options import AsJson, Camera, DataRoot, Frames, ProtocolId, Results, Stride
+from .panels import MEASURE
 from .run_rows import show_runs
 
 
 def add(app: typer.Typer) -> None:
     """Add the verb."""
-    app.command("import")(import_)
+    app.command("import", rich_help_panel=MEASURE)(import_)
 
 
 def import_(

@@ -7,79 +7,149 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from . import completion
 from .output import for_scripts
+
+FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
+MACHINE, OUTPUT = "The machine, and how much of it", "What is kept and shown"
+"""Headings of the options' help."""
 
 DataRoot = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
-    typer.Option("--data-root", help="Folder of the sequences; default DYNSLAM_BENCH_DATA, else the user's cache."),
+    typer.Option(
+        "--data-root",
+        help="Folder of the sequences; default DYNSLAM_BENCH_DATA, else the user's cache.",
+        rich_help_panel=FRAMES,
+    ),
 ]
-Results = Annotated[Path, typer.Option("--results", help="Results folder.")]
-AsJson = Annotated[bool, typer.Option("--json", callback=for_scripts, help="Write JSON for scripts, and nothing else.")]
+Results = Annotated[Path, typer.Option("--results", help="Results folder.", rich_help_panel=OUTPUT)]
+AsJson = Annotated[
+    bool,
+    typer.Option(
+        "--json", callback=for_scripts, help="Write JSON for scripts, and nothing else.", rich_help_panel=OUTPUT
+    ),
+]
 Camera = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml."),
+    typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml.", rich_help_panel=FRAMES),
 ]
 Frames = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--frames", metavar="A:B", help="Part of the sequence: from frame A up to, not including, B."),
+    typer.Option(
+        "--frames",
+        metavar="A:B",
+        help="Part of the sequence: from frame A up to, not including, B.",
+        rich_help_panel=FRAMES,
+    ),
 ]
-Stride = Annotated[int, typer.Option("--stride", min=1, help="Take every so many frames.")]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda:N.")]
-Threads = Annotated[int, typer.Option("--threads", min=1, help="Threads of a run.")]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs at a time.")]
+Stride = Annotated[int, typer.Option("--stride", min=1, help="Take every so many frames.", rich_help_panel=FRAMES)]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda:N.", rich_help_panel=MACHINE)]
+Threads = Annotated[int, typer.Option("--threads", min=1, help="Threads of a run.", rich_help_panel=MACHINE)]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs at a time.", rich_help_panel=MACHINE)]
 Seeds = Annotated[
     Optional[list[int]],  # noqa: UP045
-    typer.Option("--seed", help="Seeds, several allowed: --seed 0 1 2."),
+    typer.Option("--seed", min=0, help="Seeds, several allowed: --seed 0 1 2.", rich_help_panel=FRAMES),
 ]
 Offsets = Annotated[
     Optional[list[int]],  # noqa: UP045
     typer.Option(
-        "--offset", min=0, help="Start so many frames later, a repeat on the same frames; several: --offset 0 1 2."
+        "--offset",
+        min=0,
+        help="Start so many frames later, a repeat on the same frames; several: --offset 0 1 2.",
+        rich_help_panel=FRAMES,
     ),
 ]
 Assignments = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--set", metavar="NAME=VALUE", help="Set a setting, e.g. epipolar.threshold_px=1.5; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Set a setting, e.g. epipolar.threshold_px=1.5; repeatable.",
+        rich_help_panel=SETTINGS,
+        autocompletion=completion.settings,
+    ),
 ]
 SettingsFile = Annotated[
     Optional[Path],  # noqa: UP045
-    typer.Option("--settings", help="TOML file of settings, e.g. a preset that `tune best` wrote."),
+    typer.Option(
+        "--settings", help="TOML file of settings, e.g. a preset that `tune best` wrote.", rich_help_panel=SETTINGS
+    ),
 ]
-ProtocolId = Annotated[str, typer.Option("--protocol", help="How to evaluate; see `protocols list`.")]
+ProtocolId = Annotated[
+    str,
+    typer.Option(
+        "--protocol",
+        help="How to evaluate; see `protocols list`.",
+        rich_help_panel=OUTPUT,
+        autocompletion=completion.protocols,
+    ),
+]
 Retry = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--retry", help="Run again what ended so: failed, or a status."),
+    typer.Option(
+        "--retry",
+        help="Run again what ended so: failed, or a status.",
+        rich_help_panel=OUTPUT,
+        autocompletion=completion.statuses,
+    ),
 ]
-Preset = Annotated[Optional[str], typer.Option("--preset", help="A preset of the tracker.")]  # noqa: UP045
-Realtime = Annotated[bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.")]
-Drop = Annotated[float, typer.Option("--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.")]
+Preset = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        "--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=completion.presets
+    ),
+]
+Realtime = Annotated[
+    bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=FRAMES)
+]
+Drop = Annotated[
+    float,
+    typer.Option("--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.", rich_help_panel=FRAMES),
+]
 Degrade = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
         "--degrade",
         metavar="KIND=STRENGTH",
         help="Spoil the images: lighting, glare, shadow, blur, noise; repeatable.",
+        rich_help_panel=FRAMES,
     ),
 ]
-Cache = Annotated[bool, typer.Option("--cache", help="Take features and masks from the stage cache.")]
-Video = Annotated[bool, typer.Option("--video", help="Write video.mp4 beside the run.")]
-Sheet = Annotated[
-    bool, typer.Option("--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.")
+Cache = Annotated[
+    bool, typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=MACHINE)
 ]
-Label = Annotated[str, typer.Option("--label", help="Name in tables, in place of the tracker's.")]
+Video = Annotated[bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=OUTPUT)]
+Sheet = Annotated[
+    bool,
+    typer.Option(
+        "--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.", rich_help_panel=OUTPUT
+    ),
+]
+Label = Annotated[
+    str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=SETTINGS)
+]
 Trackers = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--tracker", help="Only this tracker, or another one; repeatable."),
+    typer.Option(
+        "--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=completion.trackers
+    ),
 ]
 Scheduler = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
-        "--scheduler", metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs."
+        "--scheduler",
+        metavar="ADDRESS",
+        help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs.",
+        rich_help_panel=MACHINE,
     ),
 ]
 TimeLimit = Annotated[
     Optional[float],  # noqa: UP045
-    typer.Option("--time-limit", help="Seconds that a run may take; default is no limit on the whole run."),
+    typer.Option(
+        "--time-limit",
+        help="Seconds that a run may take; default is no limit on the whole run.",
+        rich_help_panel=MACHINE,
+    ),
 ]
 MemoryLimit = Annotated[
     Optional[float],  # noqa: UP045
@@ -87,6 +157,7 @@ MemoryLimit = Annotated[
         "--memory-limit",
         min=0,
         help="MB that a run may take; default is 80 % of the machine's memory, shared by --jobs; 0 is no limit.",
+        rich_help_panel=MACHINE,
     ),
 ]
 

@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dynslam_bench.core.download_progress import Report
+from dynslam_bench.core.harmless import printable
+
+if TYPE_CHECKING:
+    from dynslam_bench.reports.tables.table import Table
 
 SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
@@ -29,8 +34,11 @@ def for_scripts(asked: bool) -> bool:
 
 
 def write(text: str = "", *, now: bool = False) -> None:
-    """Write a line to standard output; `now` also where nobody watches, ahead of what follows."""
-    sys.stdout.write(text + "\n")
+    """Write a line to standard output; `now` also where nobody watches, ahead of what follows.
+
+    What it names may come from anywhere: a terminal is never handed what it would act upon.
+    """
+    sys.stdout.write(printable(text) + "\n")
     if now:
         sys.stdout.flush()
 
@@ -38,7 +46,12 @@ def write(text: str = "", *, now: bool = False) -> None:
 def note(text: str) -> None:
     """Write a line for people to standard error, only if they watch and nobody asked for JSON."""
     if sys.stderr.isatty() and not _for_scripts:
-        sys.stderr.write(text + "\n")
+        complain(text)
+
+
+def complain(text: str) -> None:
+    """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
+    sys.stderr.write(printable(text) + "\n")
 
 
 def write_json(value: Any) -> None:
@@ -46,37 +59,91 @@ def write_json(value: Any) -> None:
     sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
 
 
-def write_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, shrink: Sequence[str] = ()) -> None:
-    """Write a table as aligned text; nothing is cut off, whatever the terminal's width.
+def write_table(
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    *,
+    shrink: Sequence[str] = (),
+    spare: Sequence[str] = (),
+) -> None:
+    """Write a table as aligned text, on a terminal no wider than that; where the output is none, it is whole.
 
     Args:
         columns: Headings.
         rows: Cells.
-        shrink: Columns of long text that may be shortened, the first one first, to fit a terminal; where the output
-            is none, they are whole.
+        shrink: Columns that are shortened first to fit a terminal, one after the other; then all others.
+        spare: Columns that are left out then if it is still too wide, the first one first; a line below names them.
     """
     cells = [list(columns), *([_text(value) for value in row] for row in rows)]
+    left_out: list[str] = []
     if sys.stdout.isatty():
-        cells = fitted(cells, [columns.index(name) for name in shrink if name in columns], _terminal_width())
+        cells, left_out = fitted(cells, shrink, spare, _terminal_width())
     head, *body = aligned(cells).split("\n")
-    write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
+    sys.stdout.write(f"\033[1m{head}\033[0m\n" if sys.stdout.isatty() else f"{head}\n")
     for line in body:
         write(line)
+    if left_out:
+        write(f"(no room for: {', '.join(left_out)})")
 
 
-def fitted(rows: list[list[str]], columns: Sequence[int], width: int, least: int = 12) -> list[list[str]]:
-    """Rows with the named columns shortened, one after the other, until a line has at most `width` characters."""
-    rows = [list(row) for row in rows]
-    for column in columns:
-        widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
-        over = sum(widths) + 2 * (len(widths) - 1) - width
-        if over <= 0:
+_LEAST = 8
+"""Characters that a shortened column keeps."""
+
+
+def fitted(
+    rows: Sequence[Sequence[str]], shrink: Sequence[str], spare: Sequence[str], width: int
+) -> tuple[list[list[str]], list[str]]:
+    """A table made to fit: columns shortened, then left out, until a line has at most `width` characters.
+
+    Args:
+        rows: Cells, the headings first.
+        shrink: As in `write_table`.
+        spare: As in `write_table`; the last columns follow where that is not enough, but the first one always stays.
+        width: Characters of a line.
+
+    Returns:
+        The table, and the headings of the columns that are left out.
+    """
+    table = [list(row) for row in rows]
+    droppable = [*(name for name in spare if name in table[0]), *(n for n in table[0][:0:-1] if n not in spare)]
+    left_out: list[str] = []
+    while True:
+        first = [table[0].index(name) for name in shrink if name in table[0]]
+        widths = _shrunk([max(map(len, cells)) for cells in zip(*table, strict=True)], first, width)
+        if _total(widths) <= width or not droppable:
             break
-        room = max(widths[column] - over, least)
-        for row in rows:
-            if len(row[column]) > room:
-                row[column] = row[column][: room - 1] + "…"
-    return rows
+        left_out.append(droppable.pop(0))
+        at = table[0].index(left_out[-1])
+        table = [row[:at] + row[at + 1 :] for row in table]
+    return [[_cut(cell, room) for cell, room in zip(row, widths, strict=True)] for row in table], left_out
+
+
+def _total(widths: Sequence[int]) -> int:
+    return sum(widths) + 2 * (len(widths) - 1)
+
+
+def _shrunk(widths: list[int], first: Sequence[int], width: int) -> list[int]:
+    """Widths that fit, or the least ones: the columns `first` give way before the others, of which the widest does."""
+    widths = list(widths)
+    for at in first:
+        widths[at] = max(widths[at] - max(_total(widths) - width, 0), min(widths[at], _LEAST))
+    while _total(widths) > width and max(widths) > _LEAST:
+        widths[widths.index(max(widths))] -= 1
+    return widths
+
+
+def _cut(text: str, room: int) -> str:
+    return text if len(text) <= room else text[: max(room - 1, 0)] + "…"
+
+
+def write_report_table(table: Table) -> None:
+    """Write a table of a report: its title, its rows, and its caption in lines as wide as the terminal."""
+    write(table.title)
+    cells = [[" ".join(filter(None, (cell.text, cell.small, cell.tag))) for cell in row] for row in table.rows]
+    write_table([column.key for column in table.columns], cells)
+    write()
+    for line in textwrap.wrap(table.caption, min(_terminal_width(), 120) if sys.stdout.isatty() else 120):
+        write(line)
 
 
 def _terminal_width() -> int:
@@ -117,7 +184,7 @@ def heartbeat() -> Iterator[Callable[[str], None]]:
         now = time.monotonic()
         if now - told >= HEARTBEAT_S and not _for_scripts:
             told = now
-            sys.stderr.write(f"{text}, {now - began:.0f} s\n")
+            complain(f"{text}, {now - began:.0f} s")
             sys.stderr.flush()
 
     yield beat
@@ -139,7 +206,7 @@ class _Lines:
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            sys.stderr.write(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far\n")
+            complain(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 
@@ -170,13 +237,14 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
     amount = DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
-    columns = [TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn()]
+    columns = [TextColumn("{task.description}", markup=False), BarColumn(), amount, TimeRemainingColumn()]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(label, total=1)
+        task = bar.add_task(printable(label), total=1)
 
         def told(done: float, total: float | None, what: str = "") -> None:
             shown = f"{label}: {what}" if what else label
-            bar.update(task, completed=done, total=total if total is not None else done + 1, description=shown)
+            total = total if total is not None else done + 1
+            bar.update(task, completed=done, total=total, description=printable(shown))
 
         yield told
 
@@ -197,7 +265,7 @@ def _text(value: object) -> str:
         return f"{value:.4g}"
     if isinstance(value, (list, tuple, set, frozenset)):
         return ", ".join(_text(part) for part in (sorted(value) if isinstance(value, (set, frozenset)) else value))
-    return str(value)
+    return printable(" ".join(str(value).splitlines()))
 
 
 def _plain(value: Any) -> Any:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from .groups import DefaultGroup
 from .options import AsJson, DataRoot, Jobs, ProtocolId, Results
-from .output import SOME_RUNS_FAILED, write, write_json
+from .output import SOME_RUNS_FAILED, progress, write, write_json, write_report_table, write_table
+from .panels import REPORT, START
+
+if TYPE_CHECKING:
+    from dynslam_bench.reports.tables.table import Table
 
 report = typer.Typer(
     cls=DefaultGroup,
@@ -20,12 +24,12 @@ report = typer.Typer(
 
 def add_report(app: typer.Typer) -> None:
     """Add ``report``."""
-    app.add_typer(report, name="report")
+    app.add_typer(report, name="report", rich_help_panel=REPORT)
 
 
 def add_demo(app: typer.Typer) -> None:
     """Add ``demo``."""
-    app.command()(demo)
+    app.command(rich_help_panel=START)(demo)
 
 
 @report.command()
@@ -33,7 +37,10 @@ def make(
     results: Annotated[Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")] = None,  # noqa: UP045
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")] = None,  # noqa: UP045
     protocol: ProtocolId = "tum-rgbd/v1",
-    reference: Annotated[str, typer.Option(help="Tracker that errors are divided by.")] = "orb-slam2",
+    reference: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Tracker that errors are divided by; default orb-slam2, else a camera that never moves."),
+    ] = None,
     on: Annotated[
         str,
         typer.Option(help="common: rank on the sequences that all have; all: only trackers that have all."),
@@ -51,19 +58,58 @@ def make(
     if on not in ("common", "all"):
         raise ReportError(f"--on is 'common' or 'all', got '{on}'")
     folders = results or [Path("results")]
-    paths = build_report(
-        folders,
-        output or folders[0] / "report",
-        protocol=protocol,
-        reference=reference,
-        title=title,
-        on="all" if on == "all" else "common",
-        rank_seen=rank_seen,
-    )
+    with progress("report") as advance:
+        paths = build_report(
+            folders,
+            output or folders[0] / "report",
+            protocol=protocol,
+            reference=reference,
+            title=title,
+            on="all" if on == "all" else "common",
+            rank_seen=rank_seen,
+            on_progress=advance,
+        )
     if as_json:
         write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})
     else:
+        show_top(paths.leaderboard)
         write(str(paths.html))
+
+
+def show_top(leaderboard: Table, most: int = 5) -> None:
+    """The first lines of a leaderboard, as far as the terminal is wide."""
+    names = [column.name for column in leaderboard.columns]
+    shown = ["#", "tracker", "ATE ratio", "success", "coverage", "× real time"]
+    cells = [
+        [" ".join(filter(None, (cell.text, cell.small))) for cell in (row[names.index(name)] for name in shown)]
+        for row in leaderboard.rows[:most]
+    ]
+    write_table(shown, cells, shrink=("tracker",), spare=("× real time", "coverage", "success"))
+    more = len(leaderboard.rows) - most
+    write((f"... and {more} more; " if more > 0 else "") + leaderboard.brief)
+
+
+@report.command()
+def publish(
+    results: Annotated[list[Path], typer.Argument(help="Results folders.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")],
+    study: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder of a study with its page, as `tune report` names it."),
+    ] = None,
+    title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
+    protocol: ProtocolId = "tum-rgbd/v1",
+    as_json: AsJson = False,
+) -> None:
+    """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
+    from dynslam_bench.reports import publish as publish_site
+
+    with progress("site") as advance:
+        site = publish_site(results, output, study=study, title=title, protocol=protocol, on_progress=advance)
+    if as_json:
+        write_json({"index": site.index, "files": site.files, "size_mb": site.size_mb})
+    else:
+        write(f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
 
 
 @report.command()
@@ -86,7 +132,7 @@ def compare(
             {"overall": overall, "differences": found.differences, "only_a": found.only_a, "only_b": found.only_b}
         )
         return
-    write(found.to_markdown().rstrip())
+    write_report_table(found.table)
     if found.only_a or found.only_b:
         write(f"\nonly in {a}: {found.only_a} runs; only in {b}: {found.only_b} runs")
 
@@ -121,14 +167,16 @@ def audit_paper(
     elif output is not None:
         write(str(output))
     else:
-        write(found.to_markdown().rstrip())
+        for table in (found.summary(), found.details()):
+            write_report_table(table)
+            write()
 
 
 def demo(
     results: Results = Path("results"),
     frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 300,
     jobs: Jobs = 2,
-    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 10,
+    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
     from .demo import run_demo

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import typer
 
+from . import completion
 from .options import (
     AsJson,
     Assignments,
@@ -39,21 +40,33 @@ from .options import (
     gather_settings,
 )
 from .output import SOME_RUNS_FAILED, note, progress
-from .run_rows import seen_note, show_runs
+from .panels import MEASURE
+from .run_rows import seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.records import Record
     from dynslam_bench.runs import RunRecord, RunSpec
+
+R = TypeVar("R", bound="Record")
 
 
 def add(app: typer.Typer) -> None:
     """Add the verbs."""
-    app.command()(run)
-    app.command()(bench)
+    app.command(rich_help_panel=MEASURE)(run)
+    app.command(rich_help_panel=MEASURE)(bench)
 
 
 def run(
-    tracker: Annotated[str, typer.Argument(help="Id, replay:FILE, module:Attr or file.py:Attr.")],
-    sequences: Annotated[list[str], typer.Argument(metavar="SEQUENCE...", help="Ids or folders in TUM layout.")],
+    tracker: Annotated[
+        str,
+        typer.Argument(help="Id, replay:FILE, module:Attr or file.py:Attr.", autocompletion=completion.trackers),
+    ],
+    sequences: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SEQUENCE...", help="Ids or folders in TUM layout.", autocompletion=completion.sequences
+        ),
+    ],
     seed: Seeds = None,
     offset: Offsets = None,
     assignments: Assignments = None,
@@ -90,14 +103,32 @@ def run(
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
     asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
     asked |= {"video": video, "sheet": sheet, "label": label}
-    asked |= {"limits": Limits(time_s=time_limit, memory_mb=memory_limit)}
+    asked |= {"limits": checked(Limits, time_s=time_limit, memory_mb=memory_limit)}
     specs = [
-        RunSpec(sequence=sequence, seed=number, offset=skipped, **asked)
+        checked(RunSpec, sequence=sequence, seed=number, offset=skipped, **asked)
         for sequence in sequences
         for number in (seed or [0])
         for skipped in (offset or [0])
     ]
     finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json)
+
+
+def checked(kind: type[R], **values: Any) -> R:
+    """A record of values that come from the command line.
+
+    Raises:
+        RunError: One does not fit; names it.
+    """
+    from pydantic import ValidationError
+
+    from dynslam_bench.core.errors import RunError
+
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        raise RunError(f"{name} is {first['input']!r}", first["msg"].lower()) from None
 
 
 def preset_of(tracker: str, preset: str) -> dict[str, Any]:
@@ -137,7 +168,12 @@ def parse_strengths(assignments: Sequence[str]) -> dict[str, float]:
 
 
 def bench(
-    suite: Annotated[str, typer.Argument(help="dynamic, dynamic-full, real, robustness, or a TOML file.")],
+    suite: Annotated[
+        str,
+        typer.Argument(
+            help="dynamic, dynamic-full, real, robustness, or a TOML file.", autocompletion=completion.suites
+        ),
+    ],
     results: Results = Path("results"),
     data_root: DataRoot = None,
     tracker: Trackers = None,
@@ -155,6 +191,7 @@ def bench(
     as_json: AsJson = False,
 ) -> None:
     """Run a suite: every tracker on every sequence with every seed; calling it again goes on where it stopped."""
+    from dynslam_bench.runs import Limits
     from dynslam_bench.sequences.catalogue import parse_frames
     from dynslam_bench.suites import load_suite
 
@@ -169,7 +206,8 @@ def bench(
     )
     own = {"time_s": time_limit, "memory_mb": memory_limit}
     changes = {name: value for name, value in own.items() if value is not None}
-    specs = [spec.model_copy(update={"limits": spec.limits.model_copy(update=changes)}) for spec in specs]
+    limits = {spec.limits: checked(Limits, **(spec.limits.model_dump() | changes)) for spec in specs}
+    specs = [spec.model_copy(update={"limits": limits[spec.limits]}) for spec in specs]
     finish(
         specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json, scheduler=scheduler
     )
@@ -187,11 +225,15 @@ def finish(
 ) -> None:
     """Make runs, show them, and exit with 3 if some failed."""
     from dynslam_bench.runs import RunStore
+    from dynslam_bench.runs.sheet_collector import SHEET_FILE
+    from dynslam_bench.runs.video import VIDEO_FILE
 
     store = RunStore(results)
     reused: set[str] = set()
     records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
+    pictures = [name for name, asked in ((VIDEO_FILE, specs[0].video), (SHEET_FILE, specs[0].sheet)) if asked]
+    show_pictures(records, store, pictures, as_json=as_json)
     if seen := seen_note(records):
         note(seen)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")

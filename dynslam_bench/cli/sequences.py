@@ -8,6 +8,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from . import completion
 from .options import AsJson, Camera, DataRoot
 from .output import VERIFICATION_FAILED, note, progress, write, write_fields, write_json, write_table
 
@@ -23,11 +24,18 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List all sequences and whether they are on this machine."""
+    from dynslam_bench.core.errors import SequenceError, did_you_mean
     from dynslam_bench.sequences.listing import summaries
 
+    everything = summaries(data_root=data_root)
+    tags = sorted({each for summary in everything for each in summary.tags})
+    if tag is not None and tag not in tags:
+        raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
+    if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
+        raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, [each.id for each in everything]))
     found = [
         each
-        for each in summaries(data_root=data_root)
+        for each in everything
         if fnmatch.fnmatch(each.id, pattern) and (tag is None or tag in each.tags) and (each.here or not here)
     ]
     if as_json:
@@ -37,12 +45,15 @@ def list_(
     write_table(
         columns,
         [(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.license) for each in found],
+        spare=("license", "ground truth", "split"),
     )
 
 
 @app.command()
 def info(
-    name: Annotated[str, typer.Argument(help="Id, published folder name or path.")],
+    name: Annotated[
+        str, typer.Argument(help="Id, published folder name or path.", autocompletion=completion.sequences)
+    ],
     data_root: DataRoot = None,
     camera: Camera = None,
     as_json: AsJson = False,
@@ -59,7 +70,9 @@ def info(
 
 @app.command()
 def fetch(
-    names: Annotated[list[str], typer.Argument(help="Ids or patterns such as 'bonn/*'.")],
+    names: Annotated[
+        list[str], typer.Argument(help="Ids or patterns such as 'bonn/*'.", autocompletion=completion.sequences)
+    ],
     data_root: DataRoot = None,
     url: Annotated[Optional[str], typer.Option(help="A mirror's address of the archive.")] = None,  # noqa: UP045
     checksum: Annotated[bool, typer.Option(help="Refuse an archive whose checksum is not the known one.")] = True,
@@ -84,8 +97,9 @@ def fetch(
 
 @app.command()
 def verify(
-    names: Annotated[list[str], typer.Argument(help="Ids, patterns or paths.")],
+    names: Annotated[list[str], typer.Argument(help="Ids, patterns or paths.", autocompletion=completion.sequences)],
     data_root: DataRoot = None,
+    camera: Camera = None,
     as_json: AsJson = False,
 ) -> None:
     """Decode every frame, and compare every file with the checksum taken when it was fetched."""
@@ -95,7 +109,7 @@ def verify(
     reports = []
     for name in expand(names):
         with progress(name) as advance:
-            reports.append(verify_one(name, data_root=data_root, progress=advance))
+            reports.append(verify_one(name, data_root=data_root, camera=camera, progress=advance))
     if as_json:
         write_json([{**asdict(report), "ok": report.ok} for report in reports])
     else:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 
+from . import completion
 from .options import AsJson, ProtocolId, Results
-from .output import write, write_fields, write_json, write_table
-from .run_rows import part_words, show_runs
+from .output import complain, progress, write, write_fields, write_json, write_table
+from .run_rows import show_rows
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
@@ -18,7 +18,10 @@ app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 @app.command("list")
 def list_(
     results: Results = Path("results"),
-    status: Annotated[Optional[str], typer.Option(help="Only runs that ended so, e.g. ok or crashed.")] = None,  # noqa: UP045
+    status: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Only runs that ended so, e.g. ok or crashed.", autocompletion=completion.statuses),
+    ] = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -28,16 +31,18 @@ def list_(
     from dynslam_bench.core.errors import RunError, did_you_mean
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.storage.record import Status
+    from dynslam_bench.runs.storage.run_list import list_runs
 
     if status is not None and status not in get_args(Status):
         raise RunError(f"unknown status '{status}'", did_you_mean(status, get_args(Status)))
     store = RunStore(results)
     if not store.runs.is_dir():
         raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
-    records, unreadable = store.all()
-    show_runs([record for record in records if status in (None, record.status)], store, protocol, as_json=as_json)
+    with progress("reading runs") as advance:
+        rows, unreadable = list_runs(store, protocol, on_progress=advance)
+    show_rows([row for row in rows if status in (None, row["status"])], store, protocol, as_json=as_json)
     for bad in unreadable:
-        sys.stderr.write(f"unreadable: {bad.path}: {bad.reason}\n")
+        complain(f"unreadable: {bad.path}: {bad.reason}")
 
 
 @app.command()
@@ -49,6 +54,7 @@ def show(
 ) -> None:
     """Show everything about a run."""
     from dynslam_bench.runs import RunStore, score
+    from dynslam_bench.runs.storage.run_list import part_words
 
     store = RunStore(results)
     record = store.read(run)
@@ -112,6 +118,8 @@ def rm(
 
     store = RunStore(results)
     chosen = [store.find(run) for run in runs or ()]
+    if failed and not store.runs.is_dir():
+        raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     if failed:
         chosen += [record.run_id for record in store.all()[0] if record.failed]
     if not chosen and not failed:

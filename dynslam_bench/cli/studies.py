@@ -1,7 +1,8 @@
-"""``tune space|run|worker|status|best|report``."""
+"""``tune space|pilot|screen|run|worker|status|best|report``."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -33,8 +34,9 @@ def space(study: Study, as_json: AsJson = False) -> None:
     from dynslam_bench.trackers import TRACKERS
     from dynslam_bench.tuning import read_study, search_space
 
-    spec = read_study(study)
-    found = search_space(TRACKERS.get(spec.tracker).settings, spec.space)
+    spec = read_study(study, note)
+    sequences = {block.sequence for block in spec.blocks(*spec.tune)}
+    found = search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
     if as_json:
         write_json([asdict(parameter) for parameter in found])
         return
@@ -52,6 +54,58 @@ def space(study: Study, as_json: AsJson = False) -> None:
 
 
 @app.command()
+def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
+    """Measure the spread of a study's blocks: what it could show, and what 5, 10 and 20 % would take."""
+    from dynslam_bench.tuning import Tuner, pilot_of, read_study
+
+    found = pilot_of(Tuner(read_study(study, note), results), jobs=jobs)
+    if as_json:
+        write_json(found)
+        return
+    write(f"{found.sentence}.")
+    write()
+    rows = [(f"{100 * need.effect:.0f} %", need.scenes, need.blocks, f"{need.minutes:.0f}") for need in found.needs]
+    write_table(("gain", "scenes", "runs of one configuration", "minutes"), rows)
+    if found.warning:
+        write()
+        write(f"Warning: {found.warning}.")
+
+
+@app.command()
+def screen(
+    study: Study,
+    results: Results = Path("results"),
+    jobs: Jobs = 1,
+    points: Annotated[int, typer.Option(min=1, help="Points to move from: the default, and others near it.")] = 2,
+    blocks: Annotated[int, typer.Option(min=2, help="Blocks of the study to run on.")] = 4,
+    as_json: AsJson = False,
+) -> None:
+    """Find which settings matter, before a study: one at a time, on several blocks; print the few worth tuning."""
+    from dynslam_bench.tuning import Tuner, read_study, screen_study
+
+    tuner = Tuner(read_study(study, note), results)
+    with progress(f"screening {tuner.spec.name}") as advance:
+        found = screen_study(tuner, points=points, blocks=blocks, jobs=jobs, on_done=advance)
+    if as_json:
+        write_json(found)
+        return
+    state = {name: "kept" for name in found.kept} | dict.fromkeys(found.dead, "no effect")
+    rows = [(each.name, each.objective, f"{each.size:.3f}", f"[{each.low:.3f}, {each.high:.3f}]",
+             state.get(each.name, "")) for each in found.effects]  # fmt: skip
+    write_table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows)
+    write()
+    for name, reason in found.failed.items():
+        write(f"{name} broke a run: {reason}")
+    if not found.kept:
+        write(
+            f"No setting matters more than chance on these {found.blocks} blocks ({found.runs} runs): try more blocks."
+        )
+        return
+    write("[space]")
+    write(f"include = [{', '.join(json.dumps(name) for name in found.kept)}]")
+
+
+@app.command()
 def run(
     study: Study,
     results: Results = Path("results"),
@@ -60,13 +114,13 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a study, or go on with it; then run the best again, check them on the held-out split, write the page."""
-    from dynslam_bench.tuning import finish, read_study, write_page
+    from dynslam_bench.tuning import read_study, write_page
 
-    spec = read_study(study)
+    spec = read_study(study, note)
     if trials is not None:
         spec = spec.model_copy(update={"trials": trials})
     tuner = run_trials(spec, results, jobs)
-    summary = finish(tuner, note, jobs=jobs)
+    summary = conclude(tuner, jobs=jobs)
     show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
 
 
@@ -75,7 +129,7 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
     """Only run trials of a study, beside other workers on the same storage."""
     from dynslam_bench.tuning import read_study
 
-    tuner = run_trials(read_study(study), results, jobs)
+    tuner = run_trials(read_study(study, note), results, jobs)
     write(f"study '{tuner.spec.name}' has its {tuner.spec.trials} trials")
 
 
@@ -83,9 +137,9 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show how far a study is."""
     from dynslam_bench.tuning import Tuner, read_study
-    from dynslam_bench.tuning.final_runs import best_trials, count_states
+    from dynslam_bench.tuning.trials import best_trials, count_states
 
-    tuner = Tuner(read_study(study), results, reading=True)
+    tuner = Tuner(read_study(study, note), results, reading=True)
     facts: dict[str, Any] = {
         "study": tuner.spec.name,
         "folder": tuner.folder,
@@ -109,28 +163,16 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
 def best(
     study: Study,
     results: Results = Path("results"),
+    pick: Annotated[
+        str, typer.Option(help="best; of a study of several objectives fast, balanced, accurate too.")
+    ] = "best",
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
 ) -> None:
-    """Write the best settings as a preset that `run --settings` takes."""
-    from dynslam_bench.core.errors import StudyError
-    from dynslam_bench.core.reading import read_text
+    """Write a study's settings as a preset that `run --settings` takes."""
     from dynslam_bench.core.records import write_atomic
-    from dynslam_bench.tuning import Tuner, read_study
-    from dynslam_bench.tuning.final_runs import best_trials
-    from dynslam_bench.tuning.preset import preset_text
-    from dynslam_bench.tuning.storage import study_folder
+    from dynslam_bench.tuning import read_preset_text, read_study
 
-    spec = read_study(study)
-    chosen = study_folder(results, spec) / "best.toml"
-    if chosen.is_file():
-        text = read_text(chosen, kind=StudyError)
-    else:
-        tuner = Tuner(spec, results, reading=True)
-        found = best_trials(tuner.study, 1)
-        if not found:
-            raise StudyError(f"study '{spec.name}' has no finished trial", f"dynslam-bench tune run {study}")
-        remark = f"trial {found[0].number}, the best so far; not checked on the held-out split"
-        text = preset_text(tuner.settings_of(found[0]), spec.tracker, remark)
+    text = read_preset_text(read_study(study, note), results, pick)
     if output is None:
         write(text.rstrip())
     else:
@@ -141,17 +183,17 @@ def best(
 @app.command()
 def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Write a study's page; the best are run again if that was not done yet."""
-    from dynslam_bench.tuning import StudySummary, Tuner, finish, read_study, write_page
+    from dynslam_bench.tuning import StudySummary, Tuner, read_study, write_page
     from dynslam_bench.tuning.storage import study_folder
 
-    spec = read_study(study)
+    spec = read_study(study, note)
     stored = study_folder(results, spec) / "summary.json"
     tuner = Tuner(spec, results, reading=stored.is_file())
     if stored.is_file():
         summary = StudySummary.read(stored)
     else:
         tuner.reference()
-        summary = finish(tuner, note)
+        summary = conclude(tuner)
     show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
 
 
@@ -162,11 +204,30 @@ def run_trials(spec: StudySpec, results: Path, jobs: int) -> Tuner:
     with progress(f"study {spec.name}") as advance:
 
         def told(event: StudyEvent) -> None:
+            if event.kind == "pilot":
+                note(event.text)
             if event.kind == "finished":
                 note(f"trial {event.number}: {event.text}")
                 advance(event.number + 1, event.total)
+            elif event.kind == "reference":
+                advance(0, spec.trials, f"{spec.tracker} as it is by default on {event.text}")
+            else:
+                advance(event.number, event.total, f"{spec.tracker}, {event.text}")
 
         return run_study(spec, results=results, jobs=jobs, on_event=told)
+
+
+def conclude(tuner: Tuner, jobs: int = 1) -> StudySummary:
+    """Run the best again and check them, with a progress bar."""
+    from dynslam_bench.tuning import finish
+
+    with progress(f"checking the best of {tuner.spec.name}") as advance:
+
+        def told(text: str) -> None:
+            note(text)
+            advance(0, None, text)
+
+        return finish(tuner, told, jobs=jobs)
 
 
 def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bool) -> None:
@@ -177,8 +238,9 @@ def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bo
         return
     write(summary.conclusion)
     write()
-    write_table(("setting", "value"), list(summary.candidates[0].params.items()))
-    write()
+    if summary.chosen is not None:
+        write_table(("setting", "value"), list(summary.candidates[0].params.items()))
+        write()
     write(f"preset: {preset}")
     write(f"page:   {page}")
 

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from . import completion
 from .options import AsJson, Assignments, MemoryLimit, SettingsFile, gather_settings
 from .output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.core.settings import Settings
     from dynslam_bench.trackers import TrackerSpec
+
+Tracker = Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.", autocompletion=completion.trackers)]
 
 app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
 
@@ -39,12 +42,12 @@ def list_(as_json: AsJson = False) -> None:
         write_json(rows)
         return
     columns = ("id", "provenance", "ranked", "available", "summary")
-    write_table(columns, [[row[column] for column in columns] for row in rows])
+    write_table(columns, [[row[column] for column in columns] for row in rows], shrink=("summary",))
 
 
 @app.command()
 def info(
-    tracker: Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.")],
+    tracker: Tracker,
     as_json: AsJson = False,
 ) -> None:
     """Show a tracker's description, its settings and its published numbers."""
@@ -140,7 +143,7 @@ def doctor(as_json: AsJson = False) -> None:
 
 @app.command()
 def test(
-    tracker: Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.")],
+    tracker: Tracker,
     assignments: Assignments = None,
     settings: SettingsFile = None,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each check.")] = 6,

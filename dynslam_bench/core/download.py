@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import http.client
 import json
-import os
 import shutil
 import time
 import urllib.error
@@ -21,6 +19,7 @@ from typing import Any
 from .address import check_address, connect
 from .download_progress import Progress, Report, reporting
 from .errors import DownloadError, DynslamError
+from .locks import claimed
 from .passwords import without_passwords
 from .reading import read_json
 
@@ -80,19 +79,24 @@ def download(
                 _complete(url, part, report, attempts, wait_s, timeout_s, bounds)
             found = file_sha256(here, report)
             if sha256 is not None and not found.startswith(sha256):
-                size = here.stat().st_size
-                here.unlink()
-                forget(part)
-                raise DownloadError(
-                    f"{url} has the checksum {found} ({size} bytes), expected {sha256}",
-                    "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
-                )
+                raise _discard(here, part, f"{url} has the checksum {found}", sha256)
             if here is part:
                 part.replace(target)
-                forget(part)
+            forget(part)  # also what a process left that was killed between these two lines
             return found
     except OSError as error:
         raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
+
+
+def _discard(here: Path, part: Path, what: str, expected: str) -> DownloadError:
+    """Throw away bytes whose checksum is not the expected one."""
+    size = here.stat().st_size
+    here.unlink()
+    forget(part)
+    return DownloadError(
+        f"{what} ({size} bytes), expected {expected}",
+        "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
+    )
 
 
 @dataclass(frozen=True)
@@ -239,18 +243,10 @@ def _check_space(part: Path, total: int | None, start: int) -> None:
 
 @contextlib.contextmanager
 def _only_one(lock: Path, url: str) -> Iterator[None]:
-    """Hold a lock that the system releases when the process dies."""
-    with lock.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise DownloadError(f"another process is downloading {url}", "wait for it") from error
-        if not lock.exists() or lock.stat().st_ino != os.fstat(file.fileno()).st_ino:
-            raise DownloadError(f"another process has just downloaded {url}", "run the same command again")
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
+    with claimed(lock) as mine:
+        if not mine:
+            raise DownloadError(f"another process is downloading {url}", "wait for it, then run the same command again")
+        yield
 
 
 def _continues(content_range: str | None, start: int) -> bool:

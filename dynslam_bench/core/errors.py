@@ -12,7 +12,9 @@ from .passwords import without_passwords
 
 
 class DynslamError(Exception):
-    """Base of all errors that the user of the toolkit can cause and cure; the passwords of addresses are left out.
+    """Base of all errors that the user of the toolkit can cause and cure.
+
+    Whatever the message names, it is one line of bounded length, and the passwords of addresses are left out.
 
     Args:
         message: One line with the measured numbers and the expectation.
@@ -20,8 +22,8 @@ class DynslamError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        super().__init__(without_passwords(str(message)))
-        self.hint = without_passwords(hint)
+        super().__init__(_one_line(str(message)))
+        self.hint = _one_line(hint)
 
     def __str__(self) -> str:
         message = str(self.args[0])
@@ -29,6 +31,15 @@ class DynslamError(Exception):
 
     def __reduce__(self) -> tuple[type[DynslamError], tuple[str, str]]:
         return type(self), (str(self.args[0]), self.hint)
+
+
+LONGEST = 1000
+"""Characters of the longest message, and of the longest hint."""
+
+
+def _one_line(text: str) -> str:
+    text = without_passwords(" ".join(text.splitlines()))
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
 
 
 class SettingsError(DynslamError):
@@ -65,6 +76,13 @@ class DownloadError(DynslamError):
 
 class RunError(DynslamError):
     """A run cannot be started, stored or found."""
+
+
+class InfrastructureError(RunError):
+    """What a run needs broke, and not the run: a full disk, a process that was killed.
+
+    It is no outcome of a tracker, so nothing is stored, and the same command goes on from there.
+    """
 
 
 class StudyError(DynslamError):

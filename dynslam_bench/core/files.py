@@ -5,36 +5,47 @@ What is written has the permissions that the user's umask gives.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import errno
 import os
 import re
 import secrets
 import shutil
-import socket
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import DynslamError
+from .locks import hold, is_abandoned
+
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
+_NEW_S = 60.0
+"""A temporary name ends in ``.new`` until it is locked, which takes no time, and in ``.tmp`` from then on."""
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary file beside `path` that becomes `path` when the block ends without an error.
 
-    The parent folder is made if need be. If the block raises, `path` is as it was and nothing is left beside it.
+    The parent folder is made if need be. If the block raises, `path` is as it was and nothing is left beside it; what
+    a killed process leaves is removed by `sweep_temporary`.
 
     Raises:
         OSError: The folder cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _beside(path)
-    temporary.touch(exist_ok=False)
+    temporary, lock = _reserve(path, lambda fresh: fresh.touch(exist_ok=False))
     try:
         yield temporary
         temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    finally:
+        with contextlib.suppress(OSError):  # it has become `path`, or the disk takes nothing more
+            temporary.unlink()
+        os.close(lock)
 
 
 def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
@@ -52,71 +63,110 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
 
 
 def replace_folder(work: Path, target: Path) -> None:
-    """Rename a finished folder to `target`, beside which it lies; an earlier `target` is deleted.
+    """Rename a finished folder to `target`, on the same file system; what `target` held before is deleted.
+
+    At every moment `target` is what it was or what it is to be, whoever else replaces it at the same time (where the
+    system can exchange two names at once: Linux, on its own file systems; elsewhere it is missing for a moment).
 
     Raises:
         OSError: It cannot be renamed; then `target` is as it was.
     """
-    if not target.exists():
-        work.replace(target)
-        return
-    stale = _beside(target)
-    stale.mkdir()
-    try:
-        target.replace(stale / "old")
+    while True:
         try:
-            work.replace(target)
-        except OSError:
-            (stale / "old").replace(target)
-            raise
-    finally:
-        shutil.rmtree(stale, ignore_errors=True)
+            work.rename(target)
+            return
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        try:
+            _exchange(work, target)
+        except FileNotFoundError:
+            if not work.exists():
+                raise
+            continue  # another process has just removed the target
+        shutil.rmtree(work, ignore_errors=True)
+        return
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Give each of two folders the other's name."""
+    if sys.platform == "linux":
+        libc = ctypes.CDLL(None, use_errno=True)
+        names = (_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other))
+        if hasattr(libc, "renameat2") and libc.renameat2(*names, _RENAME_EXCHANGE) == 0:
+            return
+        number = ctypes.get_errno()
+        if number not in (0, errno.EINVAL, errno.ENOSYS):
+            raise OSError(number, os.strerror(number), str(other))
+    aside = one.with_name(f"{one.name}.old")
+    other.rename(aside)
+    try:
+        one.rename(other)
+    except OSError:
+        aside.rename(other)
+        raise
+    aside.rename(one)
+
+
+def _reserve(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
+    """Make something of a temporary name beside `path`, and hold it; gives its path and the lock's descriptor."""
+    fresh = path.with_name(f".{path.name}.{secrets.token_hex(6)}.new")
+    make(fresh)
+    lock = hold(fresh)
+    return fresh.rename(fresh.with_suffix(".tmp")), lock
+
+
+def sweep_temporary(folder: Path, pattern: str = "") -> int:
+    """Remove the temporary files and folders that killed processes left in a folder; returns how many.
+
+    Args:
+        folder: Where; nothing happens if it is missing.
+        pattern: Of folders below it to look into instead, e.g. ``*/*``.
+    """
+    removed = 0
+    for path in folder.glob(f"{pattern}/.*" if pattern else ".*"):
+        if not _TEMPORARY.fullmatch(path.name) or not is_abandoned(path):
+            continue
+        with contextlib.suppress(OSError):  # another process was faster
+            if path.suffix == ".tmp" or time.time() - path.stat().st_mtime > _NEW_S:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                removed += 1
+    return removed
 
 
 @contextmanager
-def atomic_folder(target: Path) -> Iterator[Path]:
-    """A temporary folder beside `target` that becomes `target` when the block ends without an error.
-
-    An existing target is replaced. If the block raises, or the process dies, `target` is as it was; what a process of
-    this machine left when it died is swept up by the next one.
+def temporary_folder(target: Path) -> Iterator[Path]:
+    """A hidden folder beside `target` that is removed when the block ends, if it still has its name.
 
     Raises:
         DynslamError: The parent folder cannot be written.
     """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(target)
-        work = _beside(target)
-        work.mkdir()
+        work, lock = _reserve(target, Path.mkdir)
     except OSError as error:
         raise DynslamError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
     try:
         yield work
-        replace_folder(work, target)
     finally:
+        os.close(lock)
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _beside(target: Path) -> Path:
-    """A hidden name beside a target that tells whose it is."""
-    return target.with_name(f".{target.name}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}")
+@contextmanager
+def atomic_folder(target: Path) -> Iterator[Path]:
+    """A temporary folder beside `target` that becomes `target` when the block ends without an error.
 
+    An existing target is replaced. If the block raises, or the process dies, `target` is as it was; what a killed
+    process left is swept up by the next one.
 
-def _sweep(target: Path) -> None:
-    """Remove the hidden folders beside a target that belonged to processes of this machine that are no more."""
-    pattern = re.compile(rf"\.{re.escape(target.name)}\.{re.escape(socket.gethostname())}\.(\d+)\.[0-9a-f]{{8}}")
-    for left in target.parent.iterdir():
-        match = pattern.fullmatch(left.name)
-        if match and not process_exists(int(match[1])):
-            shutil.rmtree(left, ignore_errors=True)
-
-
-def process_exists(pid: int) -> bool:
-    """Whether a process of this machine has that number."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True
+    Raises:
+        DynslamError: The parent folder cannot be written, or was removed meanwhile.
+    """
+    sweep_temporary(target.parent)
+    with temporary_folder(target) as work:
+        yield work
+        try:
+            replace_folder(work, target)
+        except OSError as error:
+            raise DynslamError(f"cannot write {target}: {error.strerror}", "check the permissions") from error

@@ -13,7 +13,7 @@ from .errors import PluginError
 
 ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
 """Set in processes that may end by an import without harm: the children of runs, and the probes themselves."""
-_LIMIT_S = 120
+LIMIT_S = 120
 _IMPORTED = 113
 _PROBE = """
 import json, os, sys
@@ -47,9 +47,9 @@ def check_import(location: str) -> None:
     environment = {**os.environ, ISOLATED_VARIABLE: "1"}
     quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     try:
-        code = subprocess.run(command, env=environment, timeout=_LIMIT_S, check=False, **quiet).returncode  # type: ignore[call-overload]
+        code = subprocess.run(command, env=environment, timeout=LIMIT_S, check=False, **quiet).returncode  # type: ignore[call-overload]
     except subprocess.TimeoutExpired:
-        raise PluginError(f"cannot import {location}: it is not done after {_LIMIT_S} s") from None
+        raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None
     if code != _IMPORTED:
         how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
         raise PluginError(

@@ -53,6 +53,14 @@ class Settings(BaseModel):
         """Why nothing of this group has an effect as it is set, for a message; empty where it has one."""
         return ""
 
+    @property
+    def unused(self) -> Mapping[str, str]:
+        """Fields, or groups, without effect, each with the reason; see `idle` for all of a group at once.
+
+        As `idle`, it asks fields only that nobody tunes; what depends on a tunable field says ``when``.
+        """
+        return {}
+
     def verify(self) -> None:
         """Raise `SettingsError` where values, each valid by itself, do not go together; asked before anything runs."""
 

@@ -31,23 +31,29 @@ class Steerable(Protocol):
 def steerable_parameters(settings: Settings) -> list[Parameter]:
     """The online settings that have an effect with these settings, in order of definition.
 
-    A parameter is left out where a condition of its (``when``) does not hold, or where a group that it lies in is
-    idle (`Settings.idle`).
+    A parameter is left out where a condition of its (``when``) does not hold, where a group that it lies in is idle
+    (`Settings.idle`), or where it or its group has no effect as the rest is set (`Settings.unused`).
     """
     return [each for each in parameters(type(settings), online_only=True) if not why_idle(settings, each)]
 
 
 def why_idle(settings: Settings, parameter: Parameter) -> str:
     """Why a parameter has no effect with these settings, for a message; empty where it has one."""
-    *groups, _ = parameter.name.split(".")
-    node: Settings = settings
-    for group in groups:
-        node = getattr(node, group)
-        if node.idle:
-            return node.idle
+    if reason := why_unused(settings, parameter.name):
+        return reason
     for name, allowed in parameter.when:
         if (value := value_of(settings, name)) not in allowed:
             return f"{name} is {value!r}"
+    return ""
+
+
+def why_unused(settings: Settings, name: str) -> str:
+    """Why nothing reads a field, as the fields that are not tunable stand; empty where something does."""
+    node: Settings = settings
+    for part in name.split("."):
+        if reason := node.idle or node.unused.get(part, ""):
+            return reason
+        node = getattr(node, part)
     return ""
 
 

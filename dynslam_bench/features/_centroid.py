@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import kernel
 
 
 def patch_half_widths(radius: int) -> NDArray[np.int64]:
@@ -18,7 +19,7 @@ def patch_half_widths(radius: int) -> NDArray[np.int64]:
     return np.asarray(np.floor(np.sqrt(radius * radius - rows * rows)), dtype=np.int64)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _orientations(
     image: NDArray[np.uint8], xy: NDArray[np.float32], half_widths: NDArray[np.int64]
 ) -> NDArray[np.float32]:

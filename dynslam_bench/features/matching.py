@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import Scalar, kernel, spliced
 
 Words = NDArray[np.uint64]
 
@@ -46,8 +47,8 @@ def hamming(a: Words, b: Words) -> NDArray[np.int64]:
     return np.asarray(popcount(a ^ b).sum(axis=-1, dtype=np.int64))
 
 
-@njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
-def distance(a: Words, b: Words) -> np.int64:
+@spliced
+def distance(a: Words, b: Words) -> Scalar:
     """Hamming distance of two descriptors ``[W]``; for use inside compiled kernels."""
     total = np.int64(0)
     for w in range(a.shape[0]):
@@ -59,7 +60,7 @@ def distance(a: Words, b: Words) -> np.int64:
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _brute_force(
     a: Words, b: Words
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -141,7 +142,7 @@ class CellGrid:
         return cls(cell, columns, rows, start, np.argsort(index, kind="stable").astype(np.int64))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _search(
     cell: float, columns: int, rows: int, start: NDArray[np.int64], order: NDArray[np.int64],
     xy: NDArray[np.float64], right: NDArray[np.float64], octave: NDArray[np.int64], words: Words,
@@ -224,7 +225,7 @@ def search_in_radius(
     """
     xy, right, octave, words = keypoints
     target, target_right, radius = targets
-    return _search(  # type: ignore[no-any-return]
+    return _search(
         grid.cell, grid.columns, grid.rows, grid.start, grid.order, xy, right, octave, words, free,
         target, target_right, radius, octaves[0], octaves[1], target_words, max_distance, ratio,
     )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -23,18 +25,28 @@ def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: boo
         strict: True for ``|dt| < max_dt`` (TUM), False for ``|dt| <= max_dt``.
 
     Returns:
-        Indices into `first` and into `second` ``[K]`` each, in order of the first stamp.
+        Indices into `first` and into `second` ``[K]`` each, in order of the first stamp; nobody may write into them.
 
     Raises:
         TrajectoryError: A stamp is not finite, or `max_dt` is negative or not a number.
     """
-    a, order_a = _sorted_stamps(first)
-    b, order_b = _sorted_stamps(second)
+    return _associate(_bytes(first), _bytes(second), float(max_dt), strict)
+
+
+def _bytes(stamps: ArrayLike) -> bytes:
+    return np.asarray(stamps, dtype=np.float64).reshape(-1).tobytes()
+
+
+@lru_cache(maxsize=512)
+def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tuple[Index, Index]:
+    """`associate`, once for equal stamps: all runs on one sequence are compared with the same truth."""
+    a, order_a = _sorted_stamps(np.frombuffer(first))
+    b, order_b = _sorted_stamps(np.frombuffer(second))
     if not max_dt >= 0:
         raise TrajectoryError(f"the largest time difference is {max_dt!r}, not a number of seconds >= 0")
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
     if (np.diff(candidate_a) > 0).all() and (np.diff(candidate_b) > 0).all():  # nobody has two to choose from
-        return order_a[candidate_a], order_b[candidate_b]
+        return _shared(order_a[candidate_a], order_b[candidate_b])
     free_a = np.ones(len(a), dtype=bool).tolist()
     free_b = np.ones(len(b), dtype=bool).tolist()
     matched: list[tuple[int, int]] = []
@@ -44,7 +56,12 @@ def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: boo
             free_a[i] = free_b[j] = False
             matched.append((i, j))
     pairs = np.array(sorted(matched), dtype=np.intp).reshape(-1, 2)
-    return order_a[pairs[:, 0]], order_b[pairs[:, 1]]
+    return _shared(order_a[pairs[:, 0]], order_b[pairs[:, 1]])
+
+
+def _shared(first: Index, second: Index) -> tuple[Index, Index]:
+    first.flags.writeable = second.flags.writeable = False
+    return first, second
 
 
 def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:

@@ -170,7 +170,7 @@ def column_names(rows: Iterable[FrameRow]) -> list[str]:
 def write_csv(path: Path, rows: Sequence[FrameRow]) -> None:
     """Write ``frames.csv``."""
     columns = column_names(rows)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = csv.writer(file)
         table.writerow(columns)
         for row in rows:

@@ -20,9 +20,10 @@ from dynslam_bench.geometry.tum_file import write_tum
 
 from .frame_row import FRAMES_FILE, FrameRow
 from .process.failures import at
-from .sheet_collector import SheetWriter
+from .sheet_collector import SHEET_FILE, SheetWriter
 from .snapshots import SnapshotWriter
 from .spec import RunSpec
+from .video import VideoWriter
 
 Send = Callable[[dict[str, Any]], None]
 
@@ -108,8 +109,8 @@ class _Recorder:
         self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
         self._snapshots = SnapshotWriter(folder, len(env.sequence))
         self._env = env
-        self._video = _Video(folder / "video.mp4", env) if spec.video else None
-        self.sheet = SheetWriter(folder / "sheet.png", env) if spec.sheet else None
+        self._video = VideoWriter(folder, env) if spec.video else None
+        self.sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
 
     def add(self) -> None:
         self._frames.write()
@@ -167,7 +168,7 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
             sheet.write(outputs, env.online_trajectory() if final is None else final)
         outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
     elif sheet is not None:
-        notes.append("no sheet.png: the tracker offers neither keyframes nor a map")
+        notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
     if env.device.startswith("cuda"):
         import torch
 
@@ -206,26 +207,3 @@ class _FrameWriter:
         exact, predicted = np.isin(truth.instances, people), self._env.result.dynamic_mask
         overlap = None if predicted is None else compare_masks(np.asarray(predicted, dtype=bool), exact).iou
         return overlap, float(exact.mean())
-
-
-class _Video:
-    """Writes the rendered frames as MPEG-4."""
-
-    def __init__(self, path: Path, env: SlamEnv) -> None:
-        self._path, self._env = path, env
-        self._writer: Any = None
-
-    def add(self) -> None:
-        import cv2
-
-        image = self._env.render()
-        assert image is not None
-        if self._writer is None:
-            size = (image.shape[1], image.shape[0])
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._writer = cv2.VideoWriter(str(self._path), code, self._env.sequence.fps, size)
-        self._writer.write(np.ascontiguousarray(image[:, :, ::-1]))
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.release()

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Collection, Iterable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import InfrastructureError, RunError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
 from .identity import ResolvedRun, resolve
 from .one import OnProgress, run_one
+from .sheet_collector import SHEET_FILE
 from .spec import RunSpec
 from .storage.packing import run_packed, unpack
 from .storage.record import FAILED, RunRecord
 from .storage.scoring import DEFAULT_PROTOCOL, score
 from .storage.store import RunStore
+from .video import VIDEO_FILE
+
+T = TypeVar("T")
+_LOOK_AGAIN_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,7 @@ def run_many(
     Everything is looked up before the first run begins. A stored run is made again if a video or a sheet is asked for
     that it lacks; one that is given another label gets that. Each run is a child process; a failure is a record like
     any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from there.
+    Several processes may do so at a time on one results folder: each run is made by one of them (not with `executor`).
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -102,6 +110,44 @@ def run_many(
     return [done[run.run_id] for run in resolved]
 
 
+class _Waiting:
+    """The runs that are still to be made on this machine.
+
+    Each is claimed in the store while it is made, so that several processes on one results folder share the work.
+    """
+
+    def __init__(self, store: RunStore, todo: dict[str, ResolvedRun]) -> None:
+        self.store = store
+        self.runs = list(todo.values())
+        self.before = {run_id: store.get(run_id) for run_id in todo}
+        self.lock = threading.Lock()
+
+    @contextmanager
+    def next(self, cancelled: Callable[[], bool]) -> Iterator[tuple[ResolvedRun, RunRecord | None]]:
+        """The next run, claimed while the block lasts, and its record if another process has just made it.
+
+        With all of them claimed elsewhere it waits.
+        """
+        with ExitStack() as claims:
+            while True:
+                run = self._claimed(claims, anyway=cancelled())
+                if run is not None:
+                    break
+                time.sleep(_LOOK_AGAIN_S)
+            stored = self.store.get(run.run_id)
+            yield run, None if stored == self.before[run.run_id] else stored
+
+    def _claimed(self, claims: ExitStack, *, anyway: bool) -> ResolvedRun | None:
+        with self.lock:
+            for run in self.runs:
+                with ExitStack() as attempt:
+                    if attempt.enter_context(self.store.claim(run.run_id)) or anyway:
+                        claims.enter_context(attempt.pop_all())
+                        self.runs.remove(run)
+                        return run
+        return None
+
+
 class _Bench:
     def __init__(
         self,
@@ -128,9 +174,15 @@ class _Bench:
         return record
 
     def run_here(self, todo: dict[str, ResolvedRun], jobs: int) -> dict[str, RunRecord]:
+        waiting = _Waiting(self.store, todo)
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-run") as pool:
-            futures = {pool.submit(self._one, run): run_id for run_id, run in todo.items()}
-            return self._collect(futures, lambda record, _: record)
+            futures = {pool.submit(self._next, waiting): run_id for run_id in todo}
+            return dict(self._collect(futures, lambda made, _: made).values())
+
+    def _next(self, waiting: _Waiting) -> tuple[str, RunRecord]:
+        """Make the first run that nobody else is making, or take what another process has made of it meanwhile."""
+        with waiting.next(self._is_cancelled) as (run, stored):
+            return run.run_id, self._one(run) if stored is None else self.reuse(run, stored)
 
     def run_remotely(self, todo: dict[str, ResolvedRun], executor: Executor) -> dict[str, RunRecord]:
         options = json.dumps({"protocol": self.protocol.model_dump(mode="json")})
@@ -147,13 +199,18 @@ class _Bench:
 
         return self._collect(futures, take)
 
-    def _collect(self, futures: dict[Future[Any], str], take: Callable[[Any, str], RunRecord]) -> dict[str, RunRecord]:
+    def _collect(self, futures: Mapping[Future[Any], str], take: Callable[[Any, str], T]) -> dict[str, T]:
         try:
             return {futures[future]: take(future.result(), futures[future]) for future in as_completed(futures)}
-        except BaseException:
+        except BaseException as error:
             self.cancelled.set()
             for future in futures:
                 future.cancel()
+            if isinstance(error, (CancelledError, ConnectionError)):  # as when Dask's scheduler is gone
+                raise InfrastructureError(
+                    f"the executor gave up: {type(error).__name__} {error}".rstrip(),
+                    "what is finished is stored; the same command goes on from there",
+                ) from error
             raise
 
     def _one(self, run: ResolvedRun) -> RunRecord:
@@ -189,9 +246,11 @@ class _Bench:
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
     """Whether a stored run has to be made again for a video or a sheet that is asked for now."""
     folder = store.folder(stored.run_id)
-    wanted = [name for name, asked in (("video.mp4", run.spec.video), ("sheet.png", run.spec.sheet)) if asked]
+    wanted = [name for name, asked in ((VIDEO_FILE, run.spec.video), (SHEET_FILE, run.spec.sheet)) if asked]
     excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
-    return not stored.failed and any(not (folder / name).is_file() for name in set(wanted) - excused)
+    if stored.failed:  # what ends early has no map to draw, and what saw no frame nothing at all
+        excused |= {SHEET_FILE} if stored.n_processed else set(wanted)
+    return any(not (folder / name).is_file() for name in set(wanted) - excused)
 
 
 def _statuses(retry: Collection[str]) -> set[str]:

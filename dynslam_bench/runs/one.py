@@ -6,9 +6,10 @@ import sys
 import time
 from collections.abc import Callable
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import InfrastructureError, RunError
 from dynslam_bench.core.machine import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
@@ -72,8 +73,8 @@ def run_one(
         The record.
 
     Raises:
-        DynslamError: The request names something unknown or unfit (nothing is stored then), or the store cannot be
-            written.
+        DynslamError: The request names something unknown or unfit, the store cannot be written, or what a run needs
+            broke (`InfrastructureError`); nothing is stored then.
     """
     resolved = resolve(run) if isinstance(run, RunSpec) else run
     run_id = resolved.run_id
@@ -88,20 +89,46 @@ def run_one(
             progress_every=progress_every,
         )
         listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
-        log = LogFile(work / LOG_FILE)
-        limits = resolved.spec.limits
-        verdict = supervise(start_child(), job, limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
-        log.finish()
+        verdict = _watched(resolved, work, job, listener, cancelled, at_a_time)
         if verdict.refused:
             raise RunError(f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}")
-        frames = FrameLog.read(work / FRAMES_FILE)
-        frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
-        (work / FRAMES_FILE).unlink(missing_ok=True)
+        try:
+            frames = FrameLog.read(work / FRAMES_FILE)
+            frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
+            (work / FRAMES_FILE).unlink(missing_ok=True)
+        except OSError as error:
+            raise InfrastructureError(f"cannot write {work}: {error.strerror}", "the run is not stored") from error
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)
             store.publish(work, record)
     return record
+
+
+def _watched(
+    resolved: ResolvedRun,
+    work: Path,
+    job: dict[str, Any],
+    listener: Callable[[dict[str, Any]], bool] | None,
+    cancelled: Callable[[], bool] | None,
+    at_a_time: int,
+) -> Verdict:
+    """The child's end; where the fork server was ended under it, that of a second one.
+
+    Raises:
+        InfrastructureError: What the run needs broke; nothing is known of the run.
+    """
+    log = LogFile(work / LOG_FILE)
+    child = start_child()
+    try:
+        return supervise(child, job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
+    except InfrastructureError:
+        if not child.lost:
+            raise
+        child = start_child()
+        return supervise(child, job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
+    finally:
+        log.finish()
 
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.contracts.map_outputs import MapOutputs
-from dynslam_bench.envs.rendering import Canvas, Image
+from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
@@ -17,6 +17,8 @@ from dynslam_bench.slam.outputs.sheet_panels import draw_sheet, write_sheet
 
 SHOWN = 9
 """Frames, and keyframes, on a sheet."""
+SHEET_FILE = "sheet.png"
+FEATURES = (("kept", KEPT), ("culled", CULLED), ("mask", MASK))
 
 
 class SheetWriter:
@@ -49,8 +51,8 @@ class SheetWriter:
         shown = [outputs.keyframes[row].frame for row in _spread(len(outputs.keyframes))]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
-        truth = _aligned_truth(sequence.ground_truth, track)
-        sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth)
+        truth, ate_m = _aligned_truth(sequence.ground_truth, track)
+        sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES)
         write_sheet(self._path, sheet)
 
 
@@ -59,17 +61,22 @@ def _spread(count: int) -> list[int]:
     return sorted({int(index) for index in np.linspace(0, max(count - 1, 0), min(SHOWN, count)).round()})
 
 
-def _aligned_truth(truth: Trajectory | None, track: Trajectory) -> Trajectory | None:
-    """The ground truth at the track's stamps, moved onto the track by least squares; None without enough of it."""
+def _aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajectory | None, float | None]:
+    """The ground truth at the track's stamps, moved onto the track by least squares, and what is left in metres (RMSE).
+
+    Both are None without enough of it.
+    """
     if truth is None:
-        return None
+        return None, None
     errors = OnlineError(truth)
     poses = [errors.truth_at(float(stamp)) for stamp in track.timestamps]
     known = [row for row, pose in enumerate(poses) if pose is not None]
     if len(known) < 3:
-        return None
+        return None, None
     true = np.array([poses[row] for row in known])
     fit = align(track.T_world_cam[known], true, "se3")
     move = np.eye(4)
     move[:3, :3], move[:3, 3] = fit.rotation, fit.translation
-    return Trajectory(track.timestamps[known], se3.inverse(move) @ true)
+    moved = Trajectory(track.timestamps[known], se3.inverse(move) @ true)
+    left = moved.positions - track.positions[known]
+    return moved, float(np.sqrt(np.square(left).sum(axis=1).mean()))

@@ -52,7 +52,7 @@ class RunSpec(Record):
         degrade: Strengths of `DegradeFrames`, e.g. ``{"blur": 0.5}``.
         data_root: Folder of the recorded sequences; None for the default one.
         camera: Camera of a folder that does not say its own.
-        video: Whether to write ``video.mp4``.
+        video: Whether to write ``video.webm``.
         sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
         label: Name in tables, in place of the tracker's; no part of the run's identity.
         limits: What it may take.

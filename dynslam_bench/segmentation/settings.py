@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from pydantic import field_validator
@@ -128,6 +129,18 @@ class SegmentationSettings(Settings):
     def idle(self) -> str:
         """Without a source nothing here has an effect."""
         return "segmentation.source is 'none'" if self.source == "none" else ""
+
+    @property
+    def unused(self) -> Mapping[str, str]:
+        """What no network is asked for: exact masks are certain, and only some networks take another size of input."""
+        kind = self.source.partition(":")[0]
+        fields = {
+            "oracle": ("confidence", "mask_threshold", "nms_iou", "network_side"),
+            "recorded": ("mask_threshold", "nms_iou", "network_side"),
+            "embedded": ("network_side", "classes"),  # it knows people alone
+            "onnx": ("network_side",),
+        }
+        return dict.fromkeys(fields.get(kind, ()), f"segmentation.source is {self.source!r}")
 
     def class_names(self) -> frozenset[str]:
         """The COCO names of the classes held for dynamic."""

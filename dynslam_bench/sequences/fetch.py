@@ -6,9 +6,9 @@ import errno
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from dynslam_bench.core.download import Report, download, file_sha256
+from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha256
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
@@ -18,6 +18,7 @@ from dynslam_bench.core.records import Record
 
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from .published.archives import extract
+from .published.cameras import find_camera
 from .readers.diagnostics import Dropped
 
 RECEIPT = "fetched.json"
@@ -136,12 +137,10 @@ def fetch(
     entry, address = found.entry, url or found.entry.url
     archive = find_data_root(data_root) / ".downloads" / _archive_name(address, entry)
     expected = entry.sha256 if checksum else None
-    most = {} if entry.size_bytes is None or not checksum else {"most_bytes": entry.size_bytes}
+    how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
+    how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
     try:
-        sha256 = download(
-            address, archive, sha256=expected, progress=progress, attempts=attempts, wait_s=wait_s,
-            timeout_s=timeout_s, **most,
-        )  # fmt: skip
+        sha256 = download(address, archive, sha256=expected, **how)
     except DownloadError as error:
         raise SequenceError(str(error.args[0]), error.hint) from error
     try:
@@ -184,25 +183,31 @@ def _extract(found: Status, archive: Path, sha256: str, address: str, checked: b
 
 
 def verify(
-    name: str, *, data_root: str | Path | None = None, progress: Callable[[int, int], None] | None = None
+    name: str,
+    *,
+    data_root: str | Path | None = None,
+    camera: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Verification:
     """Decode every frame, and compare every file with the checksum taken when it was fetched.
 
     Args:
         name: Id, published folder name or path of a sequence that is here.
         data_root: Folder of the sequences.
+        camera: Camera of a folder that does not say its own, as in `open_sequence`.
         progress: Called with frames done and frames in all.
 
     Raises:
-        SequenceError: Unknown id, or the sequence is not here.
+        SequenceError: Unknown id, or the sequence is not here, or it needs a `camera` to be named.
     """
     entry = entry_of(name)
     folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root).folder
     if folder is None or not folder.is_dir():
         open_sequence(name, data_root=data_root)  # says what is missing
         raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
+    find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
     try:
-        sequence = open_folder(folder, entry=entry)
+        sequence = open_folder(folder, entry=entry, camera=camera)
     except DynslamError as error:
         return Verification(name, folder, 0, (str(error),), False, None)
     faults = []

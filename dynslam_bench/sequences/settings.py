@@ -17,14 +17,13 @@ class PreprocessingSettings(Settings):
     The order is: synchronise, undistort, resize, normalise.
     """
 
-    max_time_difference_s: float = tunable(
+    max_time_difference_s: float = Field(
         0.02,
-        low=0.005,
-        high=0.04,
-        limits=(1e-6, 1.0),
-        unit="s",
-        meaning="colour and depth images further apart than this (strictly) are not paired",
+        ge=1e-6,
+        le=1.0,
+        description="colour and depth images further apart than this (s, strictly) are not paired",
     )
+    """Decides which frames there are, and so is nothing to tune."""
     width: int | None = Field(
         default=None, ge=16, le=16384, description="width of the common resolution; none: as recorded"
     )

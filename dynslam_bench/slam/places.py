@@ -9,8 +9,9 @@ among the keyframes. Nothing is trained, stored or downloaded: the pieces are th
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import kernel
 
 from .localisation.observation import Observations
 from .mapping.map import Map
@@ -49,7 +50,7 @@ def most_alike(world: Map, keyframes: NDArray[np.int64], seen: Observations, cou
     return [int(slot) for slot in keyframes[order[:count]]]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _count(
     pieces: Pieces,
     kf_point: NDArray[np.int32],
@@ -71,7 +72,7 @@ def _count(
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _scores(
     pieces: Pieces,
     kf_point: NDArray[np.int32],

@@ -8,6 +8,8 @@ from pydantic import Field
 
 from dynslam_bench.core.settings import Settings, tunable
 
+ADJUSTED, FILTERED = {"enabled": [True]}, {"filter": [True]}
+
 
 class TrackingSettings(Settings):
     """Finding the pose of a frame against the map."""
@@ -144,9 +146,7 @@ class KeyframeSettings(Settings):
         limits=(0.1, 1.0),
         meaning="a keyframe goes when this share of its points is seen by three others at the same scale or finer",
     )
-    maximum: int = tunable(
-        600, low=50, high=2000, limits=(10, 100000), scale="log", meaning="keyframes kept at most; bounds the memory"
-    )
+    maximum: int = Field(600, ge=10, le=100000, description="keyframes kept at most; bounds the memory")
     depth_images: int = Field(8, ge=0, le=1000, description="newest keyframes that keep their depth image, for filters")
 
 
@@ -186,12 +186,24 @@ class BundleAdjustmentSettings(Settings):
     """Local bundle adjustment at each keyframe; its work is bounded by counts, never by the clock."""
 
     enabled: bool = tunable(True, meaning="whether to refine keyframes and points at each keyframe")
-    solver: Literal["schur", "gtsam"] = tunable("schur", meaning="own vectorised Schur complement, or gtsam")
+    solver: Literal["schur", "gtsam"] = tunable(
+        "schur", when=ADJUSTED, meaning="own vectorised Schur complement, or gtsam"
+    )
     window: int = tunable(
-        8, low=2, high=20, limits=(1, 100), meaning="keyframes that are refined: the newest and its covisible ones"
+        8,
+        low=2,
+        high=20,
+        limits=(1, 100),
+        when=ADJUSTED,
+        meaning="keyframes that are refined: the newest and its covisible ones",
     )
     fixed: int = tunable(
-        6, low=1, high=20, limits=(0, 100), meaning="further keyframes that see the same points and stay where they are"
+        6,
+        low=1,
+        high=20,
+        limits=(0, 100),
+        when=ADJUSTED,
+        meaning="further keyframes that see the same points and stay where they are",
     )
     observations: int = tunable(
         6000,
@@ -199,9 +211,12 @@ class BundleAdjustmentSettings(Settings):
         high=20000,
         limits=(100, 1000000),
         scale="log",
+        when=ADJUSTED,
         meaning="observations used at most: the budget that bounds the keyframe's step",
     )
-    iterations: int = tunable(3, low=1, high=10, limits=(1, 100), meaning="Levenberg-Marquardt iterations")
+    iterations: int = tunable(
+        3, low=1, high=10, limits=(1, 100), when=ADJUSTED, meaning="Levenberg-Marquardt iterations"
+    )
 
 
 class RelocalisationSettings(Settings):
@@ -232,7 +247,10 @@ class MotionModelSettings(Settings):
     """White-noise acceleration as motion model: prediction and filter while tracking, smoother afterwards."""
 
     filter: bool = tunable(True, meaning="weigh the pose that the image gives against the motion model, causally")
-    smooth: bool = tunable(True, meaning="smooth the final trajectory; the online one is never touched afterwards")
+    smooth: bool = Field(
+        True,
+        description="smooth the final trajectory; the online one (that of studies) is never touched afterwards",
+    )
     acceleration: float = tunable(
         4.0,
         low=0.5,
@@ -240,6 +258,7 @@ class MotionModelSettings(Settings):
         limits=(0.001, 10000.0),
         scale="log",
         unit="m/s^2",
+        when=FILTERED,
         meaning="standard deviation of the camera's acceleration",
     )
     angular_acceleration: float = tunable(
@@ -249,6 +268,7 @@ class MotionModelSettings(Settings):
         limits=(0.001, 100000.0),
         scale="log",
         unit="rad/s^2",
+        when=FILTERED,
         meaning="standard deviation of the camera's angular acceleration",
     )
     inflation: float = tunable(
@@ -257,6 +277,7 @@ class MotionModelSettings(Settings):
         high=300.0,
         limits=(0.01, 10000.0),
         scale="log",
+        when=FILTERED,
         meaning="factor on the covariance of a measured pose, whose pixel errors are not independent",
     )
     max_gap_s: float = tunable(
@@ -265,6 +286,7 @@ class MotionModelSettings(Settings):
         high=1.0,
         limits=(0.001, 1000.0),
         unit="s",
+        when=FILTERED,
         meaning="after a longer gap between frames nothing is assumed of the motion",
     )
 

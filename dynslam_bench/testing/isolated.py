@@ -6,14 +6,14 @@ for too long, the check that it was at has failed, and another child goes on wit
 
 from __future__ import annotations
 
-import tempfile
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import errors
 from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.temporary import TemporaryFolder
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.handle import start_child
 from dynslam_bench.runs.process.job import make_job
@@ -73,11 +73,11 @@ def isolated_tracker_report(
     limits = Limits(start_s=start_s, frame_s=frame_s, memory_mb=memory_mb)
     while True:
         follow = _Follower(known, on_check, on_wait)
-        with tempfile.TemporaryDirectory(prefix="dynslam-test-") as folder:
-            log = LogFile(Path(folder) / LOG_FILE)
+        with contextlib.closing(TemporaryFolder()) as folder:
+            log = LogFile(folder.path / LOG_FILE)
             told = [asdict(check) for check in known]
             wanted = {"tracker": tracker, "settings": dict(settings or {}), "frames": frames, "seed": seed}
-            job = make_job(_WORK, folder, spec={"threads": 1}, known=told, **wanted)
+            job = make_job(_WORK, folder.path, spec={"threads": 1}, known=told, **wanted)
 
             def tick(log: LogFile = log, follow: _Follower = follow) -> None:
                 log.look()

@@ -9,7 +9,7 @@ from ..figures.style import colours, safe
 from ..model.board import Board
 from ..model.common import common_errors, representatives
 from ..model.missing import missing_commands, missing_note
-from ..model.published import is_excerpt, reported_for
+from ..model.published import is_excerpt, least_length_s, reported_for
 from ..model.rows import Loaded
 from ..model.statistics import FEWEST, power_note
 from ..tables import fairness as fairness_tables
@@ -98,6 +98,15 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)
+    beside = {cell.sequence for cell in published}
+    unsure = sorted(
+        {row.sequence for row in board.rows if board.sequence(row) in beside and not least_length_s(row.sequence)}
+    )
+    if unsure:
+        section.notes.append(
+            f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
+            "are of the whole recordings is not checked."
+        )
     table_of_errors = sequence_tables.per_sequence(board, protocol, published)
     section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
     common, frames = common_errors(board, protocol, loaded)

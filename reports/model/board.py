@@ -52,6 +52,7 @@ class Board:
         never_move: Sequence to the error of a camera that does not move.
         reference: Variant key of the reference; None if ratios are to a camera that never moves.
         reference_name: How to call the reference in captions.
+        asked_reference: The tracker id that was asked for as the reference; empty for none.
         standings: Standing of every variant with a score on the common sequences, in order.
         ranked: Variant keys that take part in the ranking.
         incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
@@ -74,6 +75,7 @@ class Board:
     never_move: dict[str, float] = field(default_factory=dict)
     reference: str | None = None
     reference_name: str = NEVER_MOVE
+    asked_reference: str = ""
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
@@ -135,14 +137,14 @@ class Board:
 
 
 def make_board(
-    rows: Sequence[RunRow], reference: str = DEFAULT_REFERENCE, on: On = "common", *, rank_seen: bool = False
+    rows: Sequence[RunRow], reference: str | None = None, on: On = "common", *, rank_seen: bool = False
 ) -> Board:
     """Order rows into a board.
 
     Args:
         rows: One a run.
-        reference: Tracker id that errors are divided by; where it was not run on every ranked sequence, a camera that
-            never moves takes its place.
+        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Where it was not
+            run on every ranked sequence, a camera that never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 
@@ -153,9 +155,9 @@ def make_board(
         raise ReportError("there are no runs to report")
     check_one_protocol(rows)
     known = sorted({row.tracker for row in rows})
-    if reference not in known and reference != DEFAULT_REFERENCE:
+    if reference is not None and reference not in known:
         raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, known))
-    board = Board(list(rows), on, rank_seen, name_columns(rows))
+    board = Board(list(rows), on, rank_seen, name_columns(rows), asked_reference=reference or "")
     board.labels = make_labels(rows)
     _order_sequences(board)
     for key in board.labels:
@@ -167,9 +169,8 @@ def make_board(
     board.final_only = [key for key in board.labels if key not in shown]
     scored = [key for key in shown if any(_scored(board, key))]
     _choose_ranked(board, scored)
-    candidates = [
-        k for k in scored if board.first(k).tracker == reference and set(board.common) <= set(_scored(board, k))
-    ]
+    wanted = reference or DEFAULT_REFERENCE
+    candidates = [k for k in scored if board.first(k).tracker == wanted and set(board.common) <= set(_scored(board, k))]
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
         board.reference_name = board.labels[board.reference]

@@ -27,14 +27,15 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
         labels: Variant key to the name of the tracker in tables, see `make_labels`.
 
     Returns:
-        One line a run, ordered by label, sequence and repeat. ``string`` columns: run_id, kind (``run here``,
-        ``imported``), tracker, label, settings (what sets the variant apart, ``name=value; ...``), provenance,
-        sequence (name of the column in tables), column_id, frames, split, repeat, status, ending (of a failed run),
-        protocol_id, protocol_digest, trajectory (``online``, ``final``: whose errors they are), segmentation.
+        One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
+        run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
+        ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
+        status, ending (of a failed run), protocol_id, protocol_digest, trajectory (``online``, ``final``: whose errors
+        they are), segmentation.
         ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked. ``boolean``:
         ranked, failed, cached (whether stage times come from the stage cache), seen_in_training (whether the masks
-        come from a network that was trained on the scene). ``float64``, nan where unknown:
-        coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
+        come from a network that was trained on the scene). ``Float64``: coverage and
+        epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
         failures as never moving or worse), held_ate_m, final_ate_m and never_move_m (metres), frame_ms (median,
         milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
         rotation_uncertainty_deg (standard error in degrees of the alignment's rotation; above 10 the metrics
@@ -46,7 +47,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
     metrics = sorted({name for row in rows for name in row.metrics})
     kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
-    kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "float64")
+    kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "Float64")
     lines = []
     for row in ordered:
         own: dict[str, Any] = {

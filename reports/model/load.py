@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.storage.store import RunStore
 
-from .board import DEFAULT_REFERENCE, Board, On, make_board
+from .board import Board, On, make_board
 from .columns import name_columns
 from .frame import rows_frame
 from .labels import make_labels
@@ -42,7 +42,7 @@ def load_board(
     results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
     protocol: Protocol | str = "tum-rgbd/v1",
     *,
-    reference: str = DEFAULT_REFERENCE,
+    reference: str | None = None,
     on: On = "common",
     rank_seen: bool = False,
 ) -> Board:

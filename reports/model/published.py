@@ -9,11 +9,15 @@ from functools import cache
 from importlib.resources import files
 
 CLAIMED = "claimed by the paper"
-_SITTING_S = {"static": 23.63, "xyz": 42.50, "halfsphere": 37.15, "rpy": 27.48}
-_WALKING_S = {"static": 24.83, "xyz": 28.83, "halfsphere": 35.81, "rpy": 30.61}
-_TUM_S = {f"tum/fr3/sitting_{name}": seconds for name, seconds in _SITTING_S.items()}
-_TUM_S |= {f"tum/fr3/walking_{name}": seconds for name, seconds in _WALKING_S.items()}
-_BONN_S = 10.0
+_FPS = 30.0
+_SITTING = {"static": 680, "xyz": 1219, "halfsphere": 1074, "rpy": 795}
+_WALKING = {"static": 717, "xyz": 825, "halfsphere": 1021, "rpy": 866}
+_LEAST_FRAMES = {f"tum/fr3/sitting_{name}": frames for name, frames in _SITTING.items()}
+_LEAST_FRAMES |= {f"tum/fr3/walking_{name}": frames for name, frames in _WALKING.items()}
+_LEAST_FRAMES |= {"bonn/crowd": 425}
+"""So many frames a recording has at least. TUM: the pairs of colour and depth in the association files that are
+published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt that is numbered as
+in the whole, counted from 0. Of others no source was read."""
 
 
 @dataclass(frozen=True)
@@ -99,14 +103,18 @@ def _claimed(*, table: str, value: str, **words: str) -> Claimed:
     return Claimed(table=int(table), value=float(value), digits=len(value.partition(".")[2]), **words)
 
 
+def least_length_s(sequence: str) -> float | None:
+    """How long a published recording lasts at least, in seconds; None where that is not known."""
+    frames = _LEAST_FRAMES.get(sequence)
+    return None if frames is None else frames / _FPS
+
+
 def is_excerpt(sequence: str, duration_s: float) -> bool:
     """Whether a recording under a published name is so short that it can only be a part of it.
 
-    The recorded lengths are those of the TUM benchmark's page; every sequence of the Bonn data set lasts longer than
-    `_BONN_S`. Of others nothing is known.
+    Of those whose length is not known (`least_length_s`) it is not said.
     """
-    whole = _TUM_S.get(sequence, _BONN_S if sequence.startswith("bonn/") else 0.0)
-    return duration_s < 0.9 * whole
+    return duration_s < 0.9 * (least_length_s(sequence) or 0.0)
 
 
 def reported_for(sequences: Sequence[str], alignment: str = "se3") -> list[ReportedCell]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +27,13 @@ from .row_values import (
     part_words,
     variant_of,
 )
+
+OnProgress = Callable[[float, float | None, str], None]
+"""Called as ``on_progress(done, total, what)``; the total is None where it is not known."""
+
+
+def unheard(done: float, total: float | None, what: str) -> None:
+    """Progress that nobody wants to hear of."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ class Loaded:
         return {run.row.run_id: run for run in self.runs}
 
 
-def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
+def load_runs(sources: Sequence[RunStore], protocol: Protocol, on_progress: OnProgress = unheard) -> Loaded:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
 
     Raises:
@@ -85,7 +92,10 @@ def load_runs(sources: Sequence[RunStore], protocol: Protocol) -> Loaded:
     for store in sources:
         records, unreadable = store.all()
         loaded.unreadable += [f"{bad.path}: {bad.reason}" for bad in unreadable]
-        found += [LoadedRun(make_row(store, r, protocol), r, store) for r in records if r.status != "stopped"]
+        kept = [record for record in records if record.status != "stopped"]
+        for position, record in enumerate(kept):
+            on_progress(position, len(kept), f"scoring {record.tracker.id} on {record.sequence.id}")
+            found.append(LoadedRun(make_row(store, record, protocol), record, store))
         loaded.stopped += sum(record.status == "stopped" for record in records)
     _join_old_imports(found)
     newest: dict[tuple[object, ...], LoadedRun] = {}

@@ -107,6 +107,11 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, trackers that lack "
         "sequences or never succeeded.",
     ]
+    if board.asked_reference and board.reference is None:
+        parts.append(
+            f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a camera that "
+            "never moves takes its place."
+        )
     if epipolar:
         parts.append("F skipped: frames on which an epipolar system did not use its fundamental matrix.")
     if any(row.cached for row in board.rows):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
-from ..model.row import RunRow
+from ..model.row import SEEN, RunRow
 from .formats import mm
 from .metric import Value, column_marks, median_of
 from .table import Column, Emphasis, Table, TableCell
@@ -144,7 +144,8 @@ def _error_cells(
                 yield TableCell()
             else:
                 mark = marks[kind].get((key, name), "")
-                yield TableCell(mm(number) + LOST_MARK * lost, value=number, emphasis=mark)
+                seen = cell is not None and cell.seen
+                yield TableCell(mm(number) + SEEN * seen + LOST_MARK * lost, value=number, emphasis=mark)
 
 
 def _improvement_row(board: Board, subject: str, other: str, found: Mapping[str, Found]) -> list[TableCell]:

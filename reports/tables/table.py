@@ -87,10 +87,11 @@ class Table:
         title: Heading.
         caption: Everything a reader needs, including the protocol.
         columns: The columns.
+        rows: What is displayed, by row.
         shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
         values: The numbers behind it with all their digits, in the units that the caption and the headings name
             (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
-            ``Int64`` if all their numbers are whole, else ``float64``; missing where the cell has no number. Columns
+            ``Int64`` if all their numbers are whole, else ``Float64``; ``pd.NA`` where the cell has no number. Columns
             of text are ``string``.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
@@ -116,15 +117,11 @@ class Table:
         self.id, self.title, self.caption, self.brief = id, title, caption, brief or title
         self.columns = list(columns)
         self.muted_rows, self.separators = set(muted_rows), set(separators)
-        self.shown = pd.DataFrame([list(row) for row in rows], columns=range(len(self.columns)), dtype=object)
+        self.rows = [list(row) for row in rows]
+        self.shown = pd.DataFrame(self.rows, columns=range(len(self.columns)), dtype=object)
         series = [_values(column, self.shown[at]) for at, column in enumerate(self.columns)]
         self.values = pd.concat(series, axis=1)
         self.shown.columns = self.values.columns = pd.Index([column.key for column in self.columns])
-
-    @property
-    def rows(self) -> list[list[TableCell]]:
-        """What is displayed, by row."""
-        return [list(row) for row in self.shown.itertuples(index=False, name=None)]
 
     def frame(self) -> pd.DataFrame:
         """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
@@ -207,7 +204,7 @@ def _values(column: Column, shown: pd.Series) -> pd.Series:
     found = [cell.value for cell in shown]
     present = [value for value in found if value is not None]
     whole = bool(present) and all(isinstance(value, int) for value in present)
-    return pd.Series(found, dtype="Int64" if whole else "float64", name=column.key)
+    return pd.Series(found, dtype="Int64" if whole else "Float64", name=column.key)
 
 
 def _words(cell: TableCell) -> str:

@@ -30,8 +30,10 @@ from dynslam_bench.runs.storage.frames import FrameLog  # noqa: E402
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
 TRACKERS_WITH_F = (
-    "emfoa-oft", "emfoa-oft-paper", "emfoa-oft-no-masks", "emfoa-oft-paper-no-masks", "opf-slam", "chen-slam",
-    "blitz-slam", "mor-slam", "sgc-slam", "di-slam", "ds-slam", "sof-slam", "seg-slam",
+    "emfoa-oft", "emfoa-oft-no-depth-test", "emfoa-oft-lk", "emfoa-oft-patchmatch", "emfoa-oft-literal",
+    "emfoa-oft-object", "emfoa-oft-object-depth-test", "emfoa-oft-no-masks", "emfoa-oft-no-masks-no-depth-test",
+    "emfoa-oft-paper", "emfoa-oft-paper-sparse", "emfoa-oft-paper-no-masks", "opf-slam", "chen-slam", "blitz-slam",
+    "mor-slam", "sgc-slam", "di-slam", "ds-slam", "sof-slam", "seg-slam",
 )  # fmt: skip
 SEQUENCES = ("synthetic/walking_xyz@100", "synthetic/walking_halfsphere@100")
 

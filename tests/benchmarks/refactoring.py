@@ -2,6 +2,7 @@
 
     python tests/benchmarks/refactoring.py --record      # before: write refactoring.json beside this script
     python tests/benchmarks/refactoring.py               # after: compare, exit code 1 where anything differs
+    python tests/benchmarks/refactoring.py --only orb-slam2      # after, of some trackers
     python tests/benchmarks/refactoring.py --times 5     # frame times only, to be paired with another checkout's
 
 Twelve trackers on three sequences (two rendered instances that nobody tunes on, and the Bonn excerpt where it is
@@ -80,9 +81,12 @@ def main() -> int:
     """Record, compare, or time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", action="store_true")
-    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--only", nargs="+", choices=TRACKERS, default=TRACKERS, help="compare these trackers alone")
     parser.add_argument("--times", type=int, default=0, help="rounds over orb-slam2 and emfoa-oft; prints medians")
     arguments = parser.parse_args()
+    if arguments.record and arguments.only != TRACKERS:
+        parser.error("--record takes all trackers")
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     sequences = [name for name in SEQUENCES if name.startswith("synthetic/") or Path(name).is_dir()]
@@ -100,7 +104,7 @@ def main() -> int:
     digests = {}
     differing = []
     for name in sequences:
-        for tracker in TRACKERS:
+        for tracker in arguments.only:
             key = f"{tracker} | {'bonn/crowd' if name == str(EXCERPT) else name}"
             digests[key] = run(tracker, name, arguments.frames)[0]
             verdict = "" if arguments.record else ("same" if before["digests"].get(key) == digests[key] else "DIFFERS")

@@ -1,5 +1,6 @@
-"""Ctrl-C in long commands: they stop at once, say how to go on, and exit with 130."""
+"""Ctrl-C, SIGTERM and SIGHUP in long commands: they stop at once, say how to go on, and exit with the shell's code."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -19,8 +20,11 @@ STUDY = (
 )
 
 
-@pytest.mark.parametrize(("verb", "text"), [("bench", SUITE), ("tune run", STUDY)])
-def test_ctrl_c_stops_within_two_seconds(walk, tmp_path, verb, text):
+@pytest.mark.parametrize(
+    ("verb", "text", "number"),
+    [("bench", SUITE, signal.SIGHUP), ("bench", SUITE, signal.SIGTERM), ("tune run", STUDY, signal.SIGINT)],
+)
+def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     tracker = tmp_path / "waits.py"
     tracker.write_text(
         f"import sys; sys.path.insert(0, {str(HERE / 'runs')!r})\n"
@@ -47,15 +51,30 @@ def test_ctrl_c_stops_within_two_seconds(walk, tmp_path, verb, text):
             assert program.poll() is None, program.stderr.read()
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        program.send_signal(signal.SIGINT)
+        program.send_signal(number)
         began = time.monotonic()
         _, err = program.communicate(timeout=60)
         took = time.monotonic() - began
     finally:
         program.kill()
-    assert program.returncode == 130 and "the same command goes on from there" in err, err
+    assert program.returncode == 128 + number and "the same command goes on from there" in err, err
     assert took < 2 + 10 * (_load() > 4), f"{took:.1f} s"
     assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
+    assert not list(tmp_path.glob("results/runs/*")), "what was interrupted is no outcome"
+
+
+def test_ctrl_c_while_everything_still_loads_is_one_line_and_stores_nothing(walk, tmp_path):
+    """To the whole group, as a terminal sends it: the fork server is not hit, nothing counts as a crash."""
+    command = [sys.executable, "-m", "dynslam_bench.cli", "run", "never-move", str(walk), "--frames", "0:4"]
+    for delay in (0.3, 1.5):
+        program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+        time.sleep(delay)
+        os.killpg(program.pid, signal.SIGINT)
+        _, err = program.communicate(timeout=60)
+        if program.returncode == -signal.SIGINT:  # Python itself was still loading
+            continue
+        assert program.returncode == 130 and "Traceback" not in err, err
+        assert not list(tmp_path.glob("results/runs/*/run.json"))
 
 
 def _load():

@@ -8,7 +8,7 @@ import pytest
 from cli_errors import one_line
 
 from dynslam_bench.cli import output
-from dynslam_bench.cli.output import fitted, progress
+from dynslam_bench.cli.output import progress
 
 
 def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
@@ -88,13 +88,6 @@ def test_info_tells_a_program_what_it_may_set(cli):
         "tunable": False,
         "online": False,
     }
-
-
-def test_long_columns_give_way(monkeypatch):
-    rows = [["run", "settings", "reason"], ["12", "a=1, " * 20, "why " * 20]]
-    cut = fitted(rows, [1, 2], 60)
-    assert max(sum(map(len, row)) + 4 for row in cut) <= 110 and cut[1][1].endswith("…") and len(cut[1][1]) == 12
-    assert fitted(rows, [1], 400) == rows
 
 
 def test_progress_where_nobody_watches(capsys, monkeypatch):

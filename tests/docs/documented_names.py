@@ -76,6 +76,22 @@ def _docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
                     yield statement.value
 
 
+@cache
+def file_names() -> frozenset[str]:
+    """Names of the repository's own files, and of those that the package reads or writes as its strings tell."""
+    tracked = [*ROOT.glob("*"), *PAGES, *sources(), *(ROOT / "tests").rglob("*"), *(ROOT / ".ci").rglob("*")]
+    found = {file.name for file in tracked}
+    for file in sources():
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        texts = {id(node) for node in _docstrings(tree)}
+        constants = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in texts)
+        found.update(
+            re.split(r"[/\s]", node.value)[-1] for node in constants if isinstance(node.value, str) and node.value
+        )
+    data = [file for room in ROOMS for file in (ROOT / room).rglob("*.*") if file.suffix not in (".py", ".pyc")]
+    return frozenset(found | {file.name for file in data})
+
+
 def in_pages() -> Iterator[Mention]:
     """Inline code of all pages (fenced blocks are commands, which are tested elsewhere, or made-up files)."""
     for page in PAGES:

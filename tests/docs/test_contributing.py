@@ -50,6 +50,21 @@ def test_every_room_is_on_the_tour() -> None:
     assert not rooms - named - {"dynslam_bench", "tests"}
 
 
+def doors() -> list[tuple[list[str], str]]:
+    """Every door of the tour, with the rooms of its line."""
+    tour = TEXT.partition("## A tour of the rooms")[2].partition("\n## ")[0]
+    lines = [line.split("|")[1:-1] for line in tour.splitlines() if line.startswith("| `")]
+    cells = [(re.findall(r"`([\w/]+)`", rooms), re.findall(r"`([\w/.]+)`", named)) for rooms, _, named in lines]
+    return [(rooms, door) for rooms, named in cells for door in named]
+
+
+def test_every_door_is_in_its_room() -> None:
+    assert len(doors()) > 15
+    for rooms, door in doors():
+        places = [base / room / door for room in rooms for base in (ROOT, ROOT / "dynslam_bench")]
+        assert any(place.exists() for place in places), f"there is no {door} in {rooms}"
+
+
 def _functions() -> list[tuple[str, int]]:
     found = []
     for room in ("dynslam_bench", "envs", "tuning", "reports"):
@@ -74,9 +89,15 @@ LONG_FUNCTIONS = {
 def test_files_and_functions_stay_readable() -> None:
     long_files = {
         str(file.relative_to(ROOT))
-        for room in ("dynslam_bench", "envs", "tuning", "reports")
+        for room in ("dynslam_bench", "envs", "tuning", "reports", "tests")
         for file in (ROOT / room).rglob("*.py")
         if len(file.read_text().splitlines()) > 400
     }
     assert not long_files
     assert {name for name, lines in _functions() if lines > 60} == set(LONG_FUNCTIONS)
+
+
+def test_kernels_are_compiled_in_one_way() -> None:
+    users = [file for room in ("dynslam_bench", "envs", "tuning", "reports") for file in (ROOT / room).rglob("*.py")]
+    found = [file.relative_to(ROOT) for file in users if re.search(r"\b(njit|jit)\(|@n?jit", file.read_text())]
+    assert found == [Path("dynslam_bench/core/compiled.py")]

@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import typer.main
-from documented_names import IDENTIFIER, SUFFIXES, Mention, exists, in_docstrings, in_pages, links, words
+from documented_names import (
+    IDENTIFIER,
+    SUFFIXES,
+    Mention,
+    exists,
+    file_names,
+    in_docstrings,
+    in_pages,
+    links,
+    words,
+)
 
 from dynslam_bench.cli.app import app
 from dynslam_bench.core.settings import field_names
@@ -34,6 +44,14 @@ FOREIGN = {
 """First parts of names that belong to other libraries and that our code never spells."""
 FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--fixed_delta"}
 """Options of the help, of pip, and of the TUM benchmark's scripts."""
+FOREIGN_FILES = {
+    "associate.py": "a script of the TUM benchmark",
+    "evaluate_rpe.py": "a script of the TUM benchmark",
+    "times.txt": "a file of KITTI",
+    "masks.txt": "written below the name of each kind of image",
+    "my_tracker.py": "the reader's",
+}
+"""File names that are not ours, and those that the code puts together."""
 POSE = re.compile(r"[TR]_[a-z]+_[a-z]+")
 """Poses by their frames of reference; the notation, not a variable."""
 
@@ -67,6 +85,16 @@ def test_files_and_folders_exist() -> None:
     path = re.compile(r"(?:[\w.-]+/)+(?:[\w.-]+\.(?:py|toml|md|jsonl))?")
     named = [m for m in MENTIONS if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
     assert not missing(named, lambda text: exists(text) or (text.endswith("/") and text.strip("/") in words()))
+
+
+def test_bare_file_names_exist() -> None:
+    name = re.compile(rf"[\w-]*[A-Za-z_][\w-]*(?:\.[\w-]+)*\.{SUFFIXES}")
+    named = [m for m in MENTIONS if name.fullmatch(m.text)]
+    assert len(named) > 100
+    known = file_names() | set(FOREIGN_FILES)
+    assert not missing(named, known.__contains__)
+    assert missing([Mention("a page", "splitss.py"), Mention("a page", "runs.jsom")], known.__contains__)
+    assert not set(FOREIGN_FILES) & file_names(), "no exception without need"
 
 
 def test_links_lead_somewhere() -> None:

@@ -18,6 +18,7 @@ PRIVATE = {
         {"_moving_corners"},
         "a box's corners decide the rule",
     ),
+    "core/test_core_hostile_text.py": ({"_exit"}, "os._exit: a process that dies at once"),
     "envs/envs_toys.py": ({"_exit"}, "os._exit: a process that dies at once"),
     "flow/test_flow_maps.py": ({"_binomial"}, "exact weights, before they are folded into a kernel"),
     "flow/test_flow_sparse.py": ({"_runner"}, "counts the threads' work, which no result shows"),
@@ -32,8 +33,8 @@ PRIVATE = {
         {"_command", "_exchange", "_process", "_program"},
         "kills the program, or looks for what it left on the disk",
     ),
+    "tuning/test_study_trust.py": ({"_cmaes", "_mean"}, "Optuna's module that unpickles, and the state it restores"),
     "trackers/systems/test_method_page.py": ({"_flow"}, "the flow that the page promises is the one that runs"),
-    "trackers/test_steering.py": ({"_built", "_steering"}, "which part took a setting, before any frame shows it"),
     "trackers/systems/test_systems.py": ({"_filters", "_masks"}, "what a system is composed of"),
     "trackers/systems/test_systems_bridging.py": ({"_filters", "_masks"}, "puts known masks in place of a network's"),
     "trackers/systems/test_systems_lost_flow.py": (
@@ -125,7 +126,8 @@ def test_the_checker_sees_what_it_is_for() -> None:
 
 
 def test_private_names_are_asked_for_with_a_reason() -> None:
-    found = {str(file.relative_to(TESTS)): private_names(ast.parse(file.read_text(encoding="utf-8"))) for file in FILES}
+    files = [file for file in FILES if "fuzz" not in file.parts]  # it names the functions whose lines it counts
+    found = {str(file.relative_to(TESTS)): private_names(ast.parse(file.read_text(encoding="utf-8"))) for file in files}
     beyond = {file: names - PRIVATE.get(file, (set(), ""))[0] for file, names in found.items()}
     assert {file: names for file, names in beyond.items() if names} == {}
     assert all(reason for _, reason in PRIVATE.values())

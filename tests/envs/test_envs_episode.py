@@ -125,7 +125,7 @@ def test_info_holds_no_times_and_timings_do() -> None:
     _, infos, _ = play(env)
     assert not any("time" in key and key != "timestamp" for info in infos for key in info)
     assert len(env.timings) == 5
-    assert list(env.timings[0]) == ["read", "total", "features", "tracking"]
+    assert list(env.timings[0]) == ["read", "total", "processor", "features", "tracking"]
 
 
 def test_pose_in_info_is_the_tracked_pose() -> None:

@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
+from evaluation_walks import noisy, turned, walk
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import (
     PROTOCOLS,
     Evaluation,
     Protocol,
-    RPESpec,
     common_frames,
     compare_masks,
-    compare_protocols,
     coverage,
     evaluate,
     evaluate_files,
@@ -25,23 +24,6 @@ from dynslam_bench.evaluation.segments import segment_errors
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import write_tum
-
-
-def walk(seed=0, n=200, rate=30.0):
-    rng = np.random.default_rng(seed)
-    poses = [se3.exp(rng.normal(size=6))]
-    for _ in range(n - 1):
-        poses.append(poses[-1] @ se3.exp(rng.normal(0, 0.01, 6)))
-    return Trajectory(np.round(1311868163.0 + np.arange(n) / rate, 6), np.array(poses))
-
-
-def noisy(truth, seed=1, size=0.01):
-    rng = np.random.default_rng(seed)
-    return Trajectory(truth.timestamps, truth.T_world_cam @ se3.exp(rng.normal(0, size, (len(truth), 6))))
-
-
-def turned(trajectory, seed):
-    return trajectory.transformed(se3.exp(np.random.default_rng(seed).normal(0, 2, 6)))
 
 
 def close(a, b, tolerance=1e-9):
@@ -296,34 +278,7 @@ def test_a_short_trajectory_leaves_out_what_is_not_defined():
     assert "no pair of poses for the relative error over 1s; it is left out" in result.diagnostics
 
 
-# -- protocols
-
-
-def test_protocols_are_frozen_told_apart_and_described():
-    digests = {protocol.digest() for protocol in PROTOCOLS.values()}
-    assert len(digests) == len(PROTOCOLS)
-    tum = get_protocol("tum-rgbd/v1")
-    assert get_protocol(tum) is tum
-    assert tum.digest() == "1190f97bbd77"  # stored with every number: a change of v1 is a new version
-    for change in ({"max_dt": 0.03}, {"strict": False}, {"alignment": "sim3"}, {"lost_frames": "hold"}, {"rpe": ()}):
-        assert tum.model_copy(update=change).digest() != tum.digest()
-    with pytest.raises(Exception, match="frozen"):
-        tum.max_dt = 1.0
-    assert tum.describe() == (
-        "tum-rgbd/v1: SE(3)-aligned, |dt| < 0.02 s one-to-one, RPE over 1 s (TUM pairs) and 1 frame (TUM pairs), "
-        "online trajectory, lost frames excluded [1190f97bbd77]"
-    )
-    assert Protocol.model_validate_json(tum.model_dump_json()) == tum
-
-
-def test_unknown_protocol_has_a_did_you_mean():
-    with pytest.raises(EvaluationError, match=r"unknown protocol 'tum-rgbd'.*did you mean 'tum-rgbd/v1'"):
-        get_protocol("tum-rgbd")
-
-
-def test_a_delta_in_frames_is_whole():
-    with pytest.raises(ValueError, match="whole number"):
-        RPESpec(delta=1.5, unit="f")
+# -- files
 
 
 def test_the_record_survives_the_disk(tmp_path):
@@ -342,24 +297,6 @@ def test_files_and_their_notes(tmp_path):
     assert result.metrics["ate_rmse_m"] == pytest.approx(
         evaluate(noisy(walk()), walk()).metrics["ate_rmse_m"], abs=1e-6
     )
-
-
-def test_compare_protocols_shows_how_far_they_are_apart():
-    truth = walk(n=400)
-    rows = compare_protocols(turned(noisy(truth), 2), truth)
-    by_label = {row.label: row for row in rows}
-    assert (
-        by_label["not aligned"].rmse_m
-        > by_label["origin-aligned"].rmse_m
-        > by_label["SE(3)-aligned (TUM's ATE)"].rmse_m
-    )
-    assert by_label["Sim(3)-aligned"].rmse_m <= by_label["SE(3)-aligned (TUM's ATE)"].rmse_m
-    assert {row.metric for row in rows} == {"ATE", "RPE"}
-    assert all(row.rmse_m is not None and row.pairs > 0 for row in rows)
-    short = compare_protocols(noisy(walk(n=20)), walk(n=20))
-    missing = next(row for row in short if row.label == "TUM, 1 s, fixed delta")
-    assert missing.rmse_m is None
-    assert "1 s" in missing.note
 
 
 def test_pose_errors_series_gives_the_ate():

@@ -1,13 +1,13 @@
 """The report of a results folder: what is in it, what it refuses, and that the page needs no network."""
 
-import csv
 import json
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from reports_fake_store import add_run, fill, truth_of
+from reports_fake_store import add_run, truth_of
+from reports_rows import rows_of
 
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
@@ -15,28 +15,11 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.figures.sequence import broken
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.columns import shortened
 from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.model.rows import check_one_protocol, load_runs
-from dynslam_bench.reports.tables.latex import to_latex
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.reports.tables.sequences import per_sequence
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_markdown
 from dynslam_bench.runs.storage.store import RunStore
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """One filled store and its report, made once."""
-    root = tmp_path_factory.mktemp("results")
-    store = fill(root / "results")
-    add_run(store, "orb-slam3", "synthetic/walking_xyz", kind="imported", label="ORB-SLAM3", error=0.08, frame_s=None)
-    return store, build_report(store, root / "report")
-
-
-def rows_of(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 class Page(HTMLParser):
@@ -297,37 +280,6 @@ def test_the_final_trajectory_has_its_own_table(tmp_path):
     assert expected < 0.5 * evaluate(store.trajectory(run_id), truth_of("s/a")).metrics["ate_rmse_m"]
 
 
-# -- compare
-
-
-def test_compare_finds_what_changed(made, tmp_path):
-    store, paths = made
-    walking = ["synthetic/walking_xyz", "synthetic/walking_rpy"]
-    better = fill(tmp_path / "b", trackers={"orb-slam2": 0.10, "mask-rcnn": 0.002}, sequences=walking)
-    comparison = compare(store, better)
-    changed = comparison.overall["Mask R-CNN (our back end)"]
-    assert changed.value == pytest.approx(0.1, rel=0.1)
-    assert np.isnan(changed.high)  # two sequences give no interval
-    same = comparison.overall["ORB-SLAM2 (our back end)"]
-    assert same.value == pytest.approx(1.0)
-    verdicts = {row[0].text: row[5].text for row in comparison.table.rows if row[1].text.startswith("all ")}
-    assert verdicts["Mask R-CNN (our back end)"] == "B better on 2 of 2, too few to tell"
-    assert verdicts["ORB-SLAM2 (our back end)"] == "equal"
-    assert comparison.only_a == 12 + 12 + 1 + 3 * 6
-    assert comparison.only_b == 0
-    assert compare(paths.data.parent, paths.data).overall.keys() == compare(store, store).overall.keys()
-    assert all(interval.value == 1 for interval in compare(store, store).overall.values())
-    assert "| Mask R-CNN (our back end) | all 2 sequences |" in comparison.to_markdown()
-
-
-def test_compare_refuses_what_has_nothing_in_common(made, tmp_path):
-    store, _ = made
-    other = RunStore(tmp_path / "b")
-    add_run(other, "new-tracker", "s/a")
-    with pytest.raises(ReportError, match=r"\(61 runs\) and .* \(1 runs\) have no tracker and sequence in common"):
-        compare(store, other)
-
-
 # -- reported rows
 
 
@@ -377,30 +329,6 @@ def test_trackers_that_lack_sequences_are_shown_but_not_ranked():
     assert matrix.rows[[r[0].text for r in matrix.rows].index("H")][2].text == "–"
 
 
-def test_sequences_are_grouped_from_static_to_dynamic():
-    tags = {"z": ["static"], "b": ["high-dynamic"], "a": ["low-dynamic"], "c": ["high-dynamic"], "d": []}
-    board = make_board([row(sequence=name, tags=found) for name, found in tags.items()])
-    assert board.sequences == ["z", "a", "b", "c", "d"]
-    assert [board.groups[s] for s in board.sequences] == [
-        "static",
-        "low dynamic",
-        "high dynamic",
-        "high dynamic",
-        "other",
-    ]
-
-
-def test_names_lose_what_all_share():
-    names = ["synthetic/walking_xyz@0?frames=60", "synthetic/sitting_xyz@0?frames=60"]
-    assert list(shortened(names).values()) == ["walking_xyz", "sitting_xyz"]
-    assert list(shortened([*names, "synthetic/sitting_xyz@1"]).values()) == [
-        "walking_xyz@0?frames=60", "sitting_xyz@0?frames=60", "sitting_xyz@1",
-    ]  # fmt: skip
-    assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
-    assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
-    assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}
-
-
 def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     stamps = np.r_[0:0.95:0.1, 1.05:2:0.1, 2.6:3:0.1]
     values = stamps[:, None] * [1.0, 2.0]
@@ -415,33 +343,3 @@ def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     assert len(t) < 420
     assert {long[0], long[4999], long[5000], long[-1]} <= set(t.tolist())
     assert np.isnan(v[:, 0]).sum() == 1
-
-
-def test_best_and_second_share_their_marks():
-    assert emphasise([3.0, 1.0, 2.0, 1.0, None]) == ["", "best", "second", "best", ""]
-    assert emphasise([1.0, None]) == ["", ""]
-
-
-def test_tables_in_every_format():
-    table = Table(
-        "t", "A & B", "50 % of_it.", [Column("name", numeric=False), Column("x", "G"), Column("y", "G")],
-        [[TableCell("a|b_*", tag="imported"), TableCell("0.5", "±0.1", 0.51234, "best"), TableCell()]],
-    )  # fmt: skip
-    assert "| a\\|b\\_\\* (imported) | **0.5** ±0.1 |  |" in to_markdown(table)
-    assert to_csv(table) == "name,G: x,G: y\na|b_* imported,0.51234,\n"
-    latex = to_latex(table)
-    assert r"\caption{A \& B.}" in latex
-    assert r"\multicolumn{2}{c}{G}" in to_latex(
-        Table("t", "t", "", table.columns, [[*table.rows[0][:2], TableCell("1")]])
-    )
-    assert r"a\textbar{}b\_* & \textbf{0.5} \\" in latex
-
-
-def test_a_table_is_two_frames():
-    cells = [[TableCell("a"), TableCell("0.5", "±0.1", 0.51234), TableCell("3", value=3)]]
-    cells.append([TableCell("b"), TableCell("–"), TableCell()])
-    table = Table("t", "T", "c", [Column("name", numeric=False), Column("x"), Column("y")], cells)
-    assert table.rows == cells
-    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "float64", "y": "Int64"}
-    assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
-    assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"

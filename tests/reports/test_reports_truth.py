@@ -1,50 +1,19 @@
 """What a glance at the report says is true: on uneven, failing, repeated, cached and confusable results."""
 
-import csv
-
-import numpy as np
+import pandas as pd
 import pytest
 from reports_fake_store import add_run
+from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
 
-from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import build_report, compare, load_frame
+from dynslam_bench.reports import build_report, load_frame
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.columns import name_columns
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
-from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.formats import mm, percent
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.reports.tables.sequences import per_sequence, relative_errors
 from dynslam_bench.runs.storage.store import RunStore
-
-PROTOCOL = get_protocol("tum-rgbd/v1")
-
-
-def rows_of(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def row(tracker="a", sequence="s", error=0.1, **changes):
-    base = dict(
-        run_id="r", kind="run here", tracker=tracker, label=tracker.upper(), sequence=sequence, protocol_id="p",
-        protocol_digest="d", metrics={"ate_rmse_m": error, "rpe_1s_trans_rmse_m": error / 2}, held_ate_m=error,
-        never_move_m=0.3, coverage=1.0, n_frames=60, n_processed=60, n_tracked=60,
-    )  # fmt: skip
-    return RunRow(**(base | changes))
-
-
-def crashed(tracker="c", sequence="s", error=0.001, **changes):
-    """A run that died at frame 20 of 60, with a tiny error until then."""
-    done = dict(failed=True, status="crashed", n_processed=20, n_tracked=20, coverage=1 / 3, reason="boom")
-    return row(tracker, sequence, error, **(done | changes))
-
-
-def cell_of(table, name, column=1):
-    return next(cells for cells in table.rows if cells[0].text == name)[column]
-
 
 # -- what ranks
 
@@ -173,58 +142,7 @@ def test_commands_carry_settings_and_repeats():
     assert command == expected
 
 
-# -- what is a column
-
-
-def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
-    store = RunStore(tmp_path / "r")
-    for place, error in (("/data/chess/seq-01", 0.01), ("/data/fire/seq-01", 0.2)):
-        for tracker in ("a", "b"):
-            add_run(store, tracker, "folder/seq-01", error=error, content=place, block=place[6:11], place=place)
-    paths = build_report(store, tmp_path / "report")
-    table = {r["tracker"]: r for r in rows_of(paths.csv["per_sequence"])}
-    assert float(table["a"]["chess/seq-01"]) < 0.05 < float(table["a"]["fire/seq-01"])
-    assert len(rows_of(paths.csv["runs"])) == 4
-    assert "Left out" not in paths.markdown.read_text()
-    found = compare(store, store)
-    assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
-
-
-def test_the_camera_is_part_of_the_column_in_old_records_too(tmp_path):
-    """Records without a block: content and frames, and the camera that the identity names."""
-    store = RunStore(tmp_path / "r")
-    right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
-    add_run(store, "a", "folder/s", camera=right)
-    add_run(store, "b", "folder/s", camera=right | {"fx": 400.0})
-    add_run(store, "elsewhere", "folder/s", kind="imported")
-    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
-    assert set(board.sequences) == {
-        "folder/s (camera 640x480, f 525 525)", "folder/s (camera 640x480, f 400 525)", "folder/s",
-    }  # fmt: skip
-    alone = RunStore(tmp_path / "q")
-    add_run(alone, "a", "folder/s", camera=right)
-    add_run(alone, "elsewhere", "folder/s", kind="imported")
-    assert len({run.row.column_id for run in load_runs([alone], PROTOCOL).runs}) == 1
-
-
-def test_the_same_frames_are_one_column_in_every_spelling(tmp_path):
-    store = RunStore(tmp_path / "r")
-    add_run(store, "a", "synthetic/walking_xyz?frames=60", block="b1")
-    add_run(store, "b", "synthetic/walking_xyz", frames=(0, 60), block="b1")
-    add_run(store, "b", "synthetic/walking_xyz?noise=3", frames=(0, 60), block="b1", noise=3)
-    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
-    assert board.sequences == ["synthetic/walking_xyz [0:60]"]
-    assert [len(cells[board.sequences[0]].rows) for _, cells in sorted(board.cells.items())] == [1, 2]
-
-
-def test_names_of_columns_are_never_alike():
-    same = dict(sequence="folder/x", content="c" * 12)
-    rows = [row(**same, block="b1"), row(**same, block="b2"), row(sequence="folder/x", content="d" * 12, block="b3")]
-    names = name_columns(rows)
-    assert len(set(names.values())) == 3
-    assert all(name.startswith("folder/x (") for name in names.values())
-    deep = [row(sequence="folder/x", block=str(i), place=p, frames="0:9") for i, p in enumerate(["/a/1/x", "/b/1/x"])]
-    assert list(name_columns(deep).values()) == ["a/1/x [0:9]", "b/1/x [0:9]"]
+# -- what stands where
 
 
 def test_parts_get_no_published_rows(tmp_path):
@@ -395,41 +313,8 @@ def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
     assert frame["noise"].isna().tolist() == [True, False]
     assert frame["failed"].tolist() == [False, True]
     assert frame["ending"][1] == "crashed at 30/120"
-    assert frame["score_m"].dtype == np.float64
+    assert frame["score_m"].dtype == "Float64"
     assert frame["ate_rmse_m"][0] == frame["score_m"][0] > 0
-    assert np.isnan(frame["epipolar_skipped"][1])
+    assert frame["epipolar_skipped"][1] is pd.NA
     paths = build_report(store, tmp_path / "report")
     assert list(rows_of(paths.csv["runs"])[0]) == list(frame.columns)
-
-
-# -- compare
-
-
-def test_compare_pairs_runs_of_different_settings_and_says_what_differs(tmp_path):
-    before, after = RunStore(tmp_path / "a"), RunStore(tmp_path / "b")
-    names = [f"s/{i}" for i in range(6)]
-    for name in names:
-        add_run(before, "ours", name, error=0.05, overrides={"epipolar.threshold_px": 1.0})
-        add_run(after, "ours", name, error=0.02, overrides={"epipolar.threshold_px": 2.0})
-        add_run(before, "same", name)
-        add_run(after, "same", name)
-    found = compare(before, after)
-    name = "ours · epipolar.threshold_px=1.0 → ours · epipolar.threshold_px=2.0"
-    assert set(found.overall) == {name, "same"}
-    assert found.differences[name] == ["epipolar.threshold_px: 1.0 in A, 2.0 in B"]
-    assert found.differences["same"] == []
-    assert found.overall[name].high < 1
-    assert (found.only_a, found.only_b) == (0, 0)
-    verdicts = {cells[0].text: cells[5].text for cells in found.table.rows if cells[1].text.startswith("all ")}
-    assert verdicts[name] == "better"
-    assert "What differs" in found.table.caption
-
-
-def test_compare_takes_the_nearest_settings_and_leaves_the_rest(tmp_path):
-    before, after = RunStore(tmp_path / "a"), RunStore(tmp_path / "b")
-    add_run(before, "ours", "s/a")
-    add_run(after, "ours", "s/a", overrides={"x": 1})
-    add_run(after, "ours", "s/a", overrides={"x": 1, "y": 2})
-    found = compare(before, after)
-    assert list(found.differences.values()) == [["x: default in A, 1 in B"]]
-    assert (found.only_a, found.only_b) == (0, 1)

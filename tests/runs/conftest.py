@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "core"))
 
 from envs_toys import write_folder
 

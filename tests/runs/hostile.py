@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -61,6 +63,11 @@ class Hostile:
             time.sleep(300)
         if mode == "raise":
             raise ValueError("too few\npoints")
+        if mode == "full":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if mode == "gone":
+            shutil.rmtree(self.settings.pids)
+            raise ValueError("no folder")
         if mode == "children":
             self.leave_children()
         if mode == "flood":

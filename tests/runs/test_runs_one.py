@@ -40,7 +40,7 @@ def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
     assert (store.root / "latest").resolve() == folder.resolve()
     assert leftovers(store) == []
     assert record.tracker.id == "toy" and record.settings["noise.clip"] == 3.0 and record.overrides == {"noise.clip": 3}
-    assert list(record.timings) == ["read", "total", "features", "tracking"]
+    assert list(record.timings) == ["read", "total", "processor", "features", "tracking"]
     assert record.timings["tracking"].median_s == record.timings["tracking"].p95_s == 0.002
     assert record.peak_memory_mb and 20 < record.peak_memory_mb < 4000
     assert record.machine and record.machine.cores >= 1 and record.versions["numpy"] == np.__version__
@@ -284,7 +284,7 @@ def test_a_fresh_interpreter_does_the_same(store: RunStore, toy_folder: str, mon
 
 def test_video(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 5), video=True), store)
-    assert (store.folder(record.run_id) / "video.mp4").stat().st_size > 1000
+    assert (store.folder(record.run_id) / "video.webm").stat().st_size > 1000
 
 
 def test_sheet(store: RunStore, tmp_path: Path) -> None:
@@ -336,7 +336,7 @@ import json, sys
 sys.stderr.write("echo {version}\\n")
 for line in sys.stdin:
     request = json.loads(line)
-    answer = dict(state="ok", T_world_cam=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+    answer = dict(index=request.get("index"), state="ok", T_world_cam=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
     print("on it", flush=True)
     print(json.dumps(answer), flush=True)
 """

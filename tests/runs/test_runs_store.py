@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -167,20 +166,25 @@ def test_a_newer_record_is_refused_not_misread(tmp_path: Path) -> None:
         RunRecord.read(tmp_path / "run.json")
 
 
-def test_what_a_killed_process_left_is_swept_up_and_nothing_else(store: RunStore) -> None:
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    host = socket.gethostname()
-    names = {
-        "dead": f".{'a' * 16}.{host}.{gone.pid}.deadbeef",
-        "alive": f".{'b' * 16}.{host}.{os.getpid()}.deadbeef",
-        "elsewhere": f".{'c' * 16}.another-machine.{gone.pid}.deadbeef",
-        "foreign": ".git",
-    }
-    for name in names.values():
-        (store.runs / name).mkdir()
-    store.prepare()
-    assert {path.name for path in store.runs.iterdir()} == {names["alive"], names["elsewhere"], names["foreign"]}
+def test_what_a_killed_process_left_is_swept_up_and_nothing_else(tmp_path: Path) -> None:
+    root = tmp_path / "results"
+    code = (
+        f"import os, sys; sys.path[:0] = {sys.path!r}\n"
+        "from dynslam_bench.runs import RunStore\n"
+        f"store = RunStore({str(root)!r}); store.prepare()\n"
+        f"with store.work_folder({'a' * 16!r}) as work, store.claim({'a' * 16!r}) as mine:\n"
+        "    assert mine; os.kill(os.getpid(), 9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    runs = root / "runs"
+    assert len(list(runs.iterdir())) == 2
+    (runs / ".git").mkdir()
+    store = RunStore(root)
+    with store.work_folder("b" * 16) as alive, store.claim("b" * 16) as mine:
+        assert mine
+        RunStore(root).prepare()
+        assert {path.name for path in runs.iterdir()} == {alive.name, f".{'b' * 16}.claim", ".git"}
+    assert {path.name for path in runs.iterdir()} == {".git"}
 
 
 PARENT = """

@@ -1,130 +1,18 @@
-"""Fetching against a local server that cuts, lies and refuses; archives that want out; disks that fill up."""
+"""Fetching against a local server that cuts, lies and refuses; disks that fill up."""
 
-import contextlib
 import errno
 import hashlib
-import http.server
-import io
-import re
 import stat
-import tarfile
-import threading
-import zipfile
 from pathlib import Path
 
 import pytest
-from sequence_folders import make_folder
+from fetch_server import FOLDER, NAME, left_behind
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError
 from dynslam_bench.sequences import fetch as fetching
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.fetch import Receipt, fetch, status, verify
-from dynslam_bench.sequences.published.archives import extract
-
-NAME, FOLDER = "tum/fr3/sitting_static", "rgbd_dataset_freiburg3_sitting_static"
-
-
-class Server:
-    """Serves one file; `plan` holds what goes wrong with each of the next requests."""
-
-    def __init__(self, data):
-        self.data, self.plan, self.requests, self.etag, self.ranges = data, [], [], '"one"', True
-        owner = self
-
-        class Handler(http.server.BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def log_message(self, *args):
-                pass
-
-            def do_GET(self):
-                owner.requests.append(self.headers.get("Range"))
-                owner.answer(self, owner.plan.pop(0) if owner.plan else {})
-
-        self.http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
-        self.url = f"http://127.0.0.1:{self.http.server_port}/{FOLDER}.tgz"
-
-    def answer(self, handler, fault):
-        handler.close_connection = True
-        if "status" in fault:
-            handler.send_error(fault["status"])
-            return
-        start = 0
-        wanted = re.fullmatch(r"bytes=(\d+)-", handler.headers.get("Range") or "")
-        if wanted and self.ranges and handler.headers.get("If-Range", self.etag) == self.etag:
-            start = int(wanted[1])
-            if start >= len(self.data):
-                handler.send_response(416)
-                handler.send_header("Content-Range", f"bytes */{len(self.data)}")
-                handler.send_header("Content-Length", "0")
-                handler.end_headers()
-                return
-        body = self.data[start:]
-        handler.send_response(206 if start else 200)
-        if start:
-            handler.send_header("Content-Range", f"bytes {start}-{len(self.data) - 1}/{len(self.data)}")
-        handler.send_header("ETag", self.etag)
-        if fault.get("chunked"):
-            handler.send_header("Transfer-Encoding", "chunked")
-            handler.end_headers()
-            half = len(body) // 2
-            handler.wfile.write(b"%x\r\n" % half + body[:half] + b"\r\n")
-            if fault["chunked"] == "whole":
-                handler.wfile.write(b"%x\r\n" % len(body[half:]) + body[half:] + b"\r\n0\r\n\r\n")
-            return
-        handler.send_header("Content-Length", str(len(body) + fault.get("lie", 0)))
-        handler.end_headers()
-        with contextlib.suppress(ConnectionError):
-            handler.wfile.write(body[: fault.get("cut", len(body))])
-
-    def close(self):
-        self.http.shutdown()
-        self.http.server_close()
-
-
-def tgz(folder, name=FOLDER, extra=()):
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w:gz", compresslevel=0) as tar:
-        tar.add(folder, arcname=name)
-        for info, data in extra:
-            tar.addfile(info, io.BytesIO(data))
-    return buffer.getvalue()
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    made, *_ = make_folder(tmp_path_factory.mktemp("published") / FOLDER, frames=4, width=640, height=480)
-    (made / "camera.toml").unlink()
-    return made
-
-
-@pytest.fixture(scope="module")
-def packed(folder):
-    return tgz(folder)
-
-
-@pytest.fixture
-def server(packed):
-    made = Server(packed)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def get(server, tmp_path):
-    """Fetches from the server into a fresh root, without waiting between attempts."""
-
-    def call(**how):
-        return fetch(NAME, data_root=tmp_path / "root", url=server.url, wait_s=0.0, timeout_s=5.0, **how)
-
-    return call
-
-
-def left_behind(root):
-    """Every file below the root, hidden ones included."""
-    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
 
 
 def test_fetch_makes_a_sequence_that_opens(get, server, packed, tmp_path):
@@ -321,91 +209,6 @@ def test_an_unwritable_root(get, tmp_path):
     (tmp_path / "root").write_text("a file")
     with pytest.raises(DynslamError, match="cannot write into"):
         get()
-
-
-def member(name, kind=tarfile.REGTYPE, link=""):
-    info = tarfile.TarInfo(name)
-    info.type, info.linkname = kind, link
-    return info
-
-
-@pytest.mark.parametrize(
-    ("info", "words"),
-    [
-        (member("../outside.txt"), "outside the sequence's folder"),
-        (member("/etc/evil"), "outside the sequence's folder"),
-        (member(f"{FOLDER}/../../evil"), "outside the sequence's folder"),
-        (member(f"{FOLDER}\\..\\evil"), "outside the sequence's folder"),
-        (member(f"{FOLDER}/link", tarfile.SYMTYPE, "/etc/passwd"), "a link or device"),
-        (member(f"{FOLDER}/hard", tarfile.LNKTYPE, f"{FOLDER}/rgb.txt"), "a link or device"),
-        (member(f"{FOLDER}/device", tarfile.CHRTYPE), "a link or device"),
-        (member(f"{FOLDER}/pipe", tarfile.FIFOTYPE), "a link or device"),
-        (member(f"{FOLDER}/rgb.txt"), "one name twice"),
-        (member(f"{FOLDER}/rgb.txt/below"), "one name twice"),
-    ],
-)
-def test_hostile_tar_files(get, server, folder, tmp_path, info, words):
-    server.data = tgz(folder, extra=[(info, b"")])
-    with pytest.raises(SequenceError, match=words):
-        get()
-    assert left_behind(tmp_path) == []
-
-
-@pytest.mark.parametrize("kind", ["traversal", "link", "good"])
-def test_zip_files(get, server, folder, tmp_path, kind):
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for path in folder.rglob("*"):
-            archive.write(path, f"{FOLDER}/{path.relative_to(folder).as_posix()}")
-        if kind == "traversal":
-            archive.writestr("a/../../evil", "x")
-        if kind == "link":
-            info = zipfile.ZipInfo(f"{FOLDER}/link")
-            info.external_attr = (stat.S_IFLNK | 0o777) << 16
-            archive.writestr(info, "/etc/passwd")
-    server.data = buffer.getvalue()
-    if kind == "good":
-        assert len(open_sequence(get())) == 4
-        return
-    with pytest.raises(SequenceError, match="refused"):
-        get()
-    assert left_behind(tmp_path) == []
-
-
-def test_a_bomb_is_refused(tmp_path):
-    archive = tmp_path / "bomb.zip"
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file, file.open("zeros", "w", force_zip64=True) as out:
-        for _ in range(150):
-            out.write(bytes(1_000_000))
-    (tmp_path / "out").mkdir()
-    with pytest.raises(SequenceError, match="unpacks to more than"):
-        extract(archive, tmp_path / "out")
-
-
-@pytest.mark.parametrize("damage", ["html", "flip", "no list"])
-def test_damaged_archives(get, server, packed, folder, tmp_path, damage):
-    if damage == "html":
-        server.data = b"<html>moved</html>" * 100
-    elif damage == "flip":
-        middle = len(packed) // 2
-        server.data = packed[:middle] + bytes([packed[middle] ^ 255]) + packed[middle + 1 :]
-    else:
-        server.data = tgz(folder / "rgb")
-    with pytest.raises(SequenceError, match=r"holds no rgb\.txt" if damage == "no list" else "is damaged"):
-        get()
-    assert left_behind(tmp_path) == []
-    server.data = packed
-    get()
-
-
-@pytest.mark.parametrize("name", [".", "another_name", "deep/er"])
-def test_the_folder_inside_may_have_any_name(get, server, folder, name):
-    server.data = tgz(folder, name)
-    if name == "deep/er":
-        with pytest.raises(SequenceError, match=r"holds no rgb\.txt"):
-            get()
-    else:
-        assert len(open_sequence(get())) == 4
 
 
 def test_two_at_once(server, tmp_path):

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 import pytest
 
@@ -16,7 +15,6 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
 from dynslam_bench.sequences.synthetic.frame_cache import encode_png, is_intact_png
-from dynslam_bench.sequences.synthetic.kernels import compiled
 from dynslam_bench.sequences.synthetic.people.bodies import draw_person
 from dynslam_bench.sequences.synthetic.people.script import write_script
 from dynslam_bench.sequences.synthetic.scenes.plan import plan_room
@@ -171,16 +169,6 @@ if child == 0:
 print(os.waitpid(child, 0)[1])
 """
     assert in_child(code) == "0"
-
-
-def test_kernels_compile_where_nothing_can_be_cached(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**options: object):
-        if options.pop("cache", False):
-            raise RuntimeError("cannot cache function: no locator available")
-        return numba.njit(**options)
-
-    monkeypatch.setattr(compiled, "njit", refuse)
-    assert compiled.kernel(lambda x: x + 1)(2) == 3
 
 
 def test_a_cache_that_cannot_be_written_is_one_clear_line(tmp_path: Path) -> None:

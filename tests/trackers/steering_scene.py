@@ -15,6 +15,7 @@ from dynslam_bench.segmentation.masks.oracle import instances_of
 from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
+from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 
 STRIDE = 3
@@ -71,14 +72,19 @@ def build_erring(settings: Settings, context: SegmenterContext) -> Erring:
 SEGMENTER = SegmenterSpec("erring", f"{__file__}:build_erring")
 
 
-def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
-    """A tracker for the scene, with fewer features as its images are smaller."""
+def settings_for(spec: TrackerSpec, **settings: object) -> Settings:
+    """All settings of a tracker for the scene, with fewer features as its images are smaller."""
     given: dict[str, object] = {"features.n_features": 500, "features.levels": 4} | quick(spec.settings)
     if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto":
         given["segmentation.source"] = f"plugin:{__file__}:SEGMENTER"
         if "segmentation.dilation_px" in {each.name for each in parameters(spec.settings)}:
             given["segmentation.dilation_px"] = 4
-    return build_tracker(spec, given | settings, TrackerContext(sequence_id=scene.id, masks=scene))
+    return resolve_settings(spec, given | settings)
+
+
+def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
+    """A tracker for the scene."""
+    return build_tracker(spec, settings_for(spec, **settings), TrackerContext(sequence_id=scene.id, masks=scene))
 
 
 def play(

@@ -18,7 +18,6 @@ from optuna.trial import TrialState
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.runs import RunStore
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
-from dynslam_bench.tuning.dominance import hopeless
 from dynslam_bench.tuning.space import distribution
 from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
@@ -36,7 +35,7 @@ def make(sequences: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": sequences[:2], "held_out": sequences[2:], "trials": 10,
         "space": {"include": ["gain", "wobble"]}, "seeds": [0], "offsets": [0], "top": 2,
-        "pruner": "none", "min_coverage": None,
+        "race": "none", "min_coverage": None, "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 
@@ -46,12 +45,12 @@ def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_p
     trials = tuner.study.get_trials()
     assert len(trials) == 14 and all(trial.state == TrialState.COMPLETE for trial in trials)
     assert trials[0].params == {"gain": 1.5, "wobble": 2}, "trial 0 is the default"
-    assert trials[0].value == pytest.approx(0.0, abs=1e-12), "the default's ratio to itself is one"
+    assert abs(trials[0].value) < 0.1, "the default's luck with these starts, beside its median over three"
     best = tuner.study.best_trial
     assert best.value < -0.5 and abs(math.log(best.params["gain"])) < math.log(1.3)
     summary = finish(tuner, jobs=2)
     held = summary.candidates[0].held_out
-    assert held.ratio < 1 and held.sequences == 2
+    assert summary.chosen == summary.candidates[0].trial and held.ratio < 1 and held.sequences == 2
     assert not summary.improves, "two held-out sequences prove nothing"
     assert not summary.importances, "fourteen trials are too few"
     page = write_page(tuner, summary).read_text()
@@ -76,8 +75,7 @@ def test_an_untunable_study_says_that_it_did_not_help(sequences: list[str], tmp_
     )
     tuner = run_study(spec, results=tmp_path)
     summary = finish(tuner)
-    held = summary.candidates[0].held_out
-    assert summary.improves == held.shows_gain
+    assert not summary.improves
     assert summary.conclusion == summary.verdict and "eep the default" in summary.conclusion
 
 
@@ -87,7 +85,7 @@ def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> N
     trials = tuner.study.get_trials()
     assert trials
     for trial in trials:
-        named = {run_id for _, _, run_id, *_ in trial.user_attrs["instances"]}
+        named = {run_id for _, run_id, *_ in trial.user_attrs["blocks"]}
         assert len(named) == 2 and named <= stored
 
 
@@ -103,42 +101,20 @@ def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_pat
         assert trial.params == {"mode": "fine"}, "a switched-off parameter is not drawn"
 
 
-@pytest.mark.parametrize("pruner", ["median", "hyperband", "wilcoxon"])
-def test_pruners_end_hopeless_trials(sequences: list[str], tmp_path: Path, pruner: str) -> None:
-    spec = make(sequences, tune=sequences[:3], held_out=[], trials=14, sampler="random", pruner=pruner, seeds=[0, 1])
-    tuner = run_study(spec, results=tmp_path)
-    trials = tuner.study.get_trials()
-    assert trials[0].state == TrialState.COMPLETE
-    ended = [t for t in trials if t.state == TrialState.PRUNED or "early_stopped" in t.user_attrs]
-    runs = sum(len(trial.user_attrs.get("instances", [])) for trial in trials)
-    assert ended and runs < 14 * 6
-    assert tuner.study.best_trial not in ended
-
-
-def test_several_objectives_with_early_ends(sequences: list[str], tmp_path: Path) -> None:
+def test_several_objectives_have_a_front(sequences: list[str], tmp_path: Path) -> None:
     spec = make(sequences, tune=sequences, held_out=[], objectives=["accuracy", "speed"], trials=10, sampler="nsga2")
     tuner = run_study(spec, results=tmp_path)
     assert all(len(trial.values) == 2 for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,)))
-    summary = finish(tuner)
-    assert "early" not in str(summary.candidates[0])
-    assert "front" in write_page(tuner, summary).read_text()
-
-
-def test_hopeless_needs_dominance_by_the_optimistic_bound() -> None:
-    done = optuna.trial.create_trial(values=[-1.0, 5.0], user_attrs={"constraints": {}})
-    names = ("accuracy", "speed")
-    assert hopeless([0.5, 0.4], 4.0, range(3), [done], names)
-    assert not hopeless([0.5, 0.4], 6.0, range(3), [done], names), "it is faster"
-    assert not hopeless([-2.0, -2.0], 4.0, range(3), [done], names), "it is more accurate"
-    broken = optuna.trial.create_trial(values=[-1.0, 5.0], user_attrs={"constraints": {"fps": 1.0}})
-    assert not hopeless([0.5, 0.4], 4.0, range(3), [broken], names), "what violates a constraint dominates nothing"
+    assert "front" in write_page(tuner, finish(tuner)).read_text()
 
 
 def test_constraints_decide_who_is_a_candidate(sequences: list[str], tmp_path: Path) -> None:
     tuner = run_study(make(sequences, trials=4, min_fps=1e9), results=tmp_path)
     for trial in tuner.study.get_trials():
         assert trial.user_attrs["constraints"]["fps"] > 0
-    assert not finish(tuner).candidates[0].feasible
+    summary = finish(tuner)
+    assert summary.chosen is None and not any(candidate.feasible for candidate in summary.candidates)
+    assert "violates a constraint" in summary.conclusion
 
 
 WORKER = """

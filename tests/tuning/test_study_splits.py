@@ -13,8 +13,8 @@ from dynslam_bench.core.errors import StudyError
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.part import part_of
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, write_page
-from dynslam_bench.tuning.final_runs import describe_repeats, fresh_repeats
 from dynslam_bench.tuning.splits import check_splits
+from dynslam_bench.tuning.trials import errors_of
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 WALK = "synthetic/walking_xyz"
@@ -23,9 +23,15 @@ WALK = "synthetic/walking_xyz"
 def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": tune, "held_out": held_out, "trials": 2, "top": 1,
-        "space": {"include": ["gain"]}, "pruner": "none", "min_coverage": None, "offsets": [0],
+        "space": {"include": ["gain"]}, "race": "none", "min_coverage": None, "offsets": [0], "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
+
+
+def faults(tune: list[str], held_out: list[str], *, accept: bool = False) -> list[str]:
+    study = spec(tune, held_out)
+    splits = {"tune": study.blocks(*study.tune), "held_out": study.blocks(*study.held_out)}
+    return check_splits(study.name, splits, accept=accept)
 
 
 @pytest.mark.parametrize("other", ["@0", "@000", "@0?frames=50", "?frames=10&noise=3", ""])
@@ -57,11 +63,11 @@ def test_copies_and_excerpts_of_a_recording_are_the_same_recording(tmp_path: Pat
     other = toy_tracker.make_sequence(tmp_path / "other", 1.1)
     for held_out in (copy, excerpt):
         with pytest.raises(StudyError, match="are the same sequence") as caught:
-            check_splits(spec([str(whole)], [str(held_out)]))
+            faults([str(whole)], [str(held_out)])
         assert str(whole) in str(caught.value) and str(held_out) in str(caught.value)
-    assert check_splits(spec([str(whole)], [str(other)])) == []
-    with pytest.raises(StudyError, match="tune names the same frames twice"):
-        check_splits(spec([str(whole), str(copy)], [str(other)]))
+    assert faults([str(whole)], [str(other)]) == []
+    with pytest.raises(StudyError, match="are the same frames"):
+        faults([str(whole), str(copy)], [str(other)])
 
 
 def disguised(whole: Path, copy: Path, how: str) -> Path:
@@ -94,20 +100,20 @@ def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> N
     copy, twin = (disguised(whole, tmp_path / name, how) for name in ("copy", "twin"))
     assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, "digests alone pass it"
     with pytest.raises(StudyError, match="are the same sequence"):
-        check_splits(spec([str(whole)], [str(copy)]))
+        faults([str(whole)], [str(copy)])
     with pytest.raises(StudyError, match="are the same sequence"):
-        check_splits(spec([str(twin)], [str(whole)]))
+        faults([str(twin)], [str(whole)])
     for phase in (0.9, 1.7, 2.5):
         other = toy_tracker.make_sequence(tmp_path / f"other{phase}", phase, 24)
-        assert check_splits(spec([str(copy)], [str(other)])) == []
+        assert faults([str(copy)], [str(other)]) == []
 
 
 def test_instances_stay_in_their_split() -> None:
     with pytest.raises(StudyError, match=r"'synthetic/walking_xyz@5' is used as held-out.*0-99.*into the tune split"):
-        check_splits(spec([f"{WALK}@1"], [f"{WALK}@5"]))
+        faults([f"{WALK}@1"], [f"{WALK}@5"])
     with pytest.raises(StudyError, match=r"'synthetic/walking_xyz@105' is used as tune.*100-199.*held-out split"):
-        check_splits(spec([f"{WALK}@105"], [f"{WALK}@101"]))
-    assert check_splits(spec([f"{WALK}@1", f"{WALK}@1?noise=4"], [f"{WALK}@101"])) == []
+        faults([f"{WALK}@105"], [f"{WALK}@101"])
+    assert faults([f"{WALK}@1", f"{WALK}@1?noise=4"], [f"{WALK}@101"]) == []
 
 
 def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
@@ -117,15 +123,14 @@ def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
     camera = (tmp_path / held / "camera.toml").read_text()
     assert "width = 16" in camera
     with pytest.raises(StudyError, match=r"walking_rpy' is used as tune, but the catalogue puts it into the held-out"):
-        check_splits(spec([str(tmp_path / held)], []))
+        faults([str(tmp_path / held)], [])
     with pytest.raises(StudyError, match=r"walking_xyz' is used as held-out, but the catalogue puts it into the tune"):
-        check_splits(spec([str(toy_tracker.make_sequence(tmp_path / "plain", 0.7))], [str(tmp_path / tune)]))
-    assert check_splits(spec([str(tmp_path / tune)], [str(tmp_path / held)])) == []
+        faults([str(toy_tracker.make_sequence(tmp_path / "plain", 0.7))], [str(tmp_path / tune)])
+    assert faults([str(tmp_path / tune)], [str(tmp_path / held)]) == []
 
 
 def test_an_older_study_with_overlapping_splits_can_still_be_looked_at() -> None:
-    study = spec([f"{WALK}@1"], [f"{WALK}@5"])
-    assert len(check_splits(study, refuse=False)) == 1
+    assert len(faults([f"{WALK}@1"], [f"{WALK}@5"], accept=True)) == 1
 
 
 def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
@@ -143,25 +148,15 @@ def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
     assert page.count("The splits are NOT apart") >= 2, "below each table"
 
 
-def test_repeats_are_start_offsets_and_fresh_ones_are_fresh(tmp_path: Path) -> None:
-    study = spec(["a"], [], seeds=[0], offsets=[0, 3])
-    assert fresh_repeats(study) == [(1000, 1), (1001, 2)]
-    assert fresh_repeats(spec(["a"], [], seeds=[0, 1], offsets=[1])) == [(1000, 0), (1001, 2)]
-    assert describe_repeats([(1000, 1)]) == "seed 1000 from frame 1"
-    assert StudySpec(name="x", tune=("a",)).seeds == (0,) and StudySpec(name="x", tune=("a",)).offsets == (0, 3)
-
-
 def test_a_tracker_without_randomness_has_repeats_that_differ(tmp_path: Path) -> None:
     folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
     fixed = {"include": ["gain"], "fixed": {"wobble": 0}}
     tuner = run_study(spec([folder], [], seeds=[0, 1], offsets=[0, 2], space=fixed), results=tmp_path / "results")
-    rows = tuner.study.get_trials()[1].user_attrs["instances"]
-    assert sorted((row[1], row[6]) for row in rows) == [(0, 0), (0, 2), (1, 0), (1, 2)]
-    by_seed = {offset: {row[3] for row in rows if row[6] == offset} for offset in (0, 2)}
-    assert all(len(errors) == 1 for errors in by_seed.values()) and by_seed[0] != by_seed[2]
+    errors = errors_of(tuner.study.get_trials()[1])
+    assert sorted((block.seed, block.offset) for block in errors) == [(0, 0), (0, 2), (1, 0), (1, 2)]
+    by_start = {start: {ate for block, ate in errors.items() if block.offset == start} for start in (0, 2)}
+    assert all(len(found) == 1 for found in by_start.values()) and by_start[0] != by_start[2]
     summary = finish(tuner)
-    runs = [tuner.evaluator.store.get(run) for run in tuner.evaluator.store.ids()]
-    fresh = {(run.seed, run.offset) for run in runs if run.seed >= 1000}
+    fresh = {(block.seed, block.offset) for block in tuner.design.confirm}
     assert fresh == {(1000, 1), (1001, 3), (1002, 4), (1003, 5)}
-    page = write_page(tuner, summary).read_text()
-    assert "seeds changed nothing" in page and "seed 1001 from frame 3" in page
+    assert "seeds changed nothing" in write_page(tuner, summary).read_text()

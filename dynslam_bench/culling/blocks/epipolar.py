@@ -72,18 +72,7 @@ class EpipolarFilter(DynamicFilter):
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
     provenance: Provenance = "faithful-paper"
-    stats_names = (
-        "dropped",
-        "matches",
-        "inliers",
-        "parallax_px",
-        "homography_share",
-        "contradiction",
-        "degenerate",
-        "moving_objects",
-        "f_asked",
-        "f_judged",
-    )
+    stats_names = ("dropped", *STATS)
 
     def __init__(self, settings: EpipolarSettings) -> None:
         self.settings = settings

@@ -6,6 +6,8 @@ from typing import Literal
 
 from dynslam_bench.core.settings import Settings, tunable
 
+from ..tools.coherence_settings import coherent_share
+
 
 class EpipolarSettings(Settings):
     """The epipolar test (paper, Eq. 23-25) and its degeneracy guard."""
@@ -65,15 +67,7 @@ class EpipolarSettings(Settings):
         meaning="share of the points moving as their depth and the camera's motion say, of which F may reject so many "
         "before it counts as that of something else that moves, and the test is skipped; 1 never asks",
     )
-    min_share: float = tunable(
-        0.4,
-        low=0.0,
-        high=0.8,
-        limits=(0.0, 1.0),
-        online=True,
-        when={"mode": ["point"]},
-        meaning="share of the tested points around a failing one that must fail too; 0 drops every failing point",
-    )
+    min_share: float = coherent_share({"mode": ["point"]})
     mode: Literal["point", "object"] = tunable(
         "point", meaning="drop the failing point, or vote on the object that it lies on (paper, step 3)"
     )

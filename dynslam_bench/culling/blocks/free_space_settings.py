@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dynslam_bench.core.settings import Settings, tunable
 
+from ..tools.coherence_settings import coherent_share
+
+_ON = {"enabled": [True]}
+
 
 class FreeSpaceSettings(Settings):
     """The free-space test: a point where an earlier keyframe saw through is on something that moved there.
@@ -13,9 +17,7 @@ class FreeSpaceSettings(Settings):
     """
 
     enabled: bool = tunable(True, meaning="whether the test runs")
-    keyframes: int = tunable(
-        8, low=2, high=20, when={"enabled": [True]}, meaning="how many of the latest keyframes are asked"
-    )
+    keyframes: int = tunable(8, low=2, high=20, when=_ON, meaning="how many of the latest keyframes are asked")
     threshold_m: float = tunable(
         0.15,
         low=0.05,
@@ -24,7 +26,7 @@ class FreeSpaceSettings(Settings):
         limits=(0.01, 5.0),
         unit="m",
         online=True,
-        when={"enabled": [True]},
+        when=_ON,
         meaning="least depth by which the keyframe must have seen past the point",
     )
     threshold_sigma: float = tunable(
@@ -33,21 +35,13 @@ class FreeSpaceSettings(Settings):
         high=12.0,
         limits=(0.0, 100.0),
         online=True,
-        when={"enabled": [True]},
+        when=_ON,
         meaning="the same, in standard deviations of the sensor at that depth",
     )
     min_votes: int = tunable(
-        2, low=1, high=5, online=True, when={"enabled": [True]}, meaning="keyframes that must have seen past the point"
+        2, low=1, high=5, online=True, when=_ON, meaning="keyframes that must have seen past the point"
     )
-    min_share: float = tunable(
-        0.4,
-        low=0.0,
-        high=0.8,
-        limits=(0.0, 1.0),
-        online=True,
-        when={"enabled": [True]},
-        meaning="share of the tested points around a failing one that must fail too; 0 takes every failure for motion",
-    )
+    min_share: float = coherent_share(_ON)
     max_age_s: float = tunable(
         10.0,
         low=2.0,
@@ -55,6 +49,6 @@ class FreeSpaceSettings(Settings):
         scale="log",
         limits=(0.1, 1e4),
         unit="s",
-        when={"enabled": [True]},
+        when=_ON,
         meaning="keyframes older than this are not asked: what they saw may have been moved for good",
     )

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import kernel
 
 BIN_M = 0.005
 """Depth resolution at which the next pixel of a region is chosen: the one nearest to the region's mean comes first."""
 
 
-def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile at the first call, cached where a cache can be written."""
-    try:
-        return cast("Callable[..., Any]", numba.njit(cache=True, nogil=True)(function))
-    except RuntimeError:  # numba finds no folder in which it may cache
-        return cast("Callable[..., Any]", numba.njit(nogil=True)(function))
-
-
-@_kernel
+@kernel
 def hidden(
     depth: NDArray[np.float32], centre: NDArray[np.int64], expected: NDArray[np.float64], tau: float, radius: int
 ) -> NDArray[np.bool_]:
@@ -60,7 +50,7 @@ def hidden(
     return found
 
 
-@_kernel
+@kernel
 def grow(depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_m: float) -> NDArray[np.uint8]:
     """Regions of like depth around seeds: neighbours join while they are within `step` of the region's mean.
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dynslam_bench.core.settings import Settings, tunable
 
+from ..tools.coherence_settings import coherent_share
+
+_ON = {"enabled": [True]}
+
 
 class RigidMotionSettings(Settings):
     """The depth-consistency test: does the point move with the camera's rigid motion, in 3-D?
@@ -21,7 +25,7 @@ class RigidMotionSettings(Settings):
         limits=(0.05, 100.0),
         unit="px",
         online=True,
-        when={"enabled": [True]},
+        when=_ON,
         meaning="reprojection distance after the camera's motion above which a point is dynamic",
     )
     threshold_share: float = tunable(
@@ -29,7 +33,7 @@ class RigidMotionSettings(Settings):
         low=0.0,
         high=0.2,
         limits=(0.0, 1.0),
-        when={"enabled": [True]},
+        when=_ON,
         meaning="added to it, as a share of the flow that the camera's motion explains (rolling shutter)",
     )
     threshold_sigma: float = tunable(
@@ -39,23 +43,15 @@ class RigidMotionSettings(Settings):
         scale="log",
         limits=(0.1, 100.0),
         online=True,
-        when={"enabled": [True]},
+        when=_ON,
         meaning="depth difference, in standard deviations of the sensor, above which a point is dynamic",
     )
-    min_share: float = tunable(
-        0.4,
-        low=0.0,
-        high=0.8,
-        limits=(0.0, 1.0),
-        online=True,
-        when={"enabled": [True]},
-        meaning="share of the tested points around a failing one that must fail too; 0 takes every failure for motion",
-    )
+    min_share: float = coherent_share(_ON)
     memory: float = tunable(
         0.6,
         low=0.0,
         high=0.95,
         limits=(0.0, 0.99),
-        when={"enabled": [True]},
+        when=_ON,
         meaning="how much of a point's motion evidence is carried over from the previous frame",
     )

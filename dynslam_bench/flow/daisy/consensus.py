@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.jit import kernel
+from dynslam_bench.core.compiled import Scalar, kernel
+
+from ..kernels.arrays import Flags, Floats
 
 
 @kernel
-def dissenting_labels(predictions, labels, tolerance, alternative, dissents):  # type: ignore[no-untyped-def]
+def dissenting_labels(
+    predictions: Floats, labels: Floats, tolerance: Scalar, alternative: Floats, dissents: Flags
+) -> None:
     """Find the points about which the neighbours agree among themselves, but not with the point's own label.
 
     Args:

@@ -16,10 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.jit import descriptor_sum, inlined, kernel
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..kernels.arrays import Bytes, Floats, Ints, Longs
+from ..kernels.descriptor_sum import descriptor_sum
 from ..settings import FlowSettings
 from . import layout
-from .maps import OrientationMaps, map_geometry
+from .levels import map_geometry
+from .maps import OrientationMaps
 
 OUTSIDE = 1 << 20
 """Cost of a label that leaves the target image."""
@@ -141,7 +145,7 @@ def cost_tables(
 
 
 @inlined
-def cell_of(x, y, level):  # type: ignore[no-untyped-def]
+def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
     """Byte offset of the map cell that holds a full-image position, and the quarter of the cell it lies in."""
     xq = np.int64(x * np.float32(4) + np.float32(0.5)) + level[3]
     yq = np.int64(y * np.float32(4) + np.float32(0.5)) + level[3]
@@ -151,7 +155,7 @@ def cell_of(x, y, level):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def describe(start, stop, points, image, tables, out):  # type: ignore[no-untyped-def]
+def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTables, out: Bytes) -> None:
     """Reference descriptors of points, with their bins rotated by each quantised angle.
 
     Args:
@@ -195,7 +199,7 @@ def describe(start, stop, points, image, tables, out):  # type: ignore[no-untype
 
 
 @inlined
-def describe_once(x, y, a, image, tables, out, first):  # type: ignore[no-untyped-def]
+def describe_once(x: Scalar, y: Scalar, a: int, image: Side, tables: CostTables, out: Bytes, first: int) -> None:
     """The descriptor of one position for rotation index `a`, without support: 136 bytes of `out` from `first` on."""
     neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
     cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
@@ -220,7 +224,9 @@ def describe_once(x, y, a, image, tables, out, first):  # type: ignore[no-untype
 
 
 @inlined
-def descriptor_distance(x, y, si, ti, mine, descriptor, target, tables):  # type: ignore[no-untyped-def]
+def descriptor_distance(
+    x: Scalar, y: Scalar, si: int, ti: int, mine: int, descriptor: Bytes, target: Side, tables: CostTables
+) -> Scalar:
     """First term of Eq. 1: truncated distance of 136 bytes at `mine` to the target at (x, y), scale si, rotation ti."""
     near, near_phase = cell_of(x, y, tables.ring0[si])
     far, far_phase = cell_of(x, y, tables.ring1[si])
@@ -230,7 +236,7 @@ def descriptor_distance(x, y, si, ti, mine, descriptor, target, tables):  # type
 
 
 @inlined
-def quantised(s, theta):  # type: ignore[no-untyped-def]
+def quantised(s: Scalar, theta: Scalar) -> tuple[Scalar, Scalar]:
     """Scale and rotation index of a label."""
     si = np.int64(np.floor(s * np.float32(4) + np.float32(0.5))) - layout.SCALE_LOW
     ti = np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5))) - layout.ANGLE_LOW
@@ -238,7 +244,10 @@ def quantised(s, theta):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ignore[no-untyped-def]
+def label_cost(
+    i: int, u: Scalar, v: Scalar, s: Scalar, theta: Scalar, reference: Reference, target: Side, tables: CostTables,
+    bound: Scalar,
+) -> Scalar:  # fmt: skip
     """Eq. 1 of one label at point i, summed over the support; may stop early once `bound` is reached.
 
     Args:
@@ -279,7 +288,7 @@ def label_cost(i, u, v, s, theta, reference, target, tables, bound):  # type: ig
 
 
 @inlined
-def appearance(gray, x, y):  # type: ignore[no-untyped-def]
+def appearance(gray: Bytes, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """Grey level and gradient magnitude (central differences) at the pixel nearest to a position."""
     height, width = gray.shape
     column = min(max(np.int64(x + np.float32(0.5)), 0), width - 1)
@@ -291,7 +300,7 @@ def appearance(gray, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def reference_appearance(points, image, tables, out):  # type: ignore[no-untyped-def]
+def reference_appearance(points: Floats, image: Side, tables: CostTables, out: Ints) -> None:
     """Fill int32 ``[N, S, 2]`` with the reference's grey levels and gradient magnitudes at the support."""
     for i in range(len(points)):
         for q in range(len(tables.support)):
@@ -305,7 +314,9 @@ def reference_appearance(points, image, tables, out):  # type: ignore[no-untyped
 
 
 @kernel
-def label_costs(start, stop, labels, reference, target, tables, out):  # type: ignore[no-untyped-def]
+def label_costs(
+    start: int, stop: int, labels: Floats, reference: Reference, target: Side, tables: CostTables, out: Longs
+) -> None:
     """Cost of one label a point: float32 ``[N, 4]`` to int64 ``[N]``; labels that are not finite cost `OUTSIDE`."""
     for i in range(start, stop):
         out[i] = label_cost(

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 from ..kernels.buffers import BufferPool
 from ..kernels.workers import run_stripes
 from . import layout
+from .levels import MapGeometry, level_shape, map_geometry
 from .refinement import BORDER, pad_image
 from .smoothing import coarse_levels, fine_levels
 
@@ -26,24 +25,6 @@ NORM_FLOOR = 0.01 * 255.0
 """Added to a histogram's norm before dividing, so that flat regions stay near zero (0.01 for images in [0, 1])."""
 FIXED_POINT = 256
 """Units a grey level in the blurred derivatives."""
-
-
-class MapGeometry(NamedTuple):
-    """Where each level lies in the flat histogram array.
-
-    Attributes:
-        base: int64 ``[LEVELS]``, index of each level's first histogram (the corner of its margin).
-        stride: int64 ``[LEVELS]``, histograms a row, margins included.
-        shift: int64 ``[LEVELS]``, quarter pixels to map pixels: ``index = (position + bias) >> shift``.
-        bias: int64 ``[LEVELS]``, rounding and margin.
-        total: Number of histograms.
-    """
-
-    base: NDArray[np.int64]
-    stride: NDArray[np.int64]
-    shift: NDArray[np.int64]
-    bias: NDArray[np.int64]
-    total: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,28 +46,6 @@ class OrientationMaps:
     geometry: MapGeometry
 
 
-@lru_cache(maxsize=16)
-def map_geometry(height: int, width: int) -> MapGeometry:
-    """The arrangement of the seven levels for an image size in pixels."""
-    base, stride, shift, bias, total = [], [], [], [], 0
-    for step in layout.LEVEL_STEPS:
-        rows, columns = _level_shape(height, width, step)
-        margin = layout.MARGIN // step
-        base.append(total)
-        stride.append(columns + 2 * margin)
-        # full-image x (pixel centres at integers) falls into map pixel floor((x + 0.5) / step)
-        shift.append(int(np.log2(step * layout.SUBPIXEL)))
-        bias.append(layout.SUBPIXEL // 2 + margin * step * layout.SUBPIXEL)
-        total += (rows + 2 * margin) * (columns + 2 * margin)
-    return MapGeometry(
-        np.asarray(base, dtype=np.int64),
-        np.asarray(stride, dtype=np.int64),
-        np.asarray(shift, dtype=np.int64),
-        np.asarray(bias, dtype=np.int64),
-        total,
-    )
-
-
 def orientation_maps(
     gray: NDArray[np.uint8],
     *,
@@ -105,7 +64,7 @@ def orientation_maps(
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
-    (rows, columns), (quarter_rows, quarter_columns) = _level_shape(height, width, 2), _level_shape(height, width, 4)
+    (rows, columns), (quarter_rows, quarter_columns) = level_shape(height, width, 2), level_shape(height, width, 4)
     buffers = buffers or BufferPool()
     histograms, whole, half = buffers.take(
         (geometry.total, layout.BINS),
@@ -143,9 +102,3 @@ def framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     out = np.empty((image.shape[0] + 2 * BORDER, image.shape[1] + 2 * BORDER), dtype=np.uint8)
     pad_image(image, BORDER, out)
     return out
-
-
-def _level_shape(height: int, width: int, step: int) -> tuple[int, int]:
-    for _ in range(int(np.log2(step))):
-        height, width = max(1, height // 2), max(1, width // 2)
-    return height, width

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.jit import kernel
+from dynslam_bench.core.compiled import kernel
+
+from ..kernels.arrays import Floats, Longs
 
 
 @kernel
-def nearest_neighbours(start, stop, ordered, order, width, out):  # type: ignore[no-untyped-def]
+def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, width: int, out: Longs) -> None:
     """The nearest other points of each point, in an approximate but deterministic search over rows of equal bands.
 
     Args:

@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels.jit import inlined, kernel
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..kernels.arrays import Bytes, Doubles, Floats, Ints
 from ..kernels.lanes import load, load_bytes, sample, spread, store, total
 
 BORDER = 48
@@ -44,7 +46,7 @@ class Window(NamedTuple):
 
 
 @kernel
-def pad_image(image, margin, out):  # type: ignore[no-untyped-def]
+def pad_image(image: Bytes, margin: int, out: Bytes) -> None:
     """Copy a uint8 image into the middle of `out` and repeat its edges over `margin` pixels."""
     height, width = image.shape
     for y in range(height + 2 * margin):
@@ -57,7 +59,7 @@ def pad_image(image, margin, out):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def read_frame(image, x, y, rows, pitch, out):  # type: ignore[no-untyped-def]
+def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: Floats) -> None:
     """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on."""
     flat, stride = image.reshape(-1), np.int64(image.shape[1])
     column, row = np.int64(x), np.int64(y)
@@ -76,7 +78,9 @@ def read_frame(image, x, y, rows, pitch, out):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def warp_patch(image, x, y, a, b, reach, columns, rows, out):  # type: ignore[no-untyped-def]
+def warp_patch(
+    image: Bytes, x: Scalar, y: Scalar, a: Scalar, b: Scalar, reach: int, columns: Ints, rows: Ints, out: Floats
+) -> None:
     """Samples of a square patch of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
     one, far = np.float32(65536), np.float32(reach)
     column, row = np.int32((x - a * far + b * far) * one), np.int32((y - b * far - a * far) * one)
@@ -87,9 +91,10 @@ def warp_patch(image, x, y, a, b, reach, columns, rows, out):  # type: ignore[no
 
 
 @kernel
-def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
-    start, stop, points, labels, template_image, target_image, window, correlation
-):
+def similarity_lucas_kanade(
+    start: int, stop: int, points: Floats, labels: Floats, template_image: Bytes, target_image: Bytes, window: Window,
+    correlation: Floats,
+) -> None:  # fmt: skip
     """Refine labels by photometric alignment of a square window.
 
     The target is warped by the label into the template's frame; within that patch only the translation moves (cheap),
@@ -184,7 +189,7 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
             warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, patch)
             ox = oy = np.float32(0)
             g0 = g1 = mean = 0.0
-            at, w00, w01, w10, w11 = 0, zero, zero, zero, zero
+            at, w00, w01, w10, w11 = np.int64(0), zero, zero, zero, zero
             for iteration in range(iterations + 1):
                 left, top = ox + np.float32(margin), oy + np.float32(margin)
                 column, row = np.int64(left), np.int64(top)
@@ -270,9 +275,10 @@ def similarity_lucas_kanade(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def coarse_to_fine(  # type: ignore[no-untyped-def]
-    start, stop, points, labels, half_template, half_target, template, target, coarse, fine, correlation
-):
+def coarse_to_fine(
+    start: int, stop: int, points: Floats, labels: Floats, half_template: Bytes, half_target: Bytes, template: Bytes,
+    target: Bytes, coarse: Window, fine: Window, correlation: Floats,
+) -> None:  # fmt: skip
     """`similarity_lucas_kanade` at half, then at full resolution.
 
     Args:
@@ -293,7 +299,7 @@ def coarse_to_fine(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def cholesky4(h):  # type: ignore[no-untyped-def]
+def cholesky4(h: Doubles) -> bool:
     """Lower Cholesky factor of a 4 x 4 matrix, in place; False if it is not positive definite."""
     for j in range(4):
         for k in range(j):
@@ -309,7 +315,7 @@ def cholesky4(h):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def solve4(h, g0, g1, g2, g3):  # type: ignore[no-untyped-def]
+def solve4(h: Doubles, g0: Scalar, g1: Scalar, g2: Scalar, g3: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Solve with the factor of `cholesky4`."""
     y0 = g0 / h[0, 0]
     y1 = (g1 - h[1, 0] * y0) / h[1, 1]

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.jit import inlined, kernel
+from dynslam_bench.core.compiled import inlined, kernel
+
+from ..kernels.arrays import Bytes, Halves, Longs
 from ..kernels.words import average, average_of_pairs, derivatives, load_words, store_normalised, store_words
+from .levels import MapGeometry
 
 RING = 16
 """Lines kept of each level; a power of two above twice the farthest tap."""
@@ -20,7 +23,10 @@ SPILL = 64
 
 
 @inlined
-def smooth_line(ring, pitch, row, rows, columns, taps, distance, line, out, out_at):  # type: ignore[no-untyped-def]
+def smooth_line(
+    ring: Halves, pitch: int, row: int, rows: int, columns: int, taps: int, distance: int, line: Halves, out: Halves,
+    out_at: int,
+) -> None:  # fmt: skip
     """One row of a separable binomial blur, edges repeated.
 
     Args:
@@ -69,7 +75,7 @@ def smooth_line(ring, pitch, row, rows, columns, taps, distance, line, out, out_
 
 
 @inlined
-def normalise_line(line, at, columns, floor, cells, first):  # type: ignore[no-untyped-def]
+def normalise_line(line: Halves, at: int, columns: int, floor: float, cells: Bytes, first: int) -> None:
     """Partially normalised bytes of one row; what the last four histograms spill into the margin is cleared."""
     length = 8 * columns
     for i in range(0, length, 32):
@@ -79,7 +85,7 @@ def normalise_line(line, at, columns, floor, cells, first):  # type: ignore[no-u
 
 
 @inlined
-def sum_line(gray, row, sums, at, columns):  # type: ignore[no-untyped-def]
+def sum_line(gray: Bytes, row: int, sums: Halves, at: int, columns: int) -> None:
     """Sums over 2 x 2 pixels of one half-resolution row, with one repeated number on either side."""
     height, width = gray.shape
     upper, lower = gray[min(2 * row, height - 1)], gray[min(2 * row + 1, height - 1)]
@@ -94,7 +100,7 @@ def sum_line(gray, row, sums, at, columns):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def quarter_line(rows, upper, lower, columns, target):  # type: ignore[no-untyped-def]
+def quarter_line(rows: Halves, upper: int, lower: int, columns: int, target: Halves) -> None:
     """Means of 2 x 2 histograms of the rows that begin at `upper` and `lower`; a single column is its own neighbour."""
     for k in range(8):
         for each in (lower, upper):
@@ -106,7 +112,10 @@ def quarter_line(rows, upper, lower, columns, target):  # type: ignore[no-untype
 
 
 @kernel
-def fine_levels(start, stop, gray, half, border, blurs, geometry, margin, floor, cells, coarse):  # type: ignore[no-untyped-def]
+def fine_levels(
+    start: int, stop: int, gray: Bytes, half: Bytes, border: int, blurs: Longs, geometry: MapGeometry, margin: int,
+    floor: float, cells: Bytes, coarse: Halves,
+) -> None:  # fmt: skip
     """The half-resolution levels, and their last one once more at quarter resolution.
 
     Args:
@@ -116,7 +125,7 @@ def fine_levels(start, stop, gray, half, border, blurs, geometry, margin, floor,
         half: uint8 ``[h + 2 border, w + 2 border]``, receives the rounded mean over 2 x 2 pixels.
         border: Pixels around `half`'s image; left as they are.
         blurs: int64 ``[L, 2]``, taps and distance of each level.
-        geometry: `maps.MapGeometry`.
+        geometry: `levels.MapGeometry`.
         margin: Empty histograms around the maps.
         floor: Added to norms.
         cells: uint8, flat, all levels' histograms.
@@ -169,7 +178,10 @@ def fine_levels(start, stop, gray, half, border, blurs, geometry, margin, floor,
 
 
 @kernel
-def coarse_levels(start, stop, coarse, columns, blurs, first_level, geometry, margin, floor, cells):  # type: ignore[no-untyped-def]
+def coarse_levels(
+    start: int, stop: int, coarse: Halves, columns: int, blurs: Longs, first_level: int, geometry: MapGeometry,
+    margin: int, floor: float, cells: Bytes,
+) -> None:  # fmt: skip
     """The quarter-resolution levels of rows start..stop.
 
     Args:
@@ -179,7 +191,7 @@ def coarse_levels(start, stop, coarse, columns, blurs, first_level, geometry, ma
         columns: Pixels a row.
         blurs: int64 ``[L, 2]``, taps and distance of each level.
         first_level: Number of the first of these levels.
-        geometry: `maps.MapGeometry`.
+        geometry: `levels.MapGeometry`.
         margin: Empty histograms around the maps.
         floor: Added to norms.
         cells: uint8, flat, all levels' histograms.

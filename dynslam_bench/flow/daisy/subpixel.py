@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.jit import inlined, kernel
-from .cost import label_cost
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..kernels.arrays import Floats, Longs
+from .cost import CostTables, Reference, Side, label_cost
 
 
 @kernel
-def parabola(start, stop, labels, step, reference, target, tables, used):  # type: ignore[no-untyped-def]
+def parabola(
+    start: int, stop: int, labels: Floats, step: float, reference: Reference, target: Side, tables: CostTables,
+    used: Longs,
+) -> None:  # fmt: skip
     """Move each label to the vertex of the parabolas through its cost and those `step` pixels beside it.
 
     Args:
@@ -36,7 +41,7 @@ def parabola(start, stop, labels, step, reference, target, tables, used):  # typ
 
 
 @inlined
-def vertex(before, middle, after):  # type: ignore[no-untyped-def]
+def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
     """Position of the minimum of a parabola through values at -1, 0, 1, within these; 0 if it is not convex."""
     curvature = before + after - 2 * middle
     if curvature <= 0:

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ..kernels.words import COSINES, DERIVATIVE_SHIFT
 from . import layout
-from .maps import FIXED_POINT, NORM_FLOOR, MapGeometry, map_geometry
+from .levels import MapGeometry, map_geometry
+from .maps import FIXED_POINT, NORM_FLOOR
 
 
 def quantised_maps(gray: Tensor) -> tuple[Tensor, MapGeometry]:

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
-from ..daisy.cost import appearance, describe_once, descriptor_distance, quantised
-from ..kernels.jit import inlined, kernel
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..daisy.cost import CostTables, Side, appearance, describe_once, descriptor_distance, quantised
+from ..kernels.arrays import Bytes, Flags, Floats, Ints, Longs
 from .guided_filter import filter_patch
+
+Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
+"""Displacement, log2 of the scale, rotation."""
 
 
 @kernel
-def aggregate_and_choose(  # type: ignore[no-untyped-def]
-    start, stop, members, starts, centres, candidates, reference, target, tables, guide, radius, epsilon, best, winner,
-    evaluations,
-):  # fmt: skip
+def aggregate_and_choose(
+    start: int, stop: int, members: Longs, starts: Longs, centres: Floats, candidates: Floats, reference: Side,
+    target: Side, tables: CostTables, guide: Floats, radius: int, epsilon: Scalar, best: Floats, winner: Floats,
+    evaluations: Longs,
+) -> None:  # fmt: skip
     """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
 
     Args:
@@ -72,7 +80,7 @@ def aggregate_and_choose(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def patch_around(members, rows, columns, room):  # type: ignore[no-untyped-def]
+def patch_around(members: Longs, rows: int, columns: int, room: int) -> tuple[int, int, int, int]:
     """Top, left, height and width of the box around pixels, with `room` on every side as far as the image goes."""
     top, bottom, left, right = rows, -1, columns, -1
     for member in members:
@@ -84,7 +92,10 @@ def patch_around(members, rows, columns, room):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def raw_costs(label, centre, patch, size, sides, descriptors, described, raw):  # type: ignore[no-untyped-def]
+def raw_costs(
+    label: Label, centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int], size: int,
+    sides: tuple[Side, Side, CostTables], descriptors: Bytes, described: Flags, raw: Floats,
+) -> Scalar:  # fmt: skip
     """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
 
     Args:
@@ -127,7 +138,7 @@ def raw_costs(label, centre, patch, size, sides, descriptors, described, raw):  
 
 
 @kernel
-def spread_labels(start, stop, winner, regions, centres, flow):  # type: ignore[no-untyped-def]
+def spread_labels(start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats) -> None:
     """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
     for y in range(start, stop):
         row = min(y // 2, winner.shape[0] - 1)

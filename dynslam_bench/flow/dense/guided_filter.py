@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.jit import inlined, kernel
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..kernels.arrays import Floats
 
 
 @kernel
-def filter_patch(guide, values, height, width, radius, epsilon, work, out):  # type: ignore[no-untyped-def]
+def filter_patch(
+    guide: Floats, values: Floats, height: int, width: int, radius: int, epsilon: Scalar, work: Floats, out: Floats
+) -> None:
     """Edge-preserving average of `values` that follows the edges of `guide`.
 
     Within each ``(2 radius + 1)**2`` window (clipped at the image's edge) the output is a linear function of the guide;
@@ -48,7 +52,7 @@ def filter_patch(guide, values, height, width, radius, epsilon, work, out):  # t
 
 
 @inlined
-def box_mean(values, height, width, radius, line, out):  # type: ignore[no-untyped-def]
+def box_mean(values: Floats, height: int, width: int, radius: int, line: Floats, out: Floats) -> None:
     """Mean over the window clipped at the edges; columns first (vectorised), then running sums along rows."""
     for y in range(height):
         low, high = max(y - radius, 0), min(y + radius, height - 1)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.jit import kernel
+from dynslam_bench.core.compiled import kernel
+
+from ..kernels.arrays import Bytes, Doubles, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,7 @@ def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0
 
 
 @kernel
-def assign_pixels(gray, centres, size, weight, iterations, labels):  # type: ignore[no-untyped-def]
+def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints) -> None:
     """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`."""
     height, width = gray.shape
     distance = np.empty((height, width), dtype=np.float64)

@@ -7,12 +7,13 @@ sum is part of the program, results do not depend on that.
 from __future__ import annotations
 
 import operator
-from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
+
+from .instruction import Code, Definition, instruction
 
 WIDTH = 16
 _FLOAT, _WORD, _BYTE, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(8), ir.IntType(64)
@@ -22,7 +23,7 @@ _PAIR = ir.IntType(16)
 _PAIRS = ir.VectorType(_PAIR, WIDTH)
 
 
-class LanesType(types.Type):  # type: ignore[misc]
+class LanesType(types.Type):
     """Numba's type of sixteen float32 lanes."""
 
     def __init__(self) -> None:
@@ -33,51 +34,52 @@ LANES = LanesType()
 
 
 @register_model(LanesType)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, kind: Any) -> None:
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Code, kind: Code) -> None:
         super().__init__(manager, kind, _FLOATS)
 
 
-class _Arithmetic(AbstractTemplate):  # type: ignore[misc]
-    def generic(self, arguments: Any, keywords: Any) -> Any:
+class _Arithmetic(AbstractTemplate):
+    def generic(self, arguments: Code, keywords: Code) -> Code:
         if len(arguments) == 2 and all(isinstance(a, LanesType) for a in arguments):
             return signature(LANES, LANES, LANES)
         return None
 
 
-def _define(symbol: Any, instruction: str) -> None:
-    infer_global(symbol)(type(f"_Lanes_{instruction}", (_Arithmetic,), {}))
+def _define(symbol: Code, operation: str) -> None:
+    infer_global(symbol)(type(f"_Lanes_{operation}", (_Arithmetic,), {}))
 
-    @lower_builtin(symbol, LanesType, LanesType)  # type: ignore[untyped-decorator]
-    def lowered(context: Any, builder: Any, kind: Any, arguments: Any) -> Any:
-        return getattr(builder, instruction)(*arguments)
+    def lowered(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        return getattr(builder, operation)(*arguments)
 
-
-for _symbol, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
-    _define(_symbol, _instruction)
+    lower_builtin(symbol, LanesType, LanesType)(lowered)
 
 
-def pointer_to(context: Any, builder: Any, kind: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
+for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _define(_symbol, _operation)
+
+
+def pointer_to(context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType) -> Code:
     """Code for the address of an array's element, as the address of a vector."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
-def _constant(kind: ir.VectorType, value: float) -> Any:
+def _constant(kind: ir.VectorType, value: float) -> Code:
     return ir.Constant(kind, [value] * WIDTH)
 
 
-def splat(builder: Any, kind: ir.VectorType, value: Any) -> Any:
+def splat(builder: Code, kind: ir.VectorType, value: Code) -> Code:
     """Code for a vector of sixteen equal numbers."""
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_WORD, 0))
     return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _constant(_WORDS, 0))
 
 
-@intrinsic
-def load(typing_context, array, index):  # type: ignore[no-untyped-def]
+@instruction
+def load(typing_context: Code, array: Code, index: Code) -> Definition:
     """Sixteen adjacent numbers of a flat float32 array; nothing is checked."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS))
         loaded.align = 4
         return loaded
@@ -85,11 +87,11 @@ def load(typing_context, array, index):  # type: ignore[no-untyped-def]
     return LANES(array, types.int64), generate
 
 
-@intrinsic
-def load_bytes(typing_context, array, index):  # type: ignore[no-untyped-def]
+@instruction
+def load_bytes(typing_context: Code, array: Code, index: Code) -> Definition:
     """Sixteen adjacent numbers of a flat uint8 array, as floats; nothing is checked."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _BYTES))
         loaded.align = 1
         return builder.sitofp(builder.zext(loaded, _WORDS), _FLOATS)
@@ -97,11 +99,11 @@ def load_bytes(typing_context, array, index):  # type: ignore[no-untyped-def]
     return LANES(array, types.int64), generate
 
 
-@intrinsic
-def store(typing_context, array, index, lanes):  # type: ignore[no-untyped-def]
+@instruction
+def store(typing_context: Code, array: Code, index: Code, lanes: Code) -> Definition:
     """Write sixteen adjacent numbers of a flat float32 array; nothing is checked."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         pointer = pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS)
         builder.store(arguments[2], pointer, align=4)
         return context.get_dummy_value()
@@ -109,21 +111,21 @@ def store(typing_context, array, index, lanes):  # type: ignore[no-untyped-def]
     return types.void(array, types.int64, LANES), generate
 
 
-@intrinsic
-def spread(typing_context, value):  # type: ignore[no-untyped-def]
+@instruction
+def spread(typing_context: Code, value: Code) -> Definition:
     """The same float32 in every lane."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return splat(builder, _FLOATS, arguments[0])
 
     return LANES(types.float32), generate
 
 
-@intrinsic
-def total(typing_context, lanes):  # type: ignore[no-untyped-def]
+@instruction
+def total(typing_context: Code, lanes: Code) -> Definition:
     """Sum of the lanes: halves onto halves, always in the same order."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         rest, width = arguments[0], WIDTH
         while width > 1:
             width //= 2
@@ -139,8 +141,11 @@ def total(typing_context, lanes):  # type: ignore[no-untyped-def]
     return types.float32(lanes), generate
 
 
-@intrinsic
-def sample(typing_context, image, stride, columns, rows, at, column, row, step_x, step_y):  # type: ignore[no-untyped-def]
+@instruction
+def sample(
+    typing_context: Code, image: Code, stride: Code, columns: Code, rows: Code, at: Code, column: Code, row: Code,
+    step_x: Code, step_y: Code,
+) -> Definition:  # fmt: skip
     """Bilinear samples of a flat uint8 image at sixteen places of a rotated and scaled grid.
 
     Args:
@@ -159,7 +164,7 @@ def sample(typing_context, image, stride, columns, rows, at, column, row, step_x
         Grey levels. The places must lie inside the image by at least one row and one column: nothing is checked.
     """
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         pixels, stride, columns, rows, at, column, row, step_x, step_y = arguments
         grid = []
         for k, array in ((2, columns), (3, rows)):

@@ -6,13 +6,12 @@ processor, and `daisy.torch_maps` on every torch device, gets the same bytes.
 
 from __future__ import annotations
 
-from typing import Any
-
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, register_model
+from numba.extending import models, register_model
 
+from .instruction import Code, Definition, instruction
 from .lanes import pointer_to
 
 WIDTH = 32
@@ -24,7 +23,7 @@ DERIVATIVE_SHIFT = 11
 """From differences of sums over 2 x 2 pixels times `COSINES` to 256ths of a grey level a full-image pixel."""
 
 
-class WordsType(types.Type):  # type: ignore[misc]
+class WordsType(types.Type):
     """Numba's type of thirty-two uint16 lanes."""
 
     def __init__(self) -> None:
@@ -35,31 +34,31 @@ WORDS = WordsType()
 
 
 @register_model(WordsType)
-class _WordsModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, kind: Any) -> None:
+class _WordsModel(models.PrimitiveModel):
+    def __init__(self, manager: Code, kind: Code) -> None:
         super().__init__(manager, kind, _HALVES)
 
 
-def _mask(places: list[int]) -> Any:
+def _mask(places: list[int]) -> Code:
     return ir.Constant(ir.VectorType(_WORD, len(places)), places)
 
 
-def _constant(element: Any, values: Any) -> Any:
+def _constant(element: Code, values: Code) -> Code:
     return ir.Constant(ir.VectorType(element, len(values)), list(values))
 
 
-def _average(builder: Any, first: Any, second: Any) -> Any:
+def _average(builder: Code, first: Code, second: Code) -> Code:
     wide = ir.VectorType(_WORD, WIDTH)
     total = builder.add(builder.zext(first, wide), builder.zext(second, wide))
     one = _constant(_WORD, [1] * WIDTH)
     return builder.trunc(builder.lshr(builder.add(total, one), one), _HALVES)
 
 
-@intrinsic
-def load_words(typing_context, array, index):  # type: ignore[no-untyped-def]
+@instruction
+def load_words(typing_context: Code, array: Code, index: Code) -> Definition:
     """Thirty-two adjacent numbers of a flat uint16 array; nothing is checked."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _HALVES))
         loaded.align = 2
         return loaded
@@ -67,11 +66,11 @@ def load_words(typing_context, array, index):  # type: ignore[no-untyped-def]
     return WORDS(array, types.int64), generate
 
 
-@intrinsic
-def store_words(typing_context, array, index, words):  # type: ignore[no-untyped-def]
+@instruction
+def store_words(typing_context: Code, array: Code, index: Code, words: Code) -> Definition:
     """Write thirty-two adjacent numbers of a flat uint16 array; nothing is checked."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         pointer = pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _HALVES)
         builder.store(arguments[2], pointer, align=2)
         return context.get_dummy_value()
@@ -79,21 +78,21 @@ def store_words(typing_context, array, index, words):  # type: ignore[no-untyped
     return types.void(array, types.int64, WORDS), generate
 
 
-@intrinsic
-def average(typing_context, first, second):  # type: ignore[no-untyped-def]
+@instruction
+def average(typing_context: Code, first: Code, second: Code) -> Definition:
     """Rounded mean ``(a + b + 1) >> 1`` of every lane."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return _average(builder, *arguments)
 
     return WORDS(first, second), generate
 
 
-@intrinsic
-def average_of_pairs(typing_context, first, second):  # type: ignore[no-untyped-def]
+@instruction
+def average_of_pairs(typing_context: Code, first: Code, second: Code) -> Definition:
     """Rounded means of adjacent histograms: eight histograms to four."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         parts = [
             builder.shuffle_vector(*arguments, _mask([16 * pair + odd + b for pair in range(4) for b in range(8)]))
             for odd in (0, 8)
@@ -103,8 +102,8 @@ def average_of_pairs(typing_context, first, second):  # type: ignore[no-untyped-
     return WORDS(first, second), generate
 
 
-@intrinsic
-def derivatives(typing_context, sums, here, above, below):  # type: ignore[no-untyped-def]
+@instruction
+def derivatives(typing_context: Code, sums: Code, here: Code, above: Code, below: Code) -> Definition:
     """Rectified directional derivatives of four adjacent pixels.
 
     Args:
@@ -118,10 +117,10 @@ def derivatives(typing_context, sums, here, above, below):  # type: ignore[no-un
         Eight bins a pixel, 256ths of a grey level a full-image pixel.
     """
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         four, wide = ir.VectorType(_HALF, 4), ir.VectorType(_WORD, 4)
 
-        def pixels(index: Any) -> Any:
+        def pixels(index: Code) -> Code:
             loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], index, four))
             loaded.align = 2
             return builder.zext(loaded, wide)
@@ -143,11 +142,11 @@ def derivatives(typing_context, sums, here, above, below):  # type: ignore[no-un
     return WORDS(sums, types.int64, types.int64, types.int64), generate
 
 
-@intrinsic
-def store_normalised(typing_context, array, index, words, floor):  # type: ignore[no-untyped-def]
+@instruction
+def store_normalised(typing_context: Code, array: Code, index: Code, words: Code, floor: Code) -> Definition:
     """Write four histograms as 32 bytes: each divided by its Euclidean norm plus `floor`, times 255, rounded."""
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         array, index, words, floor = arguments
         wide = builder.zext(words, ir.VectorType(_WORD, WIDTH))
         squares, count = builder.mul(wide, wide), WIDTH

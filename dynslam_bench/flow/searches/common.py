@@ -7,7 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.jit import inlined
+from dynslam_bench.core.compiled import Scalar, inlined
+
+from ..kernels.arrays import Floats, Longs
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -49,7 +51,7 @@ def new_state(
 
 
 @inlined
-def scrambled(state):  # type: ignore[no-untyped-def]
+def scrambled(state: Scalar) -> Scalar:
     """64 random bits of a state (splitmix64)."""
     z = (state ^ (state >> np.uint64(30))) * _MIX1
     z = (z ^ (z >> np.uint64(27))) * _MIX2
@@ -57,26 +59,26 @@ def scrambled(state):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def first_state(seed, point, phase):  # type: ignore[no-untyped-def]
+def first_state(seed: Scalar, point: int, phase: int) -> Scalar:
     """First state of a point's random numbers in one phase: a hash of its arguments."""
     return scrambled(np.uint64(seed) + _GOLDEN * (np.uint64(point) * np.uint64(64) + np.uint64(phase) + np.uint64(1)))
 
 
 @inlined
-def advance(state):  # type: ignore[no-untyped-def]
+def advance(state: Scalar) -> Scalar:
     """The next state of a point's random numbers."""
     return state + _GOLDEN
 
 
 @inlined
-def uniform(bits, quarter):  # type: ignore[no-untyped-def]
+def uniform(bits: Scalar, quarter: int) -> Scalar:
     """One of the four float32 in [0, 1) that `scrambled` bits make, in steps of 2**-16."""
     part = np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))
     return np.float32(part) * np.float32(1.0 / 65536)
 
 
 @inlined
-def insert(flames, costs, label, cost):  # type: ignore[no-untyped-def]
+def insert(flames: Floats, costs: Longs, label: Floats, cost: Scalar) -> None:
     """Merge an evaluated label into a point's sorted flames if it is better than the worst (``F = best N``).
 
     Args:
@@ -99,7 +101,7 @@ def insert(flames, costs, label, cost):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def widen(lower, upper, flames):  # type: ignore[no-untyped-def]
+def widen(lower: Floats, upper: Floats, flames: Floats) -> None:
     """Let a point's box contain the surroundings of its best displacement, which a neighbour may have brought."""
     room = np.float32(8)
     for j in range(2):

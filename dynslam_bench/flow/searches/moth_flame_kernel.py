@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..daisy.cost import label_cost
-from ..kernels.jit import inlined, kernel
-from .common import advance, first_state, insert, scrambled, uniform, widen
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..daisy.cost import CostTables, Reference, Side, label_cost
+from ..kernels.arrays import Floats
+from .common import SearchState, advance, first_state, insert, scrambled, uniform, widen
+from .moth_flame import FlightTable
 
 CANDIDATES, FOUNDING, OPPOSITES, FLIGHT = 0, 1, 2, 3
 """Stages of a phase; all but the first and the last belong to phase 0."""
 
 
 @kernel
-def moth_flame_phase(  # type: ignore[no-untyped-def]
-    start, stop, reference, target, tables, state, candidates, end, phase, seed, table, spiral, cauchy, steps
-):
+def moth_flame_phase(
+    start: int, stop: int, reference: Reference, target: Side, tables: CostTables, state: SearchState,
+    candidates: Floats, end: int, phase: int, seed: Scalar, table: FlightTable, spiral: Floats, cauchy: Floats,
+    steps: Floats,
+) -> None:  # fmt: skip
     """Spend evaluations on points start..stop until each has used `end`.
 
     Args:
@@ -104,9 +109,10 @@ def moth_flame_phase(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def copy_population(  # type: ignore[no-untyped-def]
-    from_lower, from_upper, from_moths, from_flames, lower, upper, moths, flames
-):
+def copy_population(
+    from_lower: Floats, from_upper: Floats, from_moths: Floats, from_flames: Floats, lower: Floats, upper: Floats,
+    moths: Floats, flames: Floats,
+) -> None:  # fmt: skip
     """Copy a point's box, moths and flames."""
     for j in range(4):
         lower[j], upper[j] = from_lower[j], from_upper[j]
@@ -115,7 +121,7 @@ def copy_population(  # type: ignore[no-untyped-def]
 
 
 @inlined
-def finite_labels(candidates, trials):  # type: ignore[no-untyped-def]
+def finite_labels(candidates: Floats, trials: Floats) -> int:
     """Fill `trials` with the candidates that are finite; returns how many."""
     count = 0
     for c in range(len(candidates)):
@@ -128,7 +134,7 @@ def finite_labels(candidates, trials):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def scatter(moths, placed, lower, upper, trials, random):  # type: ignore[no-untyped-def]
+def scatter(moths: Floats, placed: int, lower: Floats, upper: Floats, trials: Floats, random: Scalar) -> Scalar:
     """Place the moths from `placed` on anywhere in the box, and try them; returns the next random state."""
     for m in range(placed, len(moths)):
         random = advance(random)
@@ -140,7 +146,9 @@ def scatter(moths, placed, lower, upper, trials, random):  # type: ignore[no-unt
 
 
 @inlined
-def oppose(moths, lower, upper, low, high, trials, random):  # type: ignore[no-untyped-def]
+def oppose(
+    moths: Floats, lower: Floats, upper: Floats, low: Floats, high: Floats, trials: Floats, random: Scalar
+) -> Scalar:
     """Fill `trials` with the moths' opposites (`moth_flame.opposites`); returns the next random state."""
     population = len(moths)
     for j in range(4):  # dynamic bounds dy, dz (Eq. 20)
@@ -161,7 +169,10 @@ def oppose(moths, lower, upper, low, high, trials, random):  # type: ignore[no-u
 
 
 @inlined
-def fly(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random):  # type: ignore[no-untyped-def]
+def fly(
+    moths: Floats, flames: Floats, lower: Floats, upper: Floats, iteration: int, table: FlightTable, spiral: Floats,
+    cauchy: Floats, steps: Floats, random: Scalar,
+) -> Scalar:  # fmt: skip
     """Move every moth once (Eq. 8-18); returns the next random state."""
     population = len(moths)
     span, own, best = table.span[iteration], table.own[iteration], table.best[iteration]
@@ -176,7 +187,7 @@ def fly(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, ra
             jumps = scrambled(random)
         for j in range(4):
             t = span * uniform(bits, j) + np.float32(1)  # Eq. 10
-            turn = spiral[min(max(np.int64((t + np.float32(2)) * np.float32(1024)), 0), 4095)]
+            turn = spiral[min(max(np.int64((t + np.float32(2)) * np.float32(1024)), np.int64(0)), np.int64(4095))]
             distance = abs(flames[m, j] - moths[m, j])
             goal = flames[flame, j]
             if pulling:  # Eq. 17

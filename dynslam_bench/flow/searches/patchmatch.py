@@ -7,13 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..daisy.cost import label_cost
-from ..kernels.jit import inlined, kernel
-from .common import advance, first_state, insert, scrambled, uniform, widen
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..daisy.cost import CostTables, Reference, Side, label_cost
+from ..kernels.arrays import Floats
+from .common import SearchState, advance, first_state, insert, scrambled, uniform, widen
 
 
 @kernel
-def shrinking_window_phase(start, stop, reference, target, tables, state, candidates, end, phase, seed, shrink):  # type: ignore[no-untyped-def]
+def shrinking_window_phase(
+    start: int, stop: int, reference: Reference, target: Side, tables: CostTables, state: SearchState,
+    candidates: Floats, end: int, phase: int, seed: Scalar, shrink: float,
+) -> None:  # fmt: skip
     """Spend evaluations on points start..stop until each has used `end`.
 
     Args:
@@ -72,7 +77,9 @@ def shrinking_window_phase(start, stop, reference, target, tables, state, candid
 
 
 @inlined
-def draw(label, bits, lower, upper, flames, window, shrink):  # type: ignore[no-untyped-def]
+def draw(
+    label: Floats, bits: Scalar, lower: Floats, upper: Floats, flames: Floats, window: Scalar, shrink: float
+) -> None:
     """Fill a label: anywhere in the box (`shrink` 1), or in a window of it around the best label."""
     for j in range(4):
         extent = upper[j] - lower[j]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.jit import inlined, kernel
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+
+from ..kernels.arrays import Floats, Longs
 from .common import advance, scrambled
 
 VOTERS = 256
@@ -12,7 +14,10 @@ VOTERS = 256
 
 
 @kernel
-def transported_labels(start, stop, points, labels, turns, neighbours, motions, lower, upper, out):  # type: ignore[no-untyped-def]
+def transported_labels(
+    start: int, stop: int, points: Floats, labels: Floats, turns: Floats, neighbours: Longs, motions: Floats,
+    lower: Floats, upper: Floats, out: Floats,
+) -> None:  # fmt: skip
     """Labels of neighbours and of common motions, as seen from each point.
 
     A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
@@ -56,7 +61,9 @@ def transported_labels(start, stop, points, labels, turns, neighbours, motions, 
 
 
 @inlined
-def admit(out, i, k, u, v, s, theta, lower, upper):  # type: ignore[no-untyped-def]
+def admit(
+    out: Floats, i: int, k: int, u: Scalar, v: Scalar, s: Scalar, theta: Scalar, lower: Floats, upper: Floats
+) -> None:
     """Store a candidate."""
     out[i, k, 0], out[i, k, 1] = u, v
     out[i, k, 2] = min(max(s, lower[i, 2]), upper[i, 2])
@@ -64,7 +71,7 @@ def admit(out, i, k, u, v, s, theta, lower, upper):  # type: ignore[no-untyped-d
 
 
 @kernel
-def label_turns(labels):  # type: ignore[no-untyped-def]
+def label_turns(labels: Floats) -> Floats:
     """What labels ``[N, 4]`` do to directions: ``2**s (cos theta, sin theta)``, float32 ``[N, 2]``."""
     turns = np.empty((len(labels), 2), dtype=np.float32)
     for i in range(len(labels)):
@@ -75,7 +82,9 @@ def label_turns(labels):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def common_motions(points, labels, costs, hypotheses, tolerance, seed, out):  # type: ignore[no-untyped-def]
+def common_motions(
+    points: Floats, labels: Floats, costs: Longs, hypotheses: int, tolerance: Scalar, seed: Scalar, out: Floats
+) -> None:
     """Up to two similarity motions with which most points agree (RANSAC over pairs of well-matched points).
 
     Args:
@@ -136,7 +145,7 @@ def common_motions(points, labels, costs, hypotheses, tolerance, seed, out):  # 
 
 
 @inlined
-def choose_voters(x, y, to_x, to_y, count, voters):  # type: ignore[no-untyped-def]
+def choose_voters(x: Floats, y: Floats, to_x: Floats, to_y: Floats, count: int, voters: Floats) -> int:
     """Copy about `VOTERS` of `count` points, evenly spread, into ``voters`` ``[4, ...]``; returns how many."""
     voting, every = 0, -(-count // VOTERS)
     for k in range(0, count, every):
@@ -147,7 +156,7 @@ def choose_voters(x, y, to_x, to_y, count, voters):  # type: ignore[no-untyped-d
 
 
 @inlined
-def count_votes(voters, voting, a, b, tx, ty, limit):  # type: ignore[no-untyped-def]
+def count_votes(voters: Floats, voting: int, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar) -> Scalar:
     """How many voters a motion takes to where they were found, by squared distance."""
     from_x, from_y, goal_x, goal_y = voters[0, :voting], voters[1, :voting], voters[2, :voting], voters[3, :voting]
     votes = np.int32(0)
@@ -158,7 +167,10 @@ def count_votes(voters, voting, a, b, tx, ty, limit):  # type: ignore[no-untyped
 
 
 @inlined
-def drop_followers(x, y, to_x, to_y, count, a, b, tx, ty, limit):  # type: ignore[no-untyped-def]
+def drop_followers(
+    x: Floats, y: Floats, to_x: Floats, to_y: Floats, count: int, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar,
+    limit: Scalar,
+) -> int:  # fmt: skip
     """Move those of `count` points that a motion misses by more than the root of `limit` forward; returns how many."""
     left = 0
     for k in range(count):
@@ -170,7 +182,7 @@ def drop_followers(x, y, to_x, to_y, count, a, b, tx, ty, limit):  # type: ignor
 
 
 @inlined
-def better_half(costs, half):  # type: ignore[no-untyped-def]
+def better_half(costs: Longs, half: int) -> Longs:
     """Indices of the `half` lowest costs, ascending; of equal ones the first."""
     threshold = np.partition(costs, half - 1)[half - 1]
     below = 0

@@ -1,10 +1,11 @@
 """The process that makes a run: it steps an environment and tells the parent how it goes.
 
 Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`), which names what is
-to be done, then perhaps ``stop``. The child
-sends ``started``, ``frame`` (one each, the sign of life), ``progress`` every so many frames, and ends with ``done``,
+to be done, then perhaps ``stop``. The child sends ``ready`` before anything else (its time counts from then on),
+``started``, ``frame`` (one each, the sign of life), ``progress`` every so many frames, and ends with ``done``,
 ``stopped`` or ``failed``. What it found lies in files in the job's folder: `frames.jsonl`, written frame by frame so
-that a crash loses nothing, and at the end the final trajectory and the map.
+that a crash loses nothing, and at the end the final trajectory and the map. Its temporary files lie in a private
+folder that goes with it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import resource
 import signal
 import sys
+import tempfile
 import threading
 import traceback
 from multiprocessing.connection import Connection
@@ -25,9 +27,10 @@ from typing import Any
 
 from dynslam_bench.core.plugin_probe import ISOLATED_VARIABLE
 from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.temporary import TemporaryFolder
 
 from .failures import describe_failure
-from .family import adopt_orphans, die_with_parent, end_descendants
+from .family import adopt_orphans, die_with_parent
 
 LOG_FILE = "log.txt"
 
@@ -49,16 +52,21 @@ def main(connection: Connection) -> int:
         job = json.loads(connection.recv_bytes())
     except EOFError:
         return 0
+    _send(connection, {"type": "ready"})
     _redirect(Path(job["folder"]) / LOG_FILE)
     stop = threading.Event()
     threading.Thread(target=_listen, args=(connection, stop), daemon=True).start()
     try:
-        _prepare(job)
-        work = load_object(job["work"])
-        message = work(job, lambda message: _send(connection, message), stop.is_set)
+        with contextlib.closing(TemporaryFolder()) as temporary:
+            os.environ["TMPDIR"] = tempfile.tempdir = str(temporary.path)
+            _prepare(job)
+            work = load_object(job["work"])
+            message = work(job, lambda message: _send(connection, message), stop.is_set)
     except BaseException as error:
         traceback.print_exc()
         message = describe_failure(error)
+        if not Path(job["folder"]).is_dir():
+            message |= {"infrastructure": f"{job['folder']} was removed"}
     _send(connection, message | {"peak_memory_mb": peak_memory_mb()})
     sys.stdout.flush()
     sys.stderr.flush()
@@ -92,7 +100,7 @@ def _send(connection: Connection, message: dict[str, Any]) -> None:
 
 def _redirect(log: Path) -> None:
     """Everything that is printed, by whatever library, goes to the log; so does the stack of a fatal signal."""
-    handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     sys.stdout.flush()
     sys.stderr.flush()
     os.dup2(handle, 1)
@@ -108,7 +116,8 @@ def _redirect(log: Path) -> None:
 
 
 def _prepare(job: dict[str, Any]) -> None:
-    os.environ.update(job["environment"] | {ISOLATED_VARIABLE: "1"})
+    wanted = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
+    os.environ.update(wanted | {ISOLATED_VARIABLE: "1"})
     with contextlib.suppress(OSError):
         os.chdir(job["working_folder"])
     sys.path[:] = job["path"]
@@ -130,33 +139,3 @@ def limit_threads(threads: int) -> None:
         os.environ["NUMBA_NUM_THREADS"] = str(threads)
     else:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-
-
-def keep(connection_fd: int) -> int:
-    """Make the run in a process below this one, which adopts and ends whatever the run leaves behind.
-
-    Returns:
-        The run's exit code; does not return if a signal ended the run, but ends by the same one.
-    """
-    if not adopt_orphans():
-        return main(Connection(connection_fd))
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            code = main(Connection(connection_fd))
-        finally:
-            os._exit(code)
-    os.close(connection_fd)
-    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    end_descendants()
-    if code < 0:
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        if -code not in (signal.SIGKILL, signal.SIGSTOP):
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    return code
-
-
-if __name__ == "__main__":
-    os._exit(keep(int(sys.argv[1])))  # threads that a tracker left running must not hold it up

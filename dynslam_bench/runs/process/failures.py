@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import sys
 import sysconfig
@@ -11,11 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError, PluginError, SegmentationError, SettingsError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, PluginError, SegmentationError, SettingsError
 
 _LONGEST = 400
 _REFUSALS = (SettingsError, SegmentationError, PluginError)
 """Raised before the first frame is tracked, these say that what was asked for cannot be."""
+
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE)
+"""What a disk says that is full, read-only, damaged or gone: no tracker can help it."""
 
 
 class FailedAt(Exception):
@@ -36,6 +40,8 @@ def at(where: object) -> Iterator[None]:
 def describe_failure(error: BaseException) -> dict[str, Any]:
     """The last message of a run that an exception ended: ``status``, ``reason`` and ``refused``.
 
+    With ``infrastructure`` it was no fault of the run's: that says what broke.
+
     The reason reads ``frame 20 of 60: ValueError: too few points (my_tracker.py:31)``.
     """
     from dynslam_bench.contracts.checks import TrackerContractError
@@ -48,6 +54,9 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
     if isinstance(cause, SystemExit):
         named = f"sys.exit({cause.code!r}) was called"
     kind = type(cause).__name__
+    broken = _broken(error)
+    if broken:
+        return _message("crashed", _located(where, broken)) | {"infrastructure": broken}
     if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
         return _message("out-of-memory", _located(where, named, cause))
     if isinstance(cause, TrackerContractError):
@@ -55,6 +64,15 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
     if isinstance(cause, DynslamError):
         return _message("crashed", _located(where, text)) | {"refused": isinstance(cause, _REFUSALS)}
     return _message("crashed", _located(where, named, cause))
+
+
+def _broken(error: BaseException | None) -> str:
+    """What of the infrastructure broke, if an exception or one of its causes says that something did."""
+    while error is not None:
+        if isinstance(error, InfrastructureError) or (isinstance(error, OSError) and error.errno in _DISK_ERRORS):
+            return " ".join(str(error).split())[:_LONGEST]
+        error = error.__cause__ or error.__context__
+    return ""
 
 
 def _message(status: str, reason: str) -> dict[str, Any]:

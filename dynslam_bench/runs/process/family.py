@@ -22,9 +22,12 @@ _SET_PARENT_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36
 _SWEEP_S = 5.0
 
 
-def die_with_parent() -> None:
-    """Ask Linux to kill this process when the one that forked it ends; elsewhere the closing connection has to do."""
-    _prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+def die_with_parent(by: int = signal.SIGKILL) -> None:
+    """Ask Linux for that signal when the one that forked this process ends; elsewhere the closing connection has to do.
+
+    For Linux the parent is the thread that forked.
+    """
+    _prctl(_SET_PARENT_DEATH_SIGNAL, by)
 
 
 def adopt_orphans() -> bool:

@@ -12,6 +12,8 @@ import time
 from abc import ABC, abstractmethod
 from multiprocessing.connection import Connection, Pipe, wait
 
+from dynslam_bench.core.temporary import sweep
+
 from .family import end_family, family
 from .server import SERVER, child_environment
 
@@ -26,12 +28,16 @@ class Child(ABC):
 
     Args:
         connection: The parent's end.
-        pid: Its process id, 0 until it is known.
+        pid: Its process id, 0 until it is known; on Linux that of its keeper.
+        run_pid: That of the run itself, or 0 where it is not known.
+        lost: Why nothing is known of its end, if that is so: who was to report it has died itself.
     """
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         self.pid = 0
+        self.run_pid = 0
+        self.lost = ""
 
     def wait_handle(self) -> int | None:
         """A file descriptor that becomes readable when the child ends, if there is one."""
@@ -81,14 +87,16 @@ class ForkedChild(Child):
             except BlockingIOError:
                 break
             if not data:  # the server is gone, and its children with it
-                self._exit = -signal.SIGKILL
+                self._exit, self.lost = -signal.SIGKILL, self.lost or "the fork server was ended from outside"
                 break
             self._buffer += data
             *lines, self._buffer = self._buffer.split(b"\n")
             for line in lines:
                 message = json.loads(line)
                 self.pid = message.get("pid", self.pid)
+                self.run_pid = message.get("run", self.run_pid)
                 self._exit = message.get("exit", self._exit)
+                self.lost = message.get("refused", self.lost)
         return self._exit
 
     def close(self) -> None:
@@ -103,11 +111,11 @@ class ForkedChild(Child):
 
 
 class FreshChild(Child):
-    """A child in an interpreter of its own; on Linux below a keeper, see `child.keep`."""
+    """A child in an interpreter of its own; on Linux below a keeper, see `keeper`."""
 
     def __init__(self) -> None:
         ours, theirs = Pipe()
-        command = [sys.executable, "-m", "dynslam_bench.runs.process.child", str(theirs.fileno())]
+        command = [sys.executable, "-m", "dynslam_bench.runs.process.keeper", str(theirs.fileno())]
         try:
             self._process = subprocess.Popen(
                 command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=child_environment()
@@ -138,18 +146,19 @@ class FreshChild(Child):
             end_family(self.pid)
 
     def close(self) -> None:
-        """Kill it if it still runs, reap it, and end what is left of its process group."""
+        """Kill it if it still runs, reap it, end what is left of its process group, and remove its temporary files."""
         super().close()
         self._process.wait()
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
+        sweep()
 
 
 def start_child() -> Child:
     """Start a child that waits for its job.
 
     Raises:
-        RunError: The fork server cannot be started.
+        InfrastructureError: The fork server cannot be started.
     """
     how = os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
     return FreshChild() if how == "fresh" else ForkedChild()

@@ -3,7 +3,8 @@
 It is told what to do over a Unix socket: one byte with two file descriptors, the child's end of its connection and a
 pipe on which the server answers with the child's process id and, later, its wait status, a JSON line each. When the
 socket closes, because the parent ended in whatever way, the server kills its children and goes. A run's end is reported
-only after everything that it had started has ended, too.
+only after everything that it had started has ended, too, and its temporary files are gone. The server has a session of
+its own: what a terminal sends to all processes at once does not reach it before it has done so.
 
 (Python's own ``forkserver`` re-imports the caller's main script in every child and may not be used in daemonic
 processes; this one does neither.)
@@ -22,11 +23,10 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Collection
-from multiprocessing.connection import Connection
 from typing import NoReturn
 
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import InfrastructureError
+from dynslam_bench.core.temporary import sweep
 
 from .family import adopt_orphans, children, end_descendants, end_family
 
@@ -34,7 +34,7 @@ PRELOADED = (
     *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
     *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.build_flow"),
-    *("dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.child"),
+    *("dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.keeper"),
 )
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
@@ -50,7 +50,7 @@ class ForkServer:
         self._owner = 0
 
     def spawn(self, child_fd: int) -> int:
-        """Fork a child that runs `child.main` on a connection.
+        """Fork a child that makes a run over a connection, see `keeper`.
 
         Args:
             child_fd: The child's end of its connection; the caller closes it afterwards.
@@ -59,7 +59,7 @@ class ForkServer:
             The read end of the status pipe.
 
         Raises:
-            RunError: The server cannot be started.
+            InfrastructureError: The server cannot be started.
         """
         read_fd, write_fd = os.pipe()
         try:
@@ -71,7 +71,7 @@ class ForkServer:
                     except OSError as error:
                         self._close()
                         if attempt == 2:
-                            raise RunError(f"the fork server does not answer: {error}") from error
+                            raise InfrastructureError(f"the fork server does not answer: {error}") from error
             raise AssertionError("unreachable")
         except BaseException:
             os.close(read_fd)
@@ -93,11 +93,15 @@ class ForkServer:
         command = [sys.executable, "-m", "dynslam_bench.runs.process.server", str(theirs.fileno())]
         try:
             self._process = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=child_environment()
+                command,
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=child_environment(),
+                start_new_session=True,
             )
         except OSError as error:
             ours.close()
-            raise RunError(f"cannot start {sys.executable}: {error.strerror}") from error
+            raise InfrastructureError(f"cannot start {sys.executable}: {error.strerror}") from error
         finally:
             theirs.close()
         self._socket, self._owner = ours, os.getpid()
@@ -128,90 +132,132 @@ atexit.register(SERVER.close)
 
 
 def serve(fd: int) -> None:
-    """The server's loop, until the socket `fd` closes."""
-    _preload()
-    adopt_orphans()  # what a run leaves behind becomes a child of this process, and is ended
-    own = frozenset(children(os.getpid()))
+    """The server's loop, until the socket `fd` closes or SIGTERM comes."""
     control = socket.socket(fileno=fd)
-    wake_read, wake_write = os.pipe()
-    for end in (wake_read, wake_write):
-        os.set_blocking(end, False)
-    signal.signal(signal.SIGCHLD, lambda *_: None)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.set_wakeup_fd(wake_write, warn_on_full_buffer=False)
-    selector = selectors.DefaultSelector()
-    selector.register(control, selectors.EVENT_READ)
-    selector.register(wake_read, selectors.EVENT_READ)
-    runs: dict[int, int] = {}
-    while True:
-        for key, _ in selector.select():
-            if key.fileobj is control:
-                message, fds, _, _ = socket.recv_fds(control, 1, 2)
-                if not message:
-                    _end(runs)
-                    return
-                connection_fd, status_fd = fds
-                pid = os.fork()
-                if pid == 0:
-                    selector.close()
-                    for inherited in (fd, wake_read, wake_write, status_fd, *runs.values()):
-                        os.close(inherited)
-                    control.detach()
-                    _become_child(connection_fd)
-                os.close(connection_fd)
-                _tell(status_fd, {"pid": pid})
-                runs[pid] = status_fd
-            else:
-                with contextlib.suppress(BlockingIOError):
-                    os.read(wake_read, 4096)
-        _reap(runs, own)
+    for ignored in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(ignored, signal.SIG_IGN)
+    if not _preload(control):
+        return
+    adopt_orphans()  # what a run leaves behind becomes a child of this process, and is ended
+    _Server(control).run()
 
 
-def _reap(runs: dict[int, int], own: Collection[int]) -> None:
-    """Bury the runs that have ended, end what they left behind, then report them."""
-    ended: list[tuple[int, int]] = []
-    for pid in list(runs):
-        with contextlib.suppress(ChildProcessError):
-            buried, status = os.waitpid(pid, os.WNOHANG)
-            if buried:
-                ended.append((runs.pop(pid), status))
-    if ended:
-        end_descendants({*runs, *own})
-    for status_fd, status in ended:
-        _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
-        os.close(status_fd)
+class _Server:
+    """The runs that are under way, and what wakes the server: the parent, a child's end, a signal."""
+
+    def __init__(self, control: socket.socket) -> None:
+        self.control = control
+        self.own = frozenset(children(os.getpid()))
+        self.runs: dict[int, int] = {}
+        self.ending = False
+        self.wake_read, self.wake_write = os.pipe()
+        for end in (self.wake_read, self.wake_write):
+            os.set_blocking(end, False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.signal(signal.SIGTERM, self._end)
+        signal.set_wakeup_fd(self.wake_write, warn_on_full_buffer=False)
+        self.selector = selectors.DefaultSelector()
+        self.selector.register(control, selectors.EVENT_READ)
+        self.selector.register(self.wake_read, selectors.EVENT_READ)
+
+    def _end(self, *_: object) -> None:
+        self.ending = True
+
+    def run(self) -> None:
+        while not self.ending:
+            for key, _ in self.selector.select():
+                if key.fileobj is not self.control:
+                    with contextlib.suppress(BlockingIOError):
+                        os.read(self.wake_read, 4096)
+                    self._reap()
+                elif not self._accept():
+                    self.ending = True
+        for pid in self.runs:
+            end_family(pid)
+        end_descendants()
+        sweep()
+
+    def _accept(self) -> bool:
+        """Fork the child that is asked for; False when nobody asks any more."""
+        message, fds, _, _ = socket.recv_fds(self.control, 1, 2)
+        if not message:
+            return False
+        connection_fd, status_fd = fds
+        try:
+            pid = os.fork()
+        except OSError as error:
+            _tell(status_fd, {"refused": f"no process can be started: {error.strerror}"})
+            os.close(connection_fd)
+            os.close(status_fd)
+            return True
+        if pid == 0:
+            self.selector.close()
+            for inherited in (self.wake_read, self.wake_write, *self.runs.values()):
+                os.close(inherited)
+            self.control.close()
+            _become_keeper(connection_fd, status_fd)
+        os.close(connection_fd)
+        _tell(status_fd, {"pid": pid})
+        self.runs[pid] = status_fd
+        return True
+
+    def _reap(self) -> None:
+        """Bury the runs that have ended, end what they left behind, then report them."""
+        ended: list[tuple[int, int]] = []
+        for pid in list(self.runs):
+            with contextlib.suppress(ChildProcessError):
+                buried, status = os.waitpid(pid, os.WNOHANG)
+                if buried:
+                    ended.append((self.runs.pop(pid), status))
+        if ended:
+            end_descendants({*self.runs, *self.own})
+            sweep()
+        for status_fd, status in ended:
+            _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
+            os.close(status_fd)
 
 
-def _end(runs: dict[int, int]) -> None:
-    for pid in runs:
-        end_family(pid)
-    end_descendants()
-
-
-def _tell(fd: int, message: dict[str, int]) -> None:
+def _tell(fd: int, message: dict[str, int] | dict[str, str]) -> None:
     with contextlib.suppress(OSError):  # the parent may have lost interest
         os.write(fd, json.dumps(message).encode() + b"\n")
 
 
-def _become_child(connection_fd: int) -> NoReturn:
+def _become_keeper(connection_fd: int, status_fd: int) -> NoReturn:
     signal.set_wakeup_fd(-1)
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for number in (signal.SIGCHLD, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+
+    def told(pid: int) -> None:
+        if pid:
+            _tell(status_fd, {"run": pid})
+        os.close(status_fd)
+
     code = 1
     try:
-        from .child import main
+        from .keeper import keep
 
-        code = main(Connection(connection_fd))
+        code = keep(connection_fd, told)
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
         os._exit(code)
 
 
-def _preload() -> None:
+def _preload(control: socket.socket) -> bool:
+    """Import what is heavy; False as soon as the parent is seen to be gone."""
     for name in PRELOADED:
+        if _is_closed(control):
+            return False
         with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
             importlib.import_module(name)
+    return True
+
+
+def _is_closed(control: socket.socket) -> bool:
+    try:
+        return control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 if __name__ == "__main__":

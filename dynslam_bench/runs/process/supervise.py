@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from typing import Any
 
+from dynslam_bench.core.errors import InfrastructureError
+
 from ..spec import Limits
 from ..storage.record import Status
 from .family import memory_mb
@@ -22,6 +24,8 @@ _STOP_GRACE_S = 30.0
 _FIRST_WARM = 1
 """The first frame after which nothing is loaded or compiled any more: a flow needs two frames before it compiles."""
 _END_GRACE_S = 10.0
+_SIGNAL_GRACE_S = 0.5
+_GO_ON = "the run is not stored; the same command goes on from there"
 
 
 @dataclass
@@ -70,6 +74,9 @@ def supervise(
 
     Returns:
         How it ended. The child has ended, too, and with it everything that it had started.
+
+    Raises:
+        InfrastructureError: The child could not do its work, through no fault of that.
     """
     watch = _Watch(child, limits, on_progress, cancelled, tick or (lambda: None), at_a_time, located)
     try:
@@ -96,7 +103,8 @@ class _Watch:
         self.tick, self.located = tick, located
         self.memory_mb, self.memory_source = memory_limit(limits.memory_mb, at_a_time)
         self.final_at = 0.0
-        self.began = self.sign_of_life = time.monotonic()
+        self.sign_of_life = time.monotonic()
+        self.began: float | None = None
         self.frame = -1
         self.n_frames = 0
         self.final: Message = {}
@@ -128,6 +136,8 @@ class _Watch:
     def died(self) -> Verdict:
         """The verdict on a child that is no more."""
         kind = self.final.get("type")
+        if self.final.get("infrastructure"):
+            raise InfrastructureError(self.final["infrastructure"], _GO_ON)
         if kind == "done":
             return self._verdict("ok")
         if kind == "stopped":
@@ -136,7 +146,21 @@ class _Watch:
             verdict = self._verdict(self.final["status"], self.final["reason"])
             verdict.refused = self.final.get("refused", False) and self.frame < 0
             return verdict
-        return self._verdict(*_reason_of_exit(_wait_exit(self.child), self._where()))
+        code = _wait_exit(self.child)
+        if code < 0 and self._is_cancelled(_SIGNAL_GRACE_S):  # what ends this process ended the child first
+            return self._verdict("stopped", f"cancelled{self._where()}")
+        if self.child.lost or self.began is None:
+            lost = self.child.lost or f"the process that was to make it ended with code {code}"
+            raise InfrastructureError(f"the run could not go on: {lost}", _GO_ON)
+        return self._verdict(*_reason_of_exit(code, self._where()))
+
+    def _is_cancelled(self, wait_s: float = 0.0) -> bool:
+        end = time.monotonic() + wait_s
+        while self.cancelled is not None and not self.cancelled():
+            if time.monotonic() >= end:
+                return False
+            time.sleep(0.02)
+        return self.cancelled is not None
 
     def _receive(self) -> bool:
         try:
@@ -145,7 +169,9 @@ class _Watch:
             return False
         kind = message["type"]
         self.sign_of_life = time.monotonic()
-        if kind == "started":
+        if kind == "ready":
+            self.began = self.sign_of_life
+        elif kind == "started":
             self.n_frames = message["frames"]
         elif kind == "frame":
             self.frame = message["index"]
@@ -169,10 +195,14 @@ class _Watch:
         limits = self.limits
         if self.final:
             return self.died() if now - self.final_at > _END_GRACE_S else None
-        if self.cancelled is not None and self.cancelled():
+        if self._is_cancelled():
             return self._verdict("stopped", f"cancelled{self._where()}")
         if self.stop_sent is not None and now - self.stop_sent > _STOP_GRACE_S:
             return self._verdict("stopped", f"stopped on request after frame {self.frame}")
+        if self.began is None:
+            if now - self.sign_of_life > limits.start_s:
+                raise InfrastructureError(f"no process for the run within {limits.start_s:g} s", _GO_ON)
+            return None
         if limits.time_s is not None and now - self.began > limits.time_s:
             return self._verdict("timeout", f"not done within {limits.time_s:g} s{self._where()}")
         patience = limits.start_s if self.frame < _FIRST_WARM else limits.frame_s
@@ -182,7 +212,7 @@ class _Watch:
             return None
         self.next_look = now + _POLL_S
         self.tick()
-        used = memory_mb(self.child.pid) if self.child.pid else 0.0
+        used = memory_mb(pid) if (pid := self.child.run_pid or self.child.pid) else 0.0
         self.peak_mb = max(self.peak_mb, used)
         if self.memory_mb is not None and used > self.memory_mb:
             source = f" ({self.memory_source})" if self.memory_source else ""

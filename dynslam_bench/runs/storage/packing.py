@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import re
 import shutil
 import struct
-import tempfile
 import zipfile
 import zlib
 from pathlib import Path
 
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.temporary import TemporaryFolder
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..one import run_one
@@ -48,8 +49,8 @@ def run_packed(spec_json: str, options_json: str = "{}") -> bytes:
     options = json.loads(options_json)
     if "protocol" in options:
         options["protocol"] = Protocol.model_validate(options["protocol"])
-    with tempfile.TemporaryDirectory(prefix="dynslam-run-") as folder:
-        store = RunStore(folder)
+    with contextlib.closing(TemporaryFolder()) as folder:
+        store = RunStore(folder.path)
         store.prepare()
         record = run_one(spec, store, **options)
         return pack(store, record)

@@ -6,11 +6,8 @@ import contextlib
 import logging
 import os
 import re
-import secrets
-import shutil
-import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, did_you_mean
+from dynslam_bench.core.files import replace_folder, sweep_temporary, temporary_folder
+from dynslam_bench.core.locks import claimed
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
@@ -59,6 +58,7 @@ class RunStore:
 
     def __init__(self, root: str | Path = "results") -> None:
         self.root = Path(root).expanduser().absolute()
+        self._swept = False
 
     @property
     def runs(self) -> Path:
@@ -86,55 +86,51 @@ class RunStore:
             RunError: The folder cannot be written.
         """
         try:
-            self.runs.mkdir(parents=True, exist_ok=True)
-            probe = self.runs / f".probe.{secrets.token_hex(4)}"
-            probe.mkdir()
-            probe.rmdir()
-        except OSError as error:
-            raise RunError(
-                f"cannot write into {self.runs}: {error.strerror}", "name another folder with --results"
-            ) from error
-        for left in self.runs.glob(".*"):
-            if _abandoned(left.name):
-                shutil.rmtree(left, ignore_errors=True)
+            with temporary_folder(self.runs / "probe"):
+                pass
+        except DynslamError as error:
+            raise RunError(str(error.args[0]), "name another folder with --results") from error
+        if not self._swept:
+            self._swept = True
+            for pattern in ("", "runs", "metrics/*", "sequences/*"):
+                sweep_temporary(self.root, pattern)
+            for left in self.runs.glob(".*.claim"):
+                with claimed(left):  # held by nobody else, it goes
+                    pass
+            self._unlink_dangling()
 
     @contextmanager
     def work_folder(self, run_id: str) -> Iterator[Path]:
         """A hidden folder to make a run in; it vanishes unless `publish` moved it into place.
 
         Raises:
-            RunError: The store cannot be written.
+            DynslamError: The store cannot be written.
         """
-        path = self.runs / f".{run_id}.{socket.gethostname()}.{os.getpid()}.{secrets.token_hex(4)}"
-        try:
-            path.mkdir(parents=True)
-        except OSError as error:
-            raise RunError(f"cannot write into {self.runs}: {error.strerror}", "name another folder") from error
-        try:
-            yield path
-        finally:
-            shutil.rmtree(path, ignore_errors=True)
+        with temporary_folder(self.folder(run_id)) as work:
+            yield work
+
+    def claim(self, run_id: str) -> AbstractContextManager[bool]:
+        """Make a run alone while the block lasts; it is given False where another process or thread is making it.
+
+        Raises:
+            DynslamError: The store cannot be written.
+        """
+        return claimed(self.runs / f".{run_id}.claim")
 
     def publish(self, work: Path, record: RunRecord) -> None:
         """Write the record into its work folder and rename that to the run's; replaces an earlier run of the id.
 
         Raises:
-            RunError: It cannot be written; then nothing has changed.
+            InfrastructureError: It cannot be written; then nothing has changed.
         """
         target = self.folder(record.run_id)
         try:
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
-            work.chmod(0o755)
-            if target.exists():
-                stale = work.with_name(f"{work.name}.old")
-                target.replace(stale)
-                work.replace(target)
-                shutil.rmtree(stale, ignore_errors=True)
-                self._forget_metrics(record.run_id)
-            else:
-                work.replace(target)
+            self._forget_metrics(record.run_id)  # those of an earlier run of the id
+            replace_folder(work, target)
+            self._forget_metrics(record.run_id)  # if they were written again between these two lines
         except OSError as error:
-            raise RunError(f"cannot write {target}: {error.strerror}", "check the free space") from error
+            raise InfrastructureError(f"cannot write {target}: {error.strerror}", "check the free space") from error
         self._link_latest(target)
 
     def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
@@ -168,15 +164,12 @@ class RunStore:
         """
         run_id = self.find(run_id)
         try:
-            gone = self.runs / f".{run_id}.{socket.gethostname()}.{os.getpid()}.gone"
-            self.folder(run_id).replace(gone)
-            shutil.rmtree(gone)
-            self._forget_metrics(run_id)
+            with self.work_folder(run_id) as gone:
+                self._forget_metrics(run_id)
+                self.folder(run_id).rename(gone / run_id)
         except OSError as error:
             raise RunError(f"cannot remove run {run_id}: {error.strerror}") from error
-        latest = self.root / "latest"
-        if latest.is_symlink() and not latest.exists():
-            latest.unlink()
+        self._unlink_dangling()
 
     # -- reading ---------------------------------------------------------------------------------------------------
 
@@ -184,7 +177,8 @@ class RunStore:
         """Ids of all stored runs, sorted."""
         if not self.runs.is_dir():
             return []
-        return sorted(path.name for path in self.runs.iterdir() if _RUN_ID.fullmatch(path.name) and path.is_dir())
+        with os.scandir(self.runs) as entries:
+            return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
 
     def read(self, run_id: str) -> RunRecord:
         """The record of a run.
@@ -193,18 +187,23 @@ class RunStore:
             RunError: There is no such run.
             DynslamError: Its record is damaged.
         """
-        return self._read(self.find(run_id))
+        return self.read_whole(self.find(run_id))
 
     def get(self, run_id: str) -> RunRecord | None:
         """The record of a run by its full id, None if it is not stored or damaged."""
         if not (self.folder(run_id) / RUN_FILE).is_file():
             return None
         try:
-            return self._read(run_id)
+            return self.read_whole(run_id)
         except DynslamError:
             return None
 
-    def _read(self, run_id: str) -> RunRecord:
+    def read_whole(self, run_id: str) -> RunRecord:
+        """The record of a run by its full id.
+
+        Raises:
+            DynslamError: It is missing or damaged, or names itself otherwise.
+        """
         path = self.folder(run_id) / RUN_FILE
         record = RunRecord.read(path)
         if record.run_id != run_id:
@@ -216,7 +215,7 @@ class RunStore:
         records, unreadable = [], []
         for run_id in self.ids():
             try:
-                records.append(self._read(run_id))
+                records.append(self.read_whole(run_id))
             except DynslamError as error:
                 unreadable.append(Unreadable(self.folder(run_id), str(error)))
         return sorted(records, key=lambda record: (record.started, record.run_id)), unreadable
@@ -319,14 +318,19 @@ class RunStore:
 
     def _forget_metrics(self, run_id: str) -> None:
         for metrics in (self.root / "metrics").glob(f"*/{run_id}.json"):
-            metrics.unlink()
+            metrics.unlink(missing_ok=True)
 
     def _link_latest(self, target: Path) -> None:
         link = self.root / "latest"
-        fresh = self.root / f".latest.{secrets.token_hex(4)}"
-        with contextlib.suppress(OSError):  # a file system without links: the run is stored all the same
+        with contextlib.suppress(OSError), temporary_folder(link) as work:  # a file system may have no links
+            fresh = work / link.name
             fresh.symlink_to(target.relative_to(self.root))
             fresh.replace(link)
+
+    def _unlink_dangling(self) -> None:
+        latest = self.root / "latest"
+        if latest.is_symlink() and not latest.exists():
+            latest.unlink(missing_ok=True)
 
 
 def _checked(name: str, what: str) -> str:
@@ -342,17 +346,3 @@ def _read_truth(path: Path, _changed_ns: int) -> Trajectory:
     truth = read_tum(path)
     truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
     return truth
-
-
-def _abandoned(name: str) -> bool:
-    """Whether a hidden folder belonged to a process of this machine that is no more."""
-    match = re.fullmatch(r"\.[0-9a-f]{16}\.(.+)\.(\d+)\.(?:[0-9a-f]{8}(?:\.old)?|gone)", name)
-    if not match or match[1] != socket.gethostname():
-        return False
-    try:
-        os.kill(int(match[2]), 0)
-    except ProcessLookupError:
-        return True
-    except OSError:
-        return False
-    return False

@@ -131,7 +131,7 @@ class YoloImages:
                 continue
             try:
                 kind, *points = line.split()
-                name = COCO_NAMES[range(len(COCO_NAMES))[int(kind)]]
+                name = COCO_NAMES[_positive(kind)]
                 polygon = np.array(points, np.float64).reshape(-1, 2) * [rgb.shape[1], rgb.shape[0]]
                 _check_polygon(polygon)
             except (ValueError, IndexError, OverflowError) as error:
@@ -173,6 +173,13 @@ def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArra
         whole = cv2.resize(fine, (high - low).tolist(), interpolation=cv2.INTER_AREA)
         mask[low[1] : high[1], low[0] : high[0]] |= whole >= 128
     return mask
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise ValueError(f"{number} is no class")
+    return number
 
 
 def _check_polygon(polygon: NDArray[np.float64]) -> None:

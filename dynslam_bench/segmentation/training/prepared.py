@@ -60,7 +60,7 @@ class PreparedImages:
         try:
             self.images: NDArray[np.uint8] = np.load(folder / "images.npy", mmap_mode="r", allow_pickle=False)
             self.labels: NDArray[np.uint8] = np.load(folder / "labels.npy", mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError, TypeError, SyntaxError, EOFError, OverflowError) as error:
+        except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
             raise SegmentationError(f"the prepared images in {folder} are damaged: {error}", _AGAIN) from error
         self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
         if not len(self.images) == len(self.labels) == len(self.names):

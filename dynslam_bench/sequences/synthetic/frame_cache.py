@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.reading import read_lines
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from ..published.cameras import write_camera
+from ..readers.lists import read_stamped_lines
 from .settings import FPS
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -96,7 +98,10 @@ class FrameStore:
             SequenceError: The file exists but cannot be read (permissions, input error).
         """
         data = self._bytes(kind, stamp)
-        image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        try:
+            image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            return None
         if image is None:
             return None
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if kind == "rgb" else image
@@ -143,7 +148,7 @@ class FrameStore:
             lines += [f"{stamp} {kind}/{stamp}.png" for stamp in sorted(known, key=float)]
             write_atomic(self.folder / f"{kind}.txt", "\n".join(lines) + "\n")
         poses = self.folder / "groundtruth.txt"
-        if not poses.is_file() or len(poses.read_text().splitlines()) < len(truth) + 3:
+        if not poses.is_file() or sum(1 for _ in read_lines(poses, kind=SequenceError)) < len(truth) + 3:
             translation, quaternion = se3.to_quaternion(truth.T_world_cam)
             rows = np.concatenate([translation, quaternion], axis=1)
             lines = ["# exact poses of a rendered sequence", "# timestamp tx ty tz qx qy qz qw", "#"]
@@ -157,5 +162,5 @@ class FrameStore:
         path = self.folder / f"{kind}.txt"
         if not path.is_file():
             return set()
-        stamps = (line.split()[0] for line in path.read_text().splitlines() if line.strip() and line[0] != "#")
+        stamps = {f"{stamp:.6f}" for stamp, _ in read_stamped_lines(path)}
         return {stamp for stamp in stamps if (self.folder / kind / f"{stamp}.png").is_file()}

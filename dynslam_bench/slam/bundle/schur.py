@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
 
 from ..localisation.pose import CHI2_DEPTH, CHI2_MONO, NEAR_M, apply_twist, cholesky_solve
@@ -60,7 +60,7 @@ class BundleResult:
     cost_after: float
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _cost(
     poses: Array, points: Array, obs_pose: Index, obs_point: Index, uv: Array, right: Array, info: Array,
     info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, chi2: Array,
@@ -89,7 +89,7 @@ def _cost(
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _step(
     poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
@@ -213,7 +213,7 @@ def _step(
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _adjust(
     poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,

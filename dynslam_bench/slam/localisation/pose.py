@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class PoseEstimate:
         return int(np.count_nonzero(self.inliers))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def cholesky_solve(a: Array, b: Array) -> bool:
     """Solve ``a x = b`` in place for a symmetric positive definite `a`; `b` becomes x. False if it is not definite."""
     n = a.shape[0]
@@ -75,7 +75,7 @@ def cholesky_solve(a: Array, b: Array) -> bool:
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def apply_twist(pose: Array, xi: Array) -> Array:
     """``exp(xi) @ pose`` for a twist (translation, rotation), re-orthonormalised."""
     theta2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
@@ -121,7 +121,7 @@ def apply_twist(pose: Array, xi: Array) -> Array:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _linearise(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array, active: NDArray[np.bool_],
     huber: bool, fx: float, fy: float, cx: float, cy: float, bf: float, h: Array, g: Array,
@@ -176,7 +176,7 @@ def _linearise(
     return cost
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _classify(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, inlier: NDArray[np.bool_], error: Array,
@@ -202,7 +202,7 @@ def _classify(
         inlier[i] = chi2 <= limit
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _optimise(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, rounds: int, iterations: int,
@@ -277,8 +277,8 @@ def optimise_pose(
     if len(points) < 6:
         return PoseEstimate(T_cam_world, np.zeros(len(points), bool), float("nan"), np.zeros((6, 6)))
     start = np.ascontiguousarray(T_cam_world, np.float64)
-    rows = [np.ascontiguousarray(each) for each in (points, uv, right, info, info_right)]
+    points, uv, right, info, info_right = map(np.ascontiguousarray, (points, uv, right, info, info_right))
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
-    pose, inliers, error, h = _optimise(start, *rows, *lens, rounds, iterations)
+    pose, inliers, error, h = _optimise(start, points, uv, right, info, info_right, *lens, rounds, iterations)
     residual = float(np.median(error[inliers])) if inliers.any() else float("nan")
     return PoseEstimate(pose, inliers, residual, h)

@@ -271,7 +271,7 @@ class Map:
     ) -> tuple[Slots, Array, Array, Slots, Array]:
         """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
         c = self.camera
-        return kernels.project(  # type: ignore[no-any-return]
+        return kernels.project(
             np.ascontiguousarray(T_cam_world), candidates, self.position, self.normal, self.far,
             c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, float(c.width), float(c.height),
             float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales), min_cosine, wide,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 
 Array = NDArray[np.float64]
@@ -15,7 +15,7 @@ Ints = NDArray[np.int32]
 Table = NDArray[np.int32]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def fullest(n_obs: Ints, points: NDArray[np.int64]) -> int:
     """Largest number of observations among the points."""
     most = 0
@@ -24,7 +24,7 @@ def fullest(n_obs: Ints, points: NDArray[np.int64]) -> int:
     return most
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def link(
     obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, keyframe: int, features: NDArray[np.int64],
     points: NDArray[np.int64],
@@ -46,7 +46,7 @@ def link(
         kf_point[keyframe, f] = p
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def unlink(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, keyframe: int, feature: int) -> None:
     """Forget one observation; the order of the others is kept."""
     p = kf_point[keyframe, feature]
@@ -63,7 +63,7 @@ def unlink(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, keyframe:
     n_obs[p] = out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def unlink_many(
     obs_kf: Table,
     obs_ft: Table,
@@ -77,7 +77,7 @@ def unlink_many(
         unlink(obs_kf, obs_ft, n_obs, kf_point, keyframes[i], features[i])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def drop_points(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, points: NDArray[np.int64]) -> None:
     """Remove all observations of the points."""
     for i in range(points.shape[0]):
@@ -87,7 +87,7 @@ def drop_points(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, poin
         n_obs[p] = 0
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def merge(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, old: int, new: int) -> None:
     """Hand the observations of `old` to `new`; where both are seen in one keyframe, `new`'s stays."""
     for k in range(n_obs[old]):
@@ -105,7 +105,7 @@ def merge(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, old: int, 
     n_obs[old] = 0
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def covisibility(obs_kf: Table, n_obs: Ints, points: Ints, slots: int) -> NDArray[np.int64]:
     """How many of the points each keyframe slot observes."""
     counts = np.zeros(slots, np.int64)
@@ -117,7 +117,7 @@ def covisibility(obs_kf: Table, n_obs: Ints, points: Ints, slots: int) -> NDArra
     return counts
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def refresh(
     points: NDArray[np.int64], position: Array, normal: Array, far: Array, words: Any,
     obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
@@ -156,7 +156,7 @@ def refresh(
         far[p] = reach
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def project(
     pose: Array, candidates: NDArray[np.int64], position: Array, normal: Array, far: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, width: float, height: float, scale_factor: float,
@@ -207,7 +207,7 @@ def project(
     return index[:count].copy(), uv[:count].copy(), right[:count].copy(), octave[:count].copy(), cosine[:count].copy()
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def redundancy(
     keyframe: int, count: int, kf_point: Table, kf_octave: Any, kf_z: Any, close: float,
     obs_kf: Table, obs_ft: Table, n_obs: Ints, others: int,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import FAR, Words, distance
 from dynslam_bench.geometry.camera import Camera
 
@@ -18,7 +18,7 @@ MAX_DISTANCE = 50
 """Largest Hamming distance of a match along an epipolar line (ORB-SLAM2's lower threshold)."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _triangulate(
     pose_a: Array, pose_b: Array, rows_a: Slots, rows_b: Slots, xy_a: Array, xy_b: Array, z_b: Array,
     octave_a: Slots, octave_b: Slots, words_a: Words, words_b: Words, scales: Array,

@@ -25,6 +25,9 @@ _INK = (40, 40, 40)
 _GREY = (150, 150, 150)
 _BLUE = (200, 110, 30)
 _RED = (40, 40, 210)
+_GREEN = (30, 150, 30)
+Legend = tuple[tuple[str, tuple[int, int, int]], ...]
+"""Words and the colours that they stand for, red first."""
 
 
 def draw_sheet(
@@ -35,6 +38,8 @@ def draw_sheet(
     outputs: MapOutputs,
     track: Trajectory,
     ground_truth: Trajectory | None = None,
+    ate_m: float | None = None,
+    features: Legend = (),
 ) -> Image:
     """Draw the sheet.
 
@@ -46,33 +51,47 @@ def draw_sheet(
         outputs: Keyframes and map points.
         track: The final trajectory.
         ground_truth: Drawn in grey, already aligned to the track; None to leave it out.
+        ate_m: The track's absolute error in metres, written beside it; None where it is not known.
+        features: What the colours on `frames` mean.
 
     Returns:
         The sheet, uint8 ``[H, W, 3]``, red first: three panels above, two below.
     """
     plane = _main_plane(outputs.positions, track.positions)
-    panels = [
-        ("1  input sequence", _fit(first_image, PANEL)),
-        (f"2  frames ({len(track)} tracked)", _mosaic(frames)),
-        (f"3  keyframes ({len(outputs.keyframes)})", _mosaic(keyframes)),
-        (f"4  map points ({len(outputs.positions)}) and cameras", _draw_map(outputs, plane)),
-        (
-            f"5  final track ({track.path_length_m if len(track) else 0.0:.2f} m)",
-            _draw_track(track, ground_truth, plane),
-        ),
+    length = f"{track.path_length_m if len(track) else 0.0:.2f} m"
+    error = "" if ate_m is None else f", ATE {1000 * ate_m:.1f} mm"
+    marks: Legend = (("track", _BLUE[::-1]), ("start", _GREEN), ("end", _RED[::-1]))
+    marks += () if ground_truth is None else (("truth", _GREY),)
+    panels: list[tuple[str, Legend, Image]] = [
+        ("1  input sequence", (), _fit(first_image, PANEL)),
+        (f"2  frames ({len(track)} tracked)", features, _mosaic(frames)),
+        (f"3  keyframes ({len(outputs.keyframes)})", (), _mosaic(keyframes)),
+        (f"4  map points ({len(outputs.positions)})", (("cameras", _BLUE[::-1]),), _draw_map(outputs, plane)),
+        (f"5  final track ({length}{error})", marks, _draw_track(track, ground_truth, plane)),
     ]
     width, height = PANEL
     gap, head = 12, 44
     sheet = np.full((head + 2 * (height + _TITLE + gap) + gap, 3 * (width + gap) + gap, 3), 255, np.uint8)
     cv2.putText(sheet, title, (gap, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 2, cv2.LINE_AA)
-    for i, (label, picture) in enumerate(panels):
+    for i, (label, legend, picture) in enumerate(panels):
         row, column = divmod(i, 3)
         x = gap + column * (width + gap) + (row * (width + gap) // 2)
         y = head + row * (height + _TITLE + gap)
         cv2.putText(sheet, label, (x, y + 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _INK, 1, cv2.LINE_AA)
+        _draw_legend(sheet, legend, x + width, y + 20)
         sheet[y + _TITLE : y + _TITLE + height, x : x + width] = picture
         cv2.rectangle(sheet, (x - 1, y + _TITLE - 1), (x + width, y + _TITLE + height), _GREY, 1)
     return sheet
+
+
+def _draw_legend(sheet: Image, legend: Legend, right: int, baseline: int) -> None:
+    """Dots and words that end at a pixel column."""
+    for words, colour in reversed(legend):
+        (width, _), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)
+        right -= width
+        cv2.putText(sheet, words, (right, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
+        cv2.circle(sheet, (right - 9, baseline - 5), 5, colour, -1, cv2.LINE_AA)
+        right -= 26
 
 
 def write_sheet(path: Path, sheet: Image) -> None:
@@ -195,7 +214,7 @@ def _draw_track(track: Trajectory, ground_truth: Trajectory | None, plane: Array
     canvas.line(flat, _BLUE[::-1], 2)
     if len(flat):
         start, end = canvas.pixels(flat[[0, -1]])
-        cv2.circle(canvas.image, (int(start[0]), int(start[1])), 5, (30, 150, 30), -1, cv2.LINE_AA)
+        cv2.circle(canvas.image, (int(start[0]), int(start[1])), 5, _GREEN, -1, cv2.LINE_AA)
         cv2.circle(canvas.image, (int(end[0]), int(end[1])), 5, _RED[::-1], -1, cv2.LINE_AA)
     canvas.scale_bar()
     return canvas.image

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import tempfile
-import weakref
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,10 +11,11 @@ import cv2
 import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.errors import InfrastructureError, TrackerError
+from dynslam_bench.core.temporary import SHARED_MEMORY, TemporaryFolder
 from dynslam_bench.geometry.camera import Camera
 
-SHARED_MEMORY = Path("/dev/shm")
+FRAME_FILE = "frame.raw"
 
 
 class ImageExchange:
@@ -33,19 +33,15 @@ class ImageExchange:
     """
 
     def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
-        base = SHARED_MEMORY if mode == "raw" and SHARED_MEMORY.is_dir() else None
-        try:
-            self.folder = Path(tempfile.mkdtemp(prefix="dynslam-bench-", dir=base))
-        except OSError:
-            self.folder = Path(tempfile.mkdtemp(prefix="dynslam-bench-"))
-        self._remove = weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
         self.camera, self.mode = camera, mode
         self._last: tuple[Path, ...] = ()
         colour = camera.height * camera.width * 3
         self.depth_offset = -(-colour // 16) * 16
+        size = self.depth_offset + camera.height * camera.width * 4
+        self._temporary = _with_space(size) if mode == "raw" else TemporaryFolder()
+        self.folder = self._temporary.path
         if mode == "raw":
-            size = self.depth_offset + camera.height * camera.width * 4
-            self._memory = np.memmap(self.folder / "frame.raw", np.uint8, "w+", shape=(size,))
+            self._memory = np.memmap(self.folder / FRAME_FILE, np.uint8, "r+", shape=(size,))
             self._rgb = self._memory[:colour].reshape(camera.height, camera.width, 3)
             self._depth = self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
 
@@ -55,7 +51,7 @@ class ImageExchange:
             return {"mode": "png", "depth_factor": self.camera.depth_factor}
         return {
             "mode": "raw",
-            "file": str(self.folder / "frame.raw"),
+            "file": str(self.folder / FRAME_FILE),
             "rgb_offset": 0,
             "depth_offset": self.depth_offset,
             "bytes": int(self._memory.size),
@@ -94,4 +90,28 @@ class ImageExchange:
 
     def close(self) -> None:
         """Remove the folder; may be called more than once."""
-        self._remove()
+        self._temporary.close()
+
+
+def _with_space(size: int) -> TemporaryFolder:
+    """A folder with the file for the frames, its space taken already: a full disk would end the run by SIGBUS later.
+
+    Raises:
+        InfrastructureError: There is no room, neither in shared memory nor among the temporary files.
+    """
+    reasons = []
+    for base in (SHARED_MEMORY, None):
+        try:
+            folder = TemporaryFolder(base)
+        except OSError as error:
+            reasons.append(f"{base or tempfile.gettempdir()}: {error.strerror}")
+            continue
+        try:
+            with (folder.path / FRAME_FILE).open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            folder.close()
+            reasons.append(f"{folder.path.parent}: {error.strerror}")
+            continue
+        return folder
+    raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")

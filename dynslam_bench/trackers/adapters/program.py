@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import logging
 import os
@@ -10,19 +11,21 @@ import selectors
 import shutil
 import signal
 import subprocess
+import sys
+import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.reading import parse_json
 
+_SET_PARENT_DEATH_SIGNAL = 1
 LOGGER = logging.getLogger(__name__)
 """Told, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
-
 
 LONGEST_LINE = 1 << 26
 """Bytes of the longest line that is taken from a program: a final trajectory of half a million poses."""
@@ -34,7 +37,8 @@ class Program:
     Requests go to its standard input, one JSON object a line; it answers each with one JSON object a line on its
     standard output. Lines that do not begin with ``{`` are log output and skipped, as is all it writes to its standard
     error; the last ones are kept for error messages, all of them go to `LOGGER`. It has a session of its own, so that
-    it is ended together with whatever it started, and it should end by itself at the end of its standard input.
+    it is ended together with whatever it started, and it should end by itself at the end of its standard input; on
+    Linux it is killed when the process that started it dies.
 
     Args:
         name: For messages.
@@ -67,6 +71,7 @@ class Program:
                 cwd=folder,
                 env={**os.environ, **(environment or {})},
                 start_new_session=True,
+                preexec_fn=end_with_parent(),
             )
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
@@ -109,7 +114,7 @@ class Program:
         Raises:
             TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
         """
-        self._answers.clear()
+        self._refuse_surplus(doing)
         for said in self._said.values():
             said.fresh = False
         line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
@@ -121,7 +126,20 @@ class Program:
             raise TrackerError(f"{self.name} {doing}: {error.args[0]}", "one JSON object a line") from None
         if answer.get("error"):
             raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
+        self._refuse_surplus(doing)
         return answer
+
+    def _refuse_surplus(self, doing: str) -> None:
+        """An answer that nobody asked for would be taken for the next one's: a pose of the wrong frame."""
+        if self.alive:
+            self._read(0.0)
+        if self._answers:
+            surplus = self._answers.popleft()
+            self.kill()
+            raise TrackerError(
+                f"{self.name} {doing}: wrote an answer that was not asked for: '{surplus[:80]}'",
+                "one line that begins with { for each request",
+            )
 
     def close(self, timeout_s: float) -> None:
         """Ask it to end, wait, and kill it if it does not; may be called more than once."""
@@ -231,6 +249,17 @@ class _Said:
 
     def add(self, text: str) -> None:
         self.last, self.fresh = text.strip()[:300], True
+
+
+def end_with_parent() -> Callable[[], object] | None:
+    """What a program's process does before it begins, so that Linux kills it when this one dies; None elsewhere.
+
+    Linux means the thread that starts it: only the main thread's end is this process's end.
+    """
+    if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
+        return None
+    prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec as little as possible is done
+    return lambda: prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
 
 
 def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:

@@ -49,7 +49,8 @@ def serve(
             elif operation == "track":
                 if images is None:
                     raise RuntimeError("track before reset")
-                answer = track(int(request["index"]), float(request["timestamp"]), *images)
+                index = int(request["index"])
+                answer = {"index": index, **track(index, float(request["timestamp"]), *images)}
             elif operation == "finalize" and finalize is not None:
                 answer = {"trajectory": finalize()}
             elif operation == "close":

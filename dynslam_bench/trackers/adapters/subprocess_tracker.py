@@ -22,7 +22,8 @@ from .exchange import ImageExchange
 from .program import Program, files_of_command
 from .settings import ProgramSettings, SubprocessSettings
 
-PROTOCOL = 1
+PROTOCOL = 2
+"""Of the JSON lines; since 2 the answer to ``track`` repeats its index."""
 
 
 class ProgramTracker:
@@ -114,6 +115,11 @@ class ProgramTracker:
         images = exchange.put(frame)
         request = {"op": "track", "index": frame.index, "timestamp": frame.timestamp, **images}
         answer = program.ask(request, self.limits.frame_timeout_s, doing)
+        if answer.get("index") != frame.index:
+            raise TrackerError(
+                f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
+                "each answer repeats the index of its track request",
+            )
         return read_track_answer(answer, f"{self.name} {doing}", lambda: time.perf_counter() - start)
 
     def close(self) -> None:

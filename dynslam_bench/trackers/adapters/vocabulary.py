@@ -12,6 +12,7 @@ from pathlib import Path
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import vocabularies_folder
+from dynslam_bench.core.reading import MEGABYTE, read_bytes
 
 from .settings import OrbSlam3Settings
 
@@ -20,6 +21,10 @@ HINT = (
     f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
     f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
 )
+MOST_BYTES = 512 * MEGABYTE
+"""The vocabulary of ORB-SLAM3 has 145 MB."""
+MOST_MEMORY = 256 * MEGABYTE
+"""Most memory that its decompression may take."""
 TOKENS = 35  # parent, whether it is a leaf, 32 bytes of the descriptor, weight
 
 
@@ -58,22 +63,31 @@ def find_vocabulary(setting: str) -> Path:
 def _prepared(path: Path, size: int, modified_ns: int) -> Path:
     """Decompress if need be, check; once in a process as long as the file's size and time stay."""
     if path.suffix != ".xz":
-        _check(path.read_bytes(), path)
+        _check(read_bytes(path, limit=MOST_BYTES, kind=TrackerError), path)
         return path
-    packed = path.read_bytes()
+    packed = read_bytes(path, limit=MOST_BYTES, kind=TrackerError)
     target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
     if target.is_file():
-        _check(target.read_bytes(), target)
+        _check(read_bytes(target, limit=MOST_BYTES, kind=TrackerError), target)
         return target
     try:
-        text = lzma.decompress(packed)
-    except (lzma.LZMAError, EOFError) as error:
+        text = _unpack(packed)
+    except (lzma.LZMAError, EOFError, ValueError) as error:
         raise TrackerError(
             f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file: {error}", HINT
         ) from None
     _check(text, path)
     write_atomic(target, text)
     return target
+
+
+def _unpack(packed: bytes) -> bytes:
+    """The content of an .xz file; a small file that claims or holds far more is a ValueError."""
+    reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MOST_MEMORY)
+    text = reader.decompress(packed, max_length=MOST_BYTES)
+    if not reader.eof:
+        raise ValueError(f"it is cut short, or unpacks to more than {MOST_BYTES >> 20} MB")
+    return text
 
 
 def _check(text: bytes, path: Path) -> None:

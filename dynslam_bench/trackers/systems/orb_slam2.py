@@ -5,6 +5,7 @@ No dynamic handling beyond the robust kernel and the chi-square tests of the pos
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
@@ -13,6 +14,15 @@ from .composition import SystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
+
+
+class UnfilteredSettings(SystemSettings):
+    """Settings of a system without any filter."""
+
+    @property
+    def unused(self) -> Mapping[str, str]:
+        """Where nothing is culled there is nothing to guard."""
+        return {"guard": "the system has no filter"}
 
 
 def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
@@ -24,7 +34,7 @@ SPEC = TrackerSpec(
     id="orb-slam2",
     entry_point=f"{__name__}:build",
     label="ORB-SLAM2 style (our back end)",
-    settings=SystemSettings,
+    settings=UnfilteredSettings,
     summary="the shared RGB-D back end without dynamic handling: the reference of every ratio",
     provenance="own",
     published_as=("ORB-SLAM2",),

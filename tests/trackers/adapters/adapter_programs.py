@@ -14,9 +14,16 @@ CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.
 PRELUDE = """
 import json, os, sys, time
 def say(answer):
-    sys.stdout.write(json.dumps(answer) + "\\n"); sys.stdout.flush()
+    sys.stdout.write(json.dumps(index | answer) + "\\n"); sys.stdout.flush()
 STILL = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-requests = (json.loads(line) for line in sys.stdin)
+index = {}
+def read():
+    for line in sys.stdin:
+        request = json.loads(line)
+        index.clear()
+        index.update({key: request[key] for key in request if key == "index"})
+        yield request
+requests = read()
 """
 
 GOOD = """

@@ -35,6 +35,8 @@ FAULTS = {
         "sys.stderr.write('optimising\\n'); sys.stderr.flush(); time.sleep(60)",
         "no answer within 0.5 s.*'optimising'",
     ),
+    "of another frame": ("index['index'] = 6; say({'state': 'ok', 'T_world_cam': STILL})", "answered index 6"),
+    "of no frame": ("index.clear(); say({'state': 'ok', 'T_world_cam': STILL})", "answered index None"),
     "closes": ("os.close(1); time.sleep(60)", "closed its output"),
 }
 
@@ -61,6 +63,23 @@ def test_faults_become_one_line(program, fault):
     assert gone(pid)
     reset(tracker)
     assert tracker.track(frame(0)).state == "ok", "a reset starts the program again"
+
+
+def test_a_second_answer_is_never_taken_for_the_next_frame(program):
+    """However late it comes, it is seen before the next pose is believed."""
+    for pause in ("", "time.sleep(0.2);"):
+        tracker = reset(
+            program(f"""
+            for request in requests:
+                say({{"state": "ok", "T_world_cam": STILL}})
+                if request["op"] == "track":
+                    {pause} say({{"state": "ok", "T_world_cam": STILL}})
+            """)
+        )
+        with pytest.raises(TrackerError, match=r"not asked for|answered index 0"):
+            for index in range(3):
+                tracker.track(frame(index))
+        tracker.close()
 
 
 def test_death_at_reset(program):

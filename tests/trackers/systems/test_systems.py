@@ -20,6 +20,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
+from dynslam_bench.trackers.measured import epipolar_skipped
 from dynslam_bench.trackers.specs import all_specs
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
 
@@ -151,6 +152,20 @@ def test_online_segmentation_settings_reach_every_filter(walking) -> None:
                     assert held.confidence == 0.77, f"{spec.id}: {each.name}"
                     reached.append(spec.id)
     assert len(set(reached)) > 1
+
+
+def test_of_every_system_with_a_fundamental_matrix_it_was_measured_how_often_that_judges(walking) -> None:
+    asking = set()
+    for spec in SYSTEMS:
+        masked = issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto"
+        settings = {"segmentation.source": "oracle"} if masked else {}
+        tracker = build_tracker(spec, settings, TrackerContext(sequence_id=walking.id, masks=walking.masks))
+        if any("f_asked" in each.stats_names for each in tracker._filters):
+            asking.add(spec.id)
+    assert len(asking) > 15
+    assert asking == {spec.id for spec in SYSTEMS if epipolar_skipped(spec.id)}
+    shares = [share for name in asking for share in epipolar_skipped(name).values()]
+    assert min(shares) >= 0 and max(shares) <= 1
 
 
 @pytest.mark.parametrize("name", ["sof-slam", "seg-slam"])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from .compiled import kernel
+from dynslam_bench.core.compiled import dividing_kernel
 
 NEAR_M = 0.05
 """Nothing nearer than this is seen, metres."""
 
 
-@kernel
+@dividing_kernel
 def hit_box(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, hx: float, hy: float, hz: float, t_max: float
 ) -> tuple[float, int]:
@@ -57,7 +57,7 @@ def hit_box(
     return t_in, face
 
 
-@kernel
+@dividing_kernel
 def hit_round_cone(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, h: float, r1: float, r2: float, t_max: float
 ) -> float:

@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 
-from .compiled import Intrinsics, Ints, Reals, kernel
+from dynslam_bench.core.compiled import dividing_kernel
+
+from .arrays import Intrinsics, Ints, Reals
 from .hits import NEAR_M
 
 
-@kernel
+@dividing_kernel
 def flow_field(
     row0: int, row1: int, intrinsics: Intrinsics, hit: Ints, depth: Reals, motion: Reals, flow: Reals
 ) -> None:
@@ -40,7 +42,7 @@ def flow_field(
             flow[row, column, 1] = v / w * fy + cy - row
 
 
-@kernel
+@dividing_kernel
 def motion_blur(row0: int, row1: int, color: Reals, flow: Reals, shutter: float, blurred: Reals) -> None:
     """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred."""
     height, width = color.shape[:2]

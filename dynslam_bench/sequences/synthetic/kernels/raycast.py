@@ -13,15 +13,17 @@ import math
 
 import numpy as np
 
+from dynslam_bench.core.compiled import dividing_kernel
+
 from ..scenes.parts import BOX, ROUND_CONE
-from .compiled import Intrinsics, Ints, Reals, kernel
+from .arrays import Intrinsics, Ints, Reals
 from .hits import NEAR_M, hit_box, hit_round_cone
 
 TILE = 8
 _PER_TURN = 1.0 / (2.0 * math.pi)
 
 
-@kernel
+@dividing_kernel
 def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Ints, Ints]:
     """Primitive lists of all tiles, nearest bound first.
 
@@ -58,7 +60,7 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
 # to a function that it does not inline, which costs more than the tracing.
 
 
-@kernel
+@dividing_kernel
 def cast_geometry(
     row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
     local: Reals, shape: Reals, hit: Ints, depth: Reals,
@@ -109,7 +111,7 @@ def cast_geometry(
             depth[row, column] = t if p >= 0 else 0.0
 
 
-@kernel
+@dividing_kernel
 def shade_pixels(
     row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
     local: Reals, shape: Reals, texture: Ints, uv: Reals, tint: Reals, facets: Reals, atlas: Ints, level_offset: Ints,

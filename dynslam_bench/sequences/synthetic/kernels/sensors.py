@@ -13,15 +13,16 @@ Depth model, in the order of the physics of a Kinect-like sensor:
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from .compiled import Intrinsics, Ints, Reals, kernel
+from dynslam_bench.core.compiled import Scalar, dividing_kernel
+
+from .arrays import Intrinsics, Ints, Reals
 
 
-@kernel
-def _hash(a: Any, b: Any) -> Any:
+@dividing_kernel
+def _hash(a: Scalar, b: Scalar) -> Scalar:
     """A 64-bit hash (splitmix64 finaliser) of two 64-bit integers."""
     z = np.uint64(a) + np.uint64(0x9E3779B97F4A7C15) * (np.uint64(b) + np.uint64(1))
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -29,20 +30,20 @@ def _hash(a: Any, b: Any) -> Any:
     return z ^ (z >> np.uint64(31))
 
 
-@kernel
-def _normal(h: Any) -> float:
+@dividing_kernel
+def _normal(h: Scalar) -> float:
     """About normal with variance 1: the centred sum of the four 16-bit parts of a hash."""
     m = np.uint64(0xFFFF)
     total = float(h & m) + float((h >> np.uint64(16)) & m) + float((h >> np.uint64(32)) & m) + float(h >> np.uint64(48))
     return (total - 131070.0) * (1.7320508075688772 / 65536.0)
 
 
-@kernel
-def _uniform(h: Any) -> float:
+@dividing_kernel
+def _uniform(h: Scalar) -> float:
     return float(h >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@kernel
+@dividing_kernel
 def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, float]:
     """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
     height, width = depth.shape
@@ -63,9 +64,9 @@ def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, f
     return lowest, highest
 
 
-@kernel
+@dividing_kernel
 def measure_depth(
-    row0: int, row1: int, seed: Any, fx: float, baseline: float, depth: Reals, cosine: Reals, color: Reals,
+    row0: int, row1: int, seed: Scalar, fx: float, baseline: float, depth: Reals, cosine: Reals, color: Reals,
     disparity_noise: float, near: float, far: float, edge_px: int, dark: float, factor: float, out: Ints,
 ) -> None:  # fmt: skip
     """Raw depth (uint16, `factor` units a metre, 0 = missing) of rows from the exact z-depth."""
@@ -120,7 +121,7 @@ def measure_depth(
                     out[row, u] = int(measured)
 
 
-@kernel
+@dividing_kernel
 def dim(
     row0: int, row1: int, intrinsics: Intrinsics, pose: Reals, depth: Reals, light: Reals, height: float, spots: Reals,
     color: Reals,
@@ -152,9 +153,9 @@ def dim(
                 color[row, column, ch] *= factor
 
 
-@kernel
+@dividing_kernel
 def expose(
-    row0: int, row1: int, seed: Any, color: Reals, gains: Reals, offset: Reals, read_noise: float, shot_noise: float,
+    row0: int, row1: int, seed: Scalar, color: Reals, gains: Reals, offset: Reals, read_noise: float, shot_noise: float,
     out: Ints,
 ) -> None:  # fmt: skip
     """8-bit colours of rows: gain of each row and channel, shot and read noise, rounding, clipping."""

@@ -1,4 +1,7 @@
-"""A network on the scenes that it was trained on is marked in every format, and ranks only where that is asked for."""
+"""What stands beside a number is true: marks, provenance, lengths.
+
+A network on the scenes that it was trained on is marked in every format, and ranks only where that is asked for.
+"""
 
 import pandas as pd
 import pytest
@@ -6,8 +9,10 @@ from reports_fake_store import add_run
 
 from dynslam_bench.cli.run_rows import seen_note
 from dynslam_bench.reports import build_report, compare, load_board
+from dynslam_bench.reports.model.published import is_excerpt, least_length_s
 from dynslam_bench.runs.storage.store import RunStore
 from dynslam_bench.segmentation.training_set import seen_in_training
+from dynslam_bench.trackers import TRACKERS
 
 OLD, NEW = "synthetic/walking_xyz@3", "synthetic/walking_xyz@103"
 
@@ -84,3 +89,24 @@ def test_run_says_it_in_one_line(store):
     assert seen_note(records).startswith("2 of 8 runs have masks of a network that was trained on their scene")
     assert seen_note(records).endswith("e.g. synthetic/walking_xyz@100") and "\n" not in seen_note(records)
     assert seen_note([record for record in records if record.sequence.id == NEW]) == ""
+
+
+def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for name in ("bonn/balloon", "tum/fr3/walking_rpy"):
+        add_run(store, "orb-slam2", name, block=name, duration_s=30.6)
+    markdown = build_report(store, tmp_path / "report").markdown.read_text()
+    assert "Published numbers stand beside bonn/balloon, whose full length is not known here" in markdown
+    assert least_length_s("bonn/balloon") is None and not is_excerpt("bonn/balloon", 1.0), "no source, no claim"
+
+
+def test_what_was_put_together_here_is_called_no_system_of_ours(tmp_path):
+    """The back end in the manner of ORB-SLAM2 and masks by Mask R-CNN are others' systems in our composition."""
+    store = RunStore(tmp_path / "results")
+    for tracker in ("orb-slam2", "mask-rcnn", "emfoa-oft"):
+        assert TRACKERS.get(tracker).provenance == "own"
+        add_run(store, tracker, NEW, provenance="own")
+    table = pd.read_csv(build_report(store, tmp_path / "report").csv["leaderboard"])
+    assert table["provenance"].tolist() == ["our composition"] * 3
+    meaning = "put together in this project: no one paper or program describes the whole"
+    assert (tmp_path / "report" / "index.html").read_text().count(meaning) == 3

@@ -1,44 +1,20 @@
-"""One way to compile the kernels of this room: cached on disk, without the GIL, without fast-math."""
+"""The sum of truncated histogram distances that matching costs consist of, as one instruction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
-
-import numba
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
-Function = Callable[..., Any]
-
-
-def kernel(function: Function) -> Function:
-    """Compile a function at its first call.
-
-    The compiled code is cached beside the source (or in the user's cache folder); where neither can be written it is
-    compiled anew in every process. Sums of floats keep their written order (no fast-math), so that a result does not
-    depend on the processor's vector width.
-    """
-    try:
-        return cast("Function", numba.njit(cache=True, nogil=True)(function))
-    except RuntimeError:  # numba finds no folder in which it may cache
-        return cast("Function", numba.njit(nogil=True)(function))
-
-
-def inlined(function: Function) -> Function:
-    """Compile a small function into its callers."""
-    return cast("Function", numba.njit(nogil=True, forceinline=True)(function))
-
+from .instruction import Code, Definition, instruction
 
 _BYTE, _WORD, _LONG = ir.IntType(8), ir.IntType(32), ir.IntType(64)
 
 
-def _constant(element: Any, value: int, count: int) -> Any:
+def _constant(element: Code, value: int, count: int) -> Code:
     return ir.Constant(ir.VectorType(element, count), [value] * count)
 
 
-def _histogram_distances(builder: Any, first: Any, second: Any, count: int) -> Any:
+def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -> Code:
     """L1 distances of `count` histograms of eight bytes, as ``count`` 64-bit lanes."""
     bytes_ = ir.VectorType(_BYTE, 8 * count)
     first, second = builder.bitcast(first, bytes_), builder.bitcast(second, bytes_)
@@ -52,8 +28,11 @@ def _histogram_distances(builder: Any, first: Any, second: Any, count: int) -> A
     return total
 
 
-@intrinsic
-def descriptor_sum(typing_context, image, samples, near_row, far_row, near, far, descriptor, at, truncation):  # type: ignore[no-untyped-def]
+@instruction
+def descriptor_sum(
+    typing_context: Code, image: Code, samples: Code, near_row: Code, far_row: Code, near: Code, far: Code,
+    descriptor: Code, at: Code, truncation: Code,
+) -> Definition:  # fmt: skip
     """Sum of the truncated L1 distances of 17 histograms of eight bytes (first term of Eq. 1), without a branch.
 
     Written as generic vector code. Nothing is checked.
@@ -72,7 +51,7 @@ def descriptor_sum(typing_context, image, samples, near_row, far_row, near, far,
     """
     signature = types.int64(image, samples, *([types.int64] * 4), descriptor, types.int64, types.int64)
 
-    def generate(context, builder, kind, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         image, samples, near_row, far_row, near, far, descriptor, at, truncation = arguments
         cells, offsets, mine = (
             context.make_array(kind.args[k])(context, builder, array).data

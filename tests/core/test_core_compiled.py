@@ -1,0 +1,43 @@
+"""How kernels are compiled: one way for all rooms, which needs no folder to cache in."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pytest
+
+from dynslam_bench.core import compiled
+
+
+@pytest.mark.parametrize("compile_", [compiled.kernel, compiled.dividing_kernel, compiled.spliced])
+def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**options: object):
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return numba.njit(**options)
+
+    monkeypatch.setattr(compiled, "numba", SimpleNamespace(njit=refuse))
+    assert compile_(lambda x: x + 1)(2) == 3
+
+
+def test_kernels_are_cached_and_release_the_lock() -> None:
+    from dynslam_bench.slam.mapping import map_kernels
+
+    options = map_kernels.project.targetoptions
+    assert options["nogil"] and type(map_kernels.project._cache).__name__ != "NullCache"
+
+
+def test_a_division_by_zero_is_an_error_unless_asked_for() -> None:
+    @compiled.dividing_kernel
+    def like_numpy(x: float) -> float:
+        return 1.0 / x
+
+    @compiled.kernel
+    def like_python(x: float) -> float:
+        return 1.0 / x
+
+    assert like_numpy(0.0) == np.inf
+    with pytest.raises(ZeroDivisionError):
+        like_python(0.0)

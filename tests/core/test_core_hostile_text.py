@@ -1,0 +1,143 @@
+"""Text from elsewhere: files of any size and encoding, names that lead out, escapes for terminals, passwords."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+from pydantic import Field
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.core.harmless import inside, printable, storable
+from dynslam_bench.core.passwords import without_passwords
+from dynslam_bench.core.reading import parse_json, read_bytes, read_json, read_lines, read_text
+from dynslam_bench.core.records import Record
+from dynslam_bench.core.toml import parse_toml
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\xff\xfe", "is not a text file: byte 0 .0xff. is no UTF-8"),
+        (b"[" * 100_000, "is no valid JSON: it is nested too deeply"),
+        (b"9" * 5000, "is no valid JSON: Exceeds the limit"),
+        (b"{", "is no valid JSON: Expecting property name"),
+        (b" " * 2000, "has more than the 0.00095.* MB that are read"),
+    ],
+)
+def test_a_damaged_file_is_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "file.json"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=words) as caught:
+        read_json(path, limit=1000 if content.isspace() else 1 << 20, kind=RunError)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_is_no_file_is_one_line(tmp_path: Path) -> None:
+    for path in (tmp_path / "none", tmp_path, tmp_path / ("x" * 300), tmp_path / "a\0b"):
+        with pytest.raises(DynslamError, match="cannot read"):
+            read_bytes(path)
+        with pytest.raises(DynslamError, match="cannot read"):
+            list(read_lines(path))
+
+
+def test_the_byte_order_mark_is_left_out_and_long_lines_are_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "text"
+    path.write_bytes(b"\xef\xbb\xbfa\nb")
+    assert read_text(path) == "a\nb" and list(read_lines(path)) == ["a\n", "b"]
+    path.write_bytes(b"x" * 5000)
+    with pytest.raises(DynslamError, match="has more than"):
+        list(read_lines(path, limit=1000))
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 5000, "a = " + "9" * 5000, "a = \ud800", "a"])
+def test_damaged_toml_is_one_line(text: str) -> None:
+    with pytest.raises(RunError, match=r"^suite.toml is not valid TOML: "):
+        parse_toml(text, "suite.toml", kind=RunError)
+
+
+def test_messages_are_one_line_of_bounded_length() -> None:
+    error = DynslamError("first\nsecond" + "x" * 100_000, "hint\r\nmore")
+    assert "\n" not in str(error) and len(str(error)) < 2100 and str(error).startswith("first second")
+    with pytest.raises(DynslamError, match="where is no valid JSON"):
+        parse_json("\n{\n", "where")
+
+
+class Sample(Record):
+    text: str
+    more: dict[str, list[str]] = Field(default_factory=dict)
+
+
+def test_half_characters_do_not_keep_a_record_from_being_stored(tmp_path: Path) -> None:
+    record = Sample(text="caf\udce9", more={"\ud800": ["\udfff"]})
+    write_atomic(tmp_path / "record.json", record.to_json())
+    assert Sample.read(tmp_path / "record.json") == Sample(text="caf\\udce9", more={"\\ud800": ["\\udfff"]})
+    write_atomic(tmp_path / "text", "comment \ud800")
+    assert (tmp_path / "text").read_bytes() == b"comment \\ud800"
+    assert storable(("a\udc80", 1, None)) == ("a\\udc80", 1, None)
+
+
+def test_records_hold_no_password() -> None:
+    stored = Sample(text="tune --storage postgresql://me:s3cret@db/x", more={"u": ["https://h/x?a=1&token=s3cret"]})
+    assert "s3cret" not in stored.to_json() and "postgresql://me:***@db/x" in stored.to_json()
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["postgresql://me:s3cret@db/x", "mysql+pymysql://me:s3cret@db:3306/x", "https://h/x?password=s3cret&a=b",
+     "grpc://:s3cret@host:1", "https://h/x;token=s3cret", "postgresql://me:s3cret@/x@y@db/x"],
+)  # fmt: skip
+def test_passwords_are_in_no_message(address: str) -> None:
+    assert "s3cret" in address and "s3cret" not in str(DynslamError(f"cannot reach {address!r} now", f"try {address}"))
+
+
+def test_what_holds_no_password_stays_as_it_is() -> None:
+    for text in ("sqlite:///studies.db", "https://host:8080/a", "grpc://host:13000", "a:b@c", "mail me@host"):
+        assert without_passwords(text) == text
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../x", "a/../../x", "/etc/passwd", "", "a\0b", "a\\..\\b", "x" * 256, "a\nb", "\x1b[2J", "..", "caf\udce9"],
+)
+def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RunError, match="does not lie in"):
+        inside(tmp_path, name, where="a list", kind=RunError)
+    assert inside(tmp_path, "rgb/1.000.png", where="a list") == tmp_path / "rgb" / "1.000.png"
+
+
+def test_terminals_get_nothing_that_they_act_upon() -> None:
+    text = "\x1b[31mred\x07\x9b2J\u202egnp.exe\ud800\x7f"
+    assert printable(text) == "\\x1b[31mred\\x07\\x9b2J\\u202egnp.exe\\ud800\\x7f"
+    assert printable("Zoë\tβ\n") == "Zoë\tβ\n"
+
+
+def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_atomic(tmp_path / "file", "x")
+        with atomic_folder(tmp_path / "folder") as work:
+            (work / "inside").touch()
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+
+
+def test_what_a_killed_process_left_beside_a_folder_is_swept_up(tmp_path: Path) -> None:
+    dead = os.fork()
+    if dead == 0:
+        with atomic_folder(tmp_path / "seq") as work:
+            (work / "half").touch()
+            os._exit(9)
+    os.waitpid(dead, 0)
+    (left,) = tmp_path.iterdir()
+    assert (left / "half").exists()
+    with atomic_folder(tmp_path / "other"):
+        assert left.exists()  # somebody else's
+    with atomic_folder(tmp_path / "seq"):
+        assert not left.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "seq"]

@@ -1,0 +1,217 @@
+"""Damage to files: bytes, numbers and words of any format, nodes of JSON, chunks of PNG; repeatable by its seed."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import zlib
+from random import Random
+from typing import Any
+
+WORDS = [
+    *(
+        b"",
+        b"-1",
+        b"0",
+        b"nan",
+        b"-inf",
+        b"1e400",
+        b"0x10",
+        b"9" * 400,
+        b"9" * 5000,
+        b"4294967295",
+        b"18446744073709551616",
+    ),
+    *(
+        b"null",
+        b"true",
+        b"[]",
+        b"{}",
+        b'""',
+        b'"\\ud800"',
+        b"\xff\xfe",
+        b"\xed\xa0\x80",
+        b"\x00",
+        b"\r",
+        b"\xe2\x80\xa8",
+    ),
+    *(
+        b"[" * 3000,
+        b'{"a":' * 3000,
+        b"a.b.c = 1\n",
+        b"../../../../etc/passwd",
+        b"/etc/passwd",
+        b"\x1b[2J",
+        b",",
+        b"#",
+        b"\n\n",
+    ),
+]
+"""Put in place of a number or a word, or anywhere."""
+VALUES: list[Any] = [
+    *(
+        None,
+        True,
+        -1,
+        0,
+        2**63,
+        10**400,
+        -(10**400),
+        1e308,
+        float("nan"),
+        float("inf"),
+        -float("inf"),
+        "",
+        "nan",
+        "a" * 300,
+    ),
+    *(
+        "\ud800",
+        "\x1b[31m",
+        "../../etc",
+        "/etc/passwd",
+        [],
+        {},
+        [[]],
+        {"": {}},
+        [0] * 50,
+        {"counts": [10**12], "size": [1, 1]},
+    ),
+]
+"""Put in place of a node of JSON."""
+_TOKEN = re.compile(rb"[-+]?[0-9][0-9.eE+-]*|[A-Za-z_]+")
+
+
+def mutate(data: bytes, others: list[bytes], random: Random) -> bytes:
+    """One to four damages to some bytes; `others` are spliced in."""
+    for _ in range(random.choice((1, 1, 1, 2, 3, 4))):
+        data = random.choice(_DAMAGES)(data, others, random)
+    return data[: 1 << 22]
+
+
+def mutate_json(data: bytes, random: Random) -> bytes:
+    """One to three nodes of a JSON text deleted, doubled or replaced; other bytes come back as they are."""
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):
+        return data
+    for _ in range(random.choice((1, 1, 2, 3))):
+        value = _changed(value, random)
+    return json.dumps(value).encode()
+
+
+def mutate_lines(data: bytes, random: Random) -> bytes:
+    """As `mutate_json` on one line of a file of JSON lines."""
+    lines = data.split(b"\n")
+    at = random.randrange(len(lines))
+    lines[at] = mutate_json(lines[at], random)
+    return b"\n".join(lines)
+
+
+def mutate_png(data: bytes, random: Random) -> bytes:
+    """One chunk of a PNG damaged under a right checksum, so that the decoder goes on to read it."""
+    if not data.startswith(b"\x89PNG"):
+        return data
+    position, chunks = 8, []
+    while position + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, position)
+        chunks.append((data[position + 4 : position + 8], data[position + 8 : position + 8 + length]))
+        position += 12 + length
+    if not chunks:
+        return data
+    at = random.randrange(len(chunks))
+    kind, body = chunks[at]
+    if random.random() < 0.3 and body:  # the compressed pixels themselves
+        try:
+            body = zlib.compress(mutate(zlib.decompress(body), [], random), 1)
+        except zlib.error:
+            body = mutate(body, [], random)
+    else:
+        body = mutate(body, [], random)
+    chunks[at] = (kind, body)
+    if random.random() < 0.1:
+        chunks.insert(random.randrange(len(chunks)), random.choice(chunks))
+    out = [data[:8]]
+    for kind, body in chunks:
+        out.append(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)))
+    return b"".join(out)
+
+
+def _changed(value: Any, random: Random) -> Any:
+    if isinstance(value, dict) and value and random.random() < 0.85:
+        key = random.choice(list(value))
+        if random.random() < 0.12:
+            return {name: each for name, each in value.items() if name != key}
+        renamed = random.choice(["", "x", key * 2, "\ud800", "__class__"]) if random.random() < 0.05 else key
+        return {**{k: v for k, v in value.items() if k != key}, renamed: _changed(value[key], random)}
+    if isinstance(value, list) and value and random.random() < 0.85:
+        at = random.randrange(len(value))
+        if random.random() < 0.15:
+            return value[:at] + value[at + 1 :]
+        if random.random() < 0.1:
+            return value * 2
+        return [*value[:at], _changed(value[at], random), *value[at + 1 :]]
+    return random.choice(VALUES)
+
+
+def _flip(data: bytes, _: list[bytes], random: Random) -> bytes:
+    if not data:
+        return data
+    at = random.randrange(len(data))
+    return data[:at] + bytes([data[at] ^ (1 << random.randrange(8))]) + data[at + 1 :]
+
+
+def _set_number(data: bytes, _: list[bytes], random: Random) -> bytes:
+    """Two, four or eight bytes become a number that is often too much."""
+    size = random.choice((2, 4, 8))
+    if len(data) < size:
+        return data
+    at = random.randrange(len(data) - size + 1)
+    number = random.choice(
+        (0, 1, (1 << (8 * size - 1)) - 1, (1 << (8 * size)) - 1, random.getrandbits(8 * size), 65535)
+    )
+    return data[:at] + (number % (1 << (8 * size))).to_bytes(size, random.choice(("big", "little"))) + data[at + size :]
+
+
+def _cut(data: bytes, _: list[bytes], random: Random) -> bytes:
+    return data[: random.randrange(len(data) + 1)]
+
+
+def _remove(data: bytes, _: list[bytes], random: Random) -> bytes:
+    at = random.randrange(len(data) + 1)
+    return data[:at] + data[at + random.choice((1, 2, 4, 16, 100)) :]
+
+
+def _double(data: bytes, _: list[bytes], random: Random) -> bytes:
+    at = random.randrange(len(data) + 1)
+    return data[:at] + data[at : at + random.choice((1, 8, 64, 512))] * random.choice((2, 2, 50)) + data[at:]
+
+
+def _splice(data: bytes, others: list[bytes], random: Random) -> bytes:
+    other = random.choice(others or [data])
+    return data[: random.randrange(len(data) + 1)] + other[random.randrange(len(other) + 1) :]
+
+
+def _insert_word(data: bytes, _: list[bytes], random: Random) -> bytes:
+    at = random.randrange(len(data) + 1)
+    return data[:at] + random.choice(WORDS) + data[at:]
+
+
+def _replace_token(data: bytes, _: list[bytes], random: Random) -> bytes:
+    found = list(_TOKEN.finditer(data[:20000]))
+    if not found:
+        return data
+    token = random.choice(found)
+    return data[: token.start()] + random.choice(WORDS) + data[token.end() :]
+
+
+def _move_line(data: bytes, _: list[bytes], random: Random) -> bytes:
+    lines = data.split(b"\n")
+    line = lines.pop(random.randrange(len(lines)))
+    lines.insert(random.randrange(len(lines) + 1), line)
+    return b"\n".join(lines)
+
+
+_DAMAGES = (_flip, _flip, _set_number, _set_number, _cut, _remove, _double, _splice, _insert_word, _replace_token,
+            _replace_token, _move_line)  # fmt: skip

@@ -1,0 +1,7 @@
+"""Every reader of files that somebody else may have written."""
+
+from __future__ import annotations
+
+from . import binaries, records, texts
+
+TARGETS = [*records.TARGETS, *texts.TARGETS, *binaries.TARGETS]

@@ -1,0 +1,239 @@
+"""Readers of what this package has stored: records, tables, packed runs, studies, cache entries."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from dynslam_bench.core import reading
+from dynslam_bench.core.records import Record
+from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the cache reads
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.runs import RunRecord, RunStore
+from dynslam_bench.runs import frame_row as rows
+from dynslam_bench.runs.storage import packing
+from dynslam_bench.runs.storage.evaluating import evaluate_run
+from dynslam_bench.runs.storage.frame_table import load_frames
+from dynslam_bench.runs.storage.frames import FrameLog
+from dynslam_bench.sequences.fetch import Receipt
+from dynslam_bench.tuning import Study, StudySummary, cmaes_state, python_study
+from dynslam_bench.tuning import frame as study_frame
+
+from .mutate import mutate, mutate_json, mutate_lines
+from .target import Target, at
+
+FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
+RUN = "a7abe04996a79cc4"
+
+
+def _stored(name: str) -> bytes:
+    (path,) = FIXTURE.glob(name)
+    return path.read_bytes()
+
+
+def _other(data: bytes) -> bytes:
+    """The same of the other run."""
+    return data.replace(RUN.encode(), b"e7f8d4df9db4bb16")
+
+
+def _store(folder: Path, run: bytes | None) -> RunStore:
+    """A store with one run, all of whose other files are sound."""
+    store = RunStore(folder / "results")
+    for file in ("trajectory_online.txt", "frames.csv"):
+        at(store.runs / RUN, file, _stored(f"runs/{RUN}/{file}"))
+    part = store.root / "sequences" / "8a65f345d9b34895"
+    for file in ("groundtruth.txt", "timestamps.txt"):
+        at(part, file, (FIXTURE / "sequences" / part.name / file).read_bytes())
+    at(store.runs / RUN, "run.json", run)
+    return store
+
+
+def _read_run(data: bytes | None, folder: Path) -> None:
+    store = _store(folder, data)
+    found, unreadable = store.all()
+    assert len(found) + len(unreadable) == 1
+    record = store.read(RUN)
+    record.describe()
+    store.score(record)
+
+
+def _read_metrics(data: bytes | None, folder: Path) -> None:
+    """Damaged metrics count as none: they are taken from the trajectories again."""
+    store = _store(folder, _stored(f"runs/{RUN}/run.json"))
+    protocol = get_protocol("tum-rgbd/v1")
+    at(store.root / "metrics" / protocol.digest(), f"{RUN}.json", data)
+    found = store.metrics(RUN, protocol)
+    assert found is None or found.run_id == RUN
+
+
+def _read_part(data: bytes | None, folder: Path) -> None:
+    """Stamps and trajectory of a stored run; what is wrong with them is the reason why there are no errors."""
+    store = _store(folder, _stored(f"runs/{RUN}/run.json"))
+    at(store.root / "sequences" / "8a65f345d9b34895", "timestamps.txt", data)
+    at(store.runs / RUN, "trajectory_final.txt", data)
+    store.score(store.read(RUN), again=True)
+
+
+def _read_log(data: bytes | None, folder: Path) -> None:
+    """Whatever a tracker's process left, a run can be stored of it."""
+    log = FrameLog.read(at(folder, rows.FRAMES_FILE, data))
+    log.write(folder, "comment")
+    log.timings(), log.mask_iou(), log.lost_streak(), log.epipolar_skipped()
+
+
+def _log_seeds() -> list[bytes]:
+    made = rows.read_csv(FIXTURE / "runs" / RUN / "frames.csv")
+    pose = [0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0]
+    lines = [json.dumps({**vars(row), "pose": pose}) + "\n" for row in made]
+    return ["".join(lines).encode(), lines[0].encode(), "".join(lines).encode()[:-30]]
+
+
+def _packed_seeds() -> list[bytes]:
+    store = RunStore(FIXTURE)
+    return [packing.pack(store, store.read(RUN))]
+
+
+def _repacked(data: bytes, random: Random) -> bytes:
+    """A sound archive whose files, or their names, are damaged."""
+    buffer = io.BytesIO()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
+            for name in old.namelist():
+                content = old.read(name)
+                if random.random() < 0.3:
+                    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
+                if random.random() < 0.05:
+                    name = random.choice(
+                        ["../x.txt", "/etc/passwd", "runs/zz/run.json", f"runs/{'0' * 16}/run.json", name]
+                    )
+                new.writestr(name, content)
+    except Exception:  # a seed that is no archive any more is damaged as bytes
+        return mutate(data, [data], random)
+    return buffer.getvalue()
+
+
+def _read_study(data: bytes | None, folder: Path) -> None:
+    study = folder / "results" / "studies" / "small"
+    at(study, "journal.log", _stored("studies/small/journal.log"))
+    at(study, "study.json", data)
+    Study.open(study)
+
+
+def _study_seeds() -> list[bytes]:
+    stored = _stored("studies/small/study.json")
+    return [stored, stored.replace(b'"small"', b'"other"'), stored.replace(b'"storage": ""', b'"storage": "redis://h"')]
+
+
+def _read_journal(data: bytes | None, folder: Path) -> None:
+    study = folder / "results" / "studies" / "small"
+    at(study, "journal.log", data)
+    at(study, "study.json", _stored("studies/small/study.json"))
+    Study.open(study).frame()
+
+
+@cache
+def _entry() -> bytes:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        StageCache(Path(folder)).put("masks", "ab12", {"a": np.eye(3), "b": np.array(["person"])}, 0.1)
+        (path,) = Path(folder).rglob("*.npz")
+        return path.read_bytes()
+
+
+def _read_entry(data: bytes | None, folder: Path) -> None:
+    at(folder / "masks" / "ab", "ab12.npz", data)
+    found = StageCache(folder).get("masks", "ab12")
+    assert found is None or found.cost_s == 0.1
+
+
+def _summary(cls: type[Record], seed: str) -> dict[str, Any]:
+    return {
+        "read": lambda data, folder: cls.read(at(folder, "record.json", data)),
+        "seeds": lambda: [_stored(seed)],
+        "covers": (Record.read, Record.parse, reading.read_text),
+        "mutation": mutate_json,
+    }
+
+
+def _receipt_seeds() -> list[bytes]:
+    made = Receipt(id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3)
+    return [made.to_json().encode()]
+
+
+def _state_seeds() -> list[bytes]:
+    """What such a state is made of, without the package that makes it."""
+    return [
+        pickle.dumps({"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}, protocol) for protocol in (4, 5)
+    ]
+
+
+TARGETS = [
+    Target(
+        "run record",
+        _read_run,
+        lambda: [_stored(f"runs/{RUN}/run.json"), _other(_stored(f"runs/{RUN}/run.json"))],
+        (RunStore._read, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
+        mutate_json,
+    ),
+    Target(
+        "metric record", _read_metrics, lambda: [_stored(f"metrics/*/{RUN}.json")], (RunStore.metrics,), mutate_json
+    ),
+    Target(
+        "stamps and trajectories of a run",
+        _read_part,
+        lambda: [_stored("sequences/*/timestamps.txt"), _stored(f"runs/{RUN}/trajectory_online.txt")],
+        (RunStore.trajectory, RunStore.timestamps, RunStore.ground_truth, evaluate_run),
+    ),
+    Target(
+        "frame log",
+        _read_log,
+        _log_seeds,
+        (rows.read_log, rows._from_json, rows._number, FrameLog.trajectory),
+        mutate_lines,
+    ),
+    Target(
+        "frame table",
+        lambda data, folder: load_frames(at(folder, rows.CSV_FILE, data)),
+        lambda: [_stored(f"runs/{RUN}/frames.csv")],
+        (rows.read_csv, rows._parse, rows._state, load_frames),
+    ),
+    Target(
+        "packed run",
+        lambda data, folder: packing.unpack(data or b"", RunStore(folder)),
+        _packed_seeds,
+        (packing.unpack, packing._take, packing._write_once),
+        _repacked,
+    ),
+    Target("study's summary", **_summary(StudySummary, "studies/small/summary.json")),
+    Target("stored study", _read_study, _study_seeds, (Study.open, python_study._spec_of), mutate_json),
+    Target(
+        "journal of a study",
+        _read_journal,
+        lambda: [_stored("studies/small/journal.log")],
+        (Study.open, Study.frame, study_frame._line),
+        mutate_lines,
+    ),
+    Target(
+        "receipt of a fetch",
+        lambda data, folder: Receipt.read(at(folder, "fetched.json", data)),
+        _receipt_seeds,
+        (Record.read, Record.parse),
+        mutate_json,
+    ),
+    Target("stage cache entry", _read_entry, lambda: [_entry()], (StageCache.get, _unpack)),
+    Target(
+        "state of CMA-ES",
+        lambda data, folder: cmaes_state._OnlyStates.loads(data or b""),
+        _state_seeds,
+        (cmaes_state._OnlyStates.loads, cmaes_state._State.find_class),
+    ),
+]

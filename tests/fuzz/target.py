@@ -1,0 +1,48 @@
+"""What is attacked: a reader, files that it reads, and the code that counts as its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from dynslam_bench.core.errors import DynslamError
+
+Mutation = Callable[[bytes, Random], bytes]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        name: Its name.
+        read: Reads what the bytes are in an empty folder of its own; None stands for a file that is missing. It ends,
+            or raises an error of `allowed`; anything else is a finding.
+        seeds: Makes files that it reads without an error, once.
+        covers: Functions, classes and modules whose lines count as the reader's.
+        mutation: Damage that keeps checksums or syntax right, used every other time beside damage to plain bytes.
+        allowed: The errors that its documentation names.
+        uncovered: Why lines of it are never reached by files alone, for the record.
+    """
+
+    name: str
+    read: Callable[[bytes | None, Path], object]
+    seeds: Callable[[], list[bytes]]
+    covers: tuple[Any, ...]
+    mutation: Mutation | None = None
+    allowed: tuple[type[BaseException], ...] = (DynslamError,)
+    uncovered: str = ""
+
+
+def at(folder: Path, name: str, data: bytes | None) -> Path:
+    """A file of that name with the bytes, or its path where there are none."""
+    path = folder / name
+    if data is None:
+        path.unlink(missing_ok=True)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return path

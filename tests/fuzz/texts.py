@@ -1,0 +1,309 @@
+"""Readers of text that people and other programs write: trajectories, lists, settings, labels, answers, addresses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dynslam_bench.cli import options
+from dynslam_bench.cli.output import _text  # how a cell of a table is written
+from dynslam_bench.core import address, harmless, reading, toml
+from dynslam_bench.core import settings as core_settings
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.geometry import kitti_file, tum_file
+from dynslam_bench.segmentation.masks import recorded
+from dynslam_bench.segmentation.training import labelled_files as labels
+from dynslam_bench.sequences import catalogue, fetch
+from dynslam_bench.sequences.published import cameras
+from dynslam_bench.sequences.readers import lists, tum
+from dynslam_bench.sequences.synthetic import parse_synthetic_id
+from dynslam_bench.sequences.synthetic import settings as synthetic
+from dynslam_bench.slam.settings import TrackingSettings
+from dynslam_bench.suites import suite
+from dynslam_bench.trackers.adapters import answers, program
+from dynslam_bench.tuning import study_file
+
+from .mutate import mutate_json
+from .records import FIXTURE
+from .target import Target, at
+
+ROOT = Path(__file__).resolve().parents[2]
+POSES = (
+    b"# a comment\n1.0 0 0 0 0 0 0 1\n3.0,1,2,3,0,0,0,2\n2.0\t1 2 3 0 0 0.6 0.8\n4.0 nan 0 0 0 0 0 1\n5 0 0 0 0 0 0 0\n"
+)
+LIST = (
+    b"# timestamp filename\n1.000000 rgb/1.png\n2.000000 rgb/2.png\n1.5 rgb/3.png\n2.0 rgb/4.png\nnan rgb/5.png\n3.0\n"
+)
+PAIRS = b"1.0 rgb/1.png 1.01 depth/1.png\n2.0 rgb/2.png 2.01 depth/2.png\n1.0 rgb/3.png 1.0 depth/3.png\n"
+CAMERA = (b"width = 640\nheight = 480\nfx = 525.0\nfy = 525.0\ncx = 319.5\ncy = 239.5\n"
+          b"distortion = [0.1, 0.0, 0.0, 0.0, 0.0]\nfps = 30.0\n")  # fmt: skip
+ANSWER = {"state": "ok", "T_world_cam": np.eye(4).ravel().tolist(), "stats": {"a": 1}, "timings": {"orb": 0.01},
+          "trajectory": [[1.0, 0, 0, 0, 0, 0, 0, 1], [2.0, 0, 0, 1, 0, 0, 0, 1]]}  # fmt: skip
+COCO = {
+    "images": [{"id": 1, "file_name": "a.png"}, {"id": 2, "file_name": "b/c.png"}],
+    "categories": [{"id": 1, "name": "person"}],
+    "annotations": [
+        {"image_id": 1, "category_id": 1, "segmentation": [[1, 1, 6, 1, 6, 6, 1, 6], [0, 0, 1, 1]]},
+        {"image_id": 1, "category_id": 1, "segmentation": {"counts": [10, 20, 34], "size": [8, 8]}},
+        {"image_id": 1, "category_id": 1, "segmentation": {"counts": ":d0R1", "size": [8, 8]}},
+        {"image_id": 1, "category_id": 1, "iscrowd": 1, "segmentation": []},
+    ],
+}
+_PNG = cv2.imencode(".png", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
+
+
+def _text_of(data: bytes | None) -> str:
+    return (data or b"").decode("utf-8", "surrogateescape")
+
+
+def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], object]:
+    return lambda data, _: read(_text_of(data))
+
+
+def _read_kitti(data: bytes | None, folder: Path) -> None:
+    kitti_file.read_kitti(at(folder, "poses.txt", data))
+
+
+def _read_folder(data: bytes | None, folder: Path) -> None:
+    """A list names files: none of them may lie outside, whatever it says."""
+    at(folder, "rgb.txt", data)
+    at(folder, "depth.txt", data)
+    for name in ("rgb/1.png", "rgb/2.png", "rgb/3.png"):
+        at(folder, name, _PNG)
+    colour, depth, _ = tum._list_images(folder, 30.0)
+    assert all((folder / file).resolve().is_relative_to(folder.resolve()) for file in (*colour.files, *depth.files))
+    tum._existing(folder, colour, "colour")
+
+
+def _read_manifest(data: bytes | None, folder: Path) -> None:
+    at(folder, "rgb/1.png", _PNG)
+    fetch._compare(folder, at(folder, fetch.MANIFEST, data))
+
+
+def _read_coco(data: bytes | None, folder: Path) -> None:
+    at(folder, "a.png", _PNG)
+    at(folder, "b/c.png", _PNG)
+    images = labels.CocoImages(at(folder, "annotations.json", data))
+    assert images.name and images.version
+    for index in range(min(len(images), 4)):
+        images[index]
+
+
+def _read_yolo(data: bytes | None, folder: Path) -> None:
+    at(folder, "images/a.png", _PNG)
+    at(folder, "labels/a.txt", data)
+    images = labels.YoloImages(folder)
+    assert images.name and images.version and len(images) == 1
+    images[0]
+
+
+def _read_answer(text: str) -> None:
+    answer = program.parse_answer(text)
+    try:
+        answers.read_track_answer(answer, "program at frame 1", lambda: 0.1)
+    except TrackerError:
+        answers.read_final_answer(answer, "program at finalize")
+    else:
+        answers.read_final_answer(answer, "program at finalize")
+
+
+def _override(text: str) -> None:
+    assigned = core_settings.parse_assignments(text.split("\n"))
+    core_settings.apply_overrides(TrackingSettings(), assigned)
+
+
+def _harmless(text: str) -> None:
+    """Whatever a record says, the terminal gets no escape, the file no half character, the path no way out."""
+    assert not set(harmless.printable(text)) & {chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)}
+    str(harmless.storable({text: [text]})).encode()
+    assert "\n" not in _text(text)
+    if harmless.is_inside(text):
+        assert (Path("/root/x") / text).resolve().is_relative_to("/root/x")
+
+
+def _ids(text: str) -> None:
+    for read in (parse_synthetic_id, catalogue.parse_frames, catalogue.entry_of):
+        try:
+            read(text)
+        except harmless.DynslamError:
+            continue
+
+
+TARGETS = [
+    Target(
+        "TUM trajectory",
+        lambda data, folder: tum_file.load_tum(at(folder, "poses.txt", data)),
+        lambda: [
+            POSES,
+            b"1 2 3\n",
+            b"1 2 3 4 5 6 7 8 9 0 1 2\n",
+            b"1 rgb/1.png\n",
+            b"1 2 3 4 5 6 7 x\n",
+            b"# nothing\n",
+            b"1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",
+        ],
+        (tum_file.load_tum, tum_file.read_table, tum_file._is_number, tum_file._hint, reading.read_lines),
+    ),
+    Target(
+        "KITTI trajectory",
+        _read_kitti,
+        lambda: [b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3\n"],
+        (tum_file.read_table,),
+    ),
+    Target(
+        "list of images",
+        lambda data, folder: lists.read_image_list(at(folder, "rgb.txt", data)),
+        lambda: [LIST],
+        (lists.read_image_list, lists.read_stamped_lines, lists.make_image_list, lists._number),
+    ),
+    Target(
+        "associations",
+        lambda data, folder: lists.read_associations(at(folder, "a.txt", data)),
+        lambda: [PAIRS],
+        (lists.read_associations, lists.read_stamped_lines),
+    ),
+    Target(
+        "folder in TUM layout",
+        _read_folder,
+        lambda: [LIST, LIST.replace(b"rgb/2", b"../2")],
+        (tum._list_images, harmless.inside, harmless.is_inside),
+    ),
+    Target(
+        "manifest of a fetch",
+        _read_manifest,
+        lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"],
+        (fetch._compare, harmless.inside, harmless.is_inside),
+    ),
+    Target(
+        "camera",
+        lambda data, folder: cameras.read_camera(at(folder, "camera.toml", data)).camera(),
+        lambda: [CAMERA, b'name = "tum-fr1"\n'],
+        (cameras.read_camera, cameras.known_camera, toml.read_toml, toml.parse_toml),
+    ),
+    Target(
+        "settings file",
+        lambda data, folder: options.read_settings(at(folder, "s.toml", data)),
+        lambda: [b"[settings]\nfeatures.count = 500\n[settings.epipolar]\nthreshold_px = 1.5\n", b"a.b = 1\n"],
+        (options.read_settings, options._flatten),
+    ),
+    Target(
+        "--set",
+        _of_text(_override),
+        lambda: [b"radius_px=15\nlocal_map=all", b"x=1", b"radius_px=[1]", b"radius_px=" + b"9" * 4999, b"radius_px"],
+        (
+            core_settings.apply_overrides,
+            core_settings.parse_assignments,
+            core_settings._parse,
+            core_settings._explain,
+            core_settings._shown,
+        ),
+    ),
+    Target(
+        "suite",
+        lambda data, folder: suite.load_suite(at(folder, "s.toml", data)),
+        lambda: [
+            (ROOT / "dynslam_bench/suites/smoke.toml").read_bytes(),
+            b'trackers = ["never-move"]\nsequences = ["a"]\nsedes = [1]\n',
+            b"trackers = 3\n",
+        ],
+        (suite.load_suite, suite._explain),
+    ),
+    Target(
+        "study",
+        lambda data, folder: study_file.read_study(at(folder, "s.toml", data)),
+        lambda: [(FIXTURE.parent / "small.toml").read_bytes(), (ROOT / "docs/studies/thresholds.toml").read_bytes()],
+        (study_file.read_study, study_file.make_study, study_file._identity),
+    ),
+    Target(
+        "COCO annotations",
+        _read_coco,
+        lambda: [
+            json.dumps(COCO).encode(),
+            b'{"images": [], "annotations": [], "categories": []}',
+            *(
+                json.dumps(COCO | {"annotations": [{**COCO["annotations"][0], "segmentation": odd}]}).encode()
+                for odd in (
+                    [[1, 2, 1e9, 3, 4, 5]],
+                    {"counts": "a", "size": [8, 8]},
+                    {"size": 3},
+                    "x",
+                    {"counts": [64], "size": [8, 8]},
+                    {"counts": [1], "size": [8, 8]},
+                    [[1, 2]],
+                )
+            ),
+        ],
+        (labels.CocoImages, labels._coco_mask, labels._from_runs, labels.decode_runs, labels._check_polygon),
+        mutate_json,
+    ),
+    Target(
+        "YOLO labels",
+        _read_yolo,
+        lambda: [b"0 0.1 0.1 0.9 0.1 0.9 0.9\n56 0 0 1 0 1 1\n\n", b"-1 0 0\n", b"0 nan 0\n", b"0 0 0\n"],
+        (labels.YoloImages, labels._fill),
+    ),
+    Target(
+        "classes of recorded masks",
+        lambda data, folder: recorded._read_classes(at(folder, "classes.json", data)),
+        lambda: [b'{"1": "person", "7": "chair"}'],
+        (recorded._read_classes, reading.parse_json),
+        mutate_json,
+    ),
+    Target(
+        "answers of a program",
+        _of_text(_read_answer),
+        lambda: [
+            json.dumps(ANSWER | odd).encode()
+            for odd in (
+                {},
+                {"state": "lost", "T_world_cam": None},
+                {"T_world_cam": None},
+                {"T_world_cam": [2] * 16},
+                {"trajectory": [[1, 0, 0, 0, 0, 0, 0, 9]]},
+                {"trajectory": [[1, 0, 0, 0, 0, 0, 0, 1]] * 2},
+            )
+        ],
+        (answers, program.parse_answer),
+        mutate_json,
+    ),
+    Target(
+        "web address",
+        lambda data, _: address.check_address(_text_of(data), checked=False),
+        lambda: [
+            b"https://cvg.cit.tum.de/rgbd/x.tgz",
+            b"https://[::1]:8080/x?y=z",
+            b"http://127.0.0.1:80/x.tgz",
+            b"http://host/x",
+            b"https://a:b@host/x",
+            b"https:///x",
+            b"ftp://host/x",
+            b"https://[x/y",
+        ],
+        (address.check_address, address._is_here),
+    ),
+    Target(
+        "names and texts",
+        _of_text(_harmless),
+        lambda: [b"rgb/1.png", "Zoë \x1b[2J\u202e".encode()],
+        (harmless.printable, harmless.storable, harmless.is_inside),
+    ),
+    Target(
+        "ids of sequences",
+        _of_text(_ids),
+        lambda: [
+            b"synthetic/walking_xyz@3?frames=60&noise=2",
+            b"3:60",
+            b"3:2",
+            b"x:",
+            b"synthetic/walking_xyz?x=1",
+            b"synthetic/walking_xyz?frames=1&frames=2",
+            b"synthetic/walking_xyz?frames=0",
+            b"synthetic/x",
+        ],
+        (catalogue.parse_frames, synthetic.parse_synthetic_id, synthetic._options, synthetic._integer),
+    ),
+]

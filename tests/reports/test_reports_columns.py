@@ -1,0 +1,85 @@
+"""What is one column of a table: the same frames of the same recording, under a name of its own."""
+
+from reports_fake_store import add_run
+from reports_rows import PROTOCOL, row, rows_of
+
+from dynslam_bench.reports import build_report, compare
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.columns import name_columns, shortened
+from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.runs.storage.store import RunStore
+
+
+def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for place, error in (("/data/chess/seq-01", 0.01), ("/data/fire/seq-01", 0.2)):
+        for tracker in ("a", "b"):
+            add_run(store, tracker, "folder/seq-01", error=error, content=place, block=place[6:11], place=place)
+    paths = build_report(store, tmp_path / "report")
+    table = {r["tracker"]: r for r in rows_of(paths.csv["per_sequence"])}
+    assert float(table["a"]["chess/seq-01"]) < 0.05 < float(table["a"]["fire/seq-01"])
+    assert len(rows_of(paths.csv["runs"])) == 4
+    assert "Left out" not in paths.markdown.read_text()
+    found = compare(store, store)
+    assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
+
+
+def test_the_camera_is_part_of_the_column_in_old_records_too(tmp_path):
+    """Records without a block: content and frames, and the camera that the identity names."""
+    store = RunStore(tmp_path / "r")
+    right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
+    add_run(store, "a", "folder/s", camera=right)
+    add_run(store, "b", "folder/s", camera=right | {"fx": 400.0})
+    add_run(store, "elsewhere", "folder/s", kind="imported")
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    assert set(board.sequences) == {
+        "folder/s (camera 640x480, f 525 525)", "folder/s (camera 640x480, f 400 525)", "folder/s",
+    }  # fmt: skip
+    alone = RunStore(tmp_path / "q")
+    add_run(alone, "a", "folder/s", camera=right)
+    add_run(alone, "elsewhere", "folder/s", kind="imported")
+    assert len({run.row.column_id for run in load_runs([alone], PROTOCOL).runs}) == 1
+
+
+def test_the_same_frames_are_one_column_in_every_spelling(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "a", "synthetic/walking_xyz?frames=60", block="b1")
+    add_run(store, "b", "synthetic/walking_xyz", frames=(0, 60), block="b1")
+    add_run(store, "b", "synthetic/walking_xyz?noise=3", frames=(0, 60), block="b1", noise=3)
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    assert board.sequences == ["synthetic/walking_xyz [0:60]"]
+    assert [len(cells[board.sequences[0]].rows) for _, cells in sorted(board.cells.items())] == [1, 2]
+
+
+def test_names_of_columns_are_never_alike():
+    same = dict(sequence="folder/x", content="c" * 12)
+    rows = [row(**same, block="b1"), row(**same, block="b2"), row(sequence="folder/x", content="d" * 12, block="b3")]
+    names = name_columns(rows)
+    assert len(set(names.values())) == 3
+    assert all(name.startswith("folder/x (") for name in names.values())
+    deep = [row(sequence="folder/x", block=str(i), place=p, frames="0:9") for i, p in enumerate(["/a/1/x", "/b/1/x"])]
+    assert list(name_columns(deep).values()) == ["a/1/x [0:9]", "b/1/x [0:9]"]
+
+
+def test_sequences_are_grouped_from_static_to_dynamic():
+    tags = {"z": ["static"], "b": ["high-dynamic"], "a": ["low-dynamic"], "c": ["high-dynamic"], "d": []}
+    board = make_board([row(sequence=name, tags=found) for name, found in tags.items()])
+    assert board.sequences == ["z", "a", "b", "c", "d"]
+    assert [board.groups[s] for s in board.sequences] == [
+        "static",
+        "low dynamic",
+        "high dynamic",
+        "high dynamic",
+        "other",
+    ]
+
+
+def test_names_lose_what_all_share():
+    names = ["synthetic/walking_xyz@0?frames=60", "synthetic/sitting_xyz@0?frames=60"]
+    assert list(shortened(names).values()) == ["walking_xyz", "sitting_xyz"]
+    assert list(shortened([*names, "synthetic/sitting_xyz@1"]).values()) == [
+        "walking_xyz@0?frames=60", "sitting_xyz@0?frames=60", "sitting_xyz@1",
+    ]  # fmt: skip
+    assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
+    assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
+    assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}

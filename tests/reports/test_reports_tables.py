@@ -1,0 +1,34 @@
+"""Tables: the frames behind them, and the formats that they are written in."""
+
+from dynslam_bench.reports.tables.latex import to_latex
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_markdown
+
+
+def test_best_and_second_share_their_marks():
+    assert emphasise([3.0, 1.0, 2.0, 1.0, None]) == ["", "best", "second", "best", ""]
+    assert emphasise([1.0, None]) == ["", ""]
+
+
+def test_tables_in_every_format():
+    table = Table(
+        "t", "A & B", "50 % of_it.", [Column("name", numeric=False), Column("x", "G"), Column("y", "G")],
+        [[TableCell("a|b_*", tag="imported"), TableCell("0.5", "±0.1", 0.51234, "best"), TableCell()]],
+    )  # fmt: skip
+    assert "| a\\|b\\_\\* (imported) | **0.5** ±0.1 |  |" in to_markdown(table)
+    assert to_csv(table) == "name,G: x,G: y\na|b_* imported,0.51234,\n"
+    latex = to_latex(table)
+    assert r"\caption{A \& B.}" in latex
+    assert r"\multicolumn{2}{c}{G}" in to_latex(
+        Table("t", "t", "", table.columns, [[*table.rows[0][:2], TableCell("1")]])
+    )
+    assert r"a\textbar{}b\_* & \textbf{0.5} \\" in latex
+
+
+def test_a_table_is_two_frames():
+    cells = [[TableCell("a"), TableCell("0.5", "±0.1", 0.51234), TableCell("3", value=3)]]
+    cells.append([TableCell("b"), TableCell("–"), TableCell()])
+    table = Table("t", "T", "c", [Column("name", numeric=False), Column("x"), Column("y")], cells)
+    assert table.rows == cells
+    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "Float64", "y": "Int64"}
+    assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
+    assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"

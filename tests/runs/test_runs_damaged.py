@@ -1,0 +1,199 @@
+"""A results folder of somebody else's: whatever a record says, nothing is written outside, and the rest is read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dynslam_bench.core.errors import DynslamError, ReportError, RunError
+from dynslam_bench.core.records import Record
+from dynslam_bench.evaluation.evaluate import SCHEMA_VERSION as EVALUATION
+from dynslam_bench.reports import build_report
+from dynslam_bench.reports.model.report_data import SCHEMA_VERSION as REPORT
+from dynslam_bench.reports.model.report_data import ReportData
+from dynslam_bench.runs import RunRecord, RunStore, score
+from dynslam_bench.runs.frame_row import read_csv, read_log
+from dynslam_bench.runs.storage.frames import FrameLog
+from dynslam_bench.runs.storage.packing import pack, unpack
+from dynslam_bench.runs.storage.record import METRIC_SCHEMA, RUN_SCHEMA, MetricRecord
+from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore
+from dynslam_bench.sequences.fetch import Receipt
+
+FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
+VERSIONED: dict[str, tuple[type[Record], int]] = {
+    "run": (RunRecord, RUN_SCHEMA),
+    "metrics": (MetricRecord, METRIC_SCHEMA),
+    "report": (ReportData, REPORT),
+    "fetched": (Receipt, 1),
+    "segmenter": (SegmenterScore, 1),
+}
+"""Every record with a version of its own, and the newest."""
+GOOD, BAD = "e7f8d4df9db4bb16", "a7abe04996a79cc4"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> RunStore:
+    """Two sound runs in ``in/results``; nothing else lies in ``tmp_path``."""
+    return RunStore(shutil.copytree(FIXTURE, tmp_path / "in" / "results"))
+
+
+def edit(store: RunStore, **changes: Any) -> None:
+    path = store.folder(BAD) / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def outside(tmp_path: Path) -> list[str]:
+    return [str(path) for path in tmp_path.rglob("*") if path.relative_to(tmp_path).parts[0] != "in"]
+
+
+@pytest.mark.parametrize("run_id", ["../../../out/x", "/tmp/out", "a7abe04996a79cc4\n", "A7ABE04996A79CC4", GOOD, ""])
+def test_a_record_whose_id_is_not_its_folders_name_is_unreadable(store: RunStore, tmp_path: Path, run_id: str) -> None:
+    edit(store, run_id=run_id)
+    records, unreadable = store.all()
+    assert [record.run_id for record in records] == [GOOD] and [bad.path.name for bad in unreadable] == [BAD]
+    assert store.get(BAD) is None
+    with pytest.raises(DynslamError, match=r"run_id|names itself"):
+        store.read(BAD)
+    build_report(str(store.root), tmp_path / "in" / "report")
+    assert outside(tmp_path) == []
+
+
+@pytest.mark.parametrize("part", ["../../../out", "/tmp/out", "x", ""])
+def test_a_record_whose_part_is_a_path_is_unreadable(store: RunStore, part: str) -> None:
+    sequence = json.loads((store.folder(BAD) / "run.json").read_text())["sequence"]
+    edit(store, sequence=sequence | {"part": part})
+    assert [bad.path.name for bad in store.all()[1]] == [BAD]
+
+
+@pytest.mark.parametrize("name", ["../../x", "/etc", "latest", ".", "", "a7abe04996a79cc"])
+def test_no_folder_of_the_store_has_another_name_than_an_id(store: RunStore, name: str) -> None:
+    asked: list[Callable[[str], object]] = [store.folder, store.get, store.trajectory]
+    asked += [store.ground_truth, store.timestamps]
+    for ask in asked:
+        with pytest.raises(RunError, match="expected 16 hexadecimal digits"):
+            ask(name)
+
+
+@pytest.mark.parametrize("content", [b"\xff", b"", b"{}", b"[" * 10**5, b'{"reason": "\\ud800"}', b"null"])
+def test_one_damaged_record_disables_nothing(store: RunStore, tmp_path: Path, content: bytes) -> None:
+    (store.folder(BAD) / "run.json").write_bytes(content)
+    records, unreadable = store.all()
+    assert [record.run_id for record in records] == [GOOD] and len(unreadable) == 1
+    assert "\n" not in unreadable[0].reason and str(store.folder(BAD)) in unreadable[0].reason
+    assert build_report(str(store.root), tmp_path / "report").html.is_file()
+    (store.folder(GOOD) / "run.json").write_bytes(content)
+    with pytest.raises(ReportError, match="there are no runs in"):
+        build_report(str(store.root), tmp_path / "none")
+
+
+@pytest.mark.parametrize("file", ["trajectory_online.txt", "../../sequences/8a65f345d9b34895/groundtruth.txt",
+                                  "../../sequences/8a65f345d9b34895/timestamps.txt"])  # fmt: skip
+def test_a_damaged_trajectory_is_the_reason_why_there_is_no_error(store: RunStore, tmp_path: Path, file: str) -> None:
+    (store.folder(BAD) / file).write_bytes(b"\xff\xfe")
+    scored = score(store, store.read(BAD), again=True)
+    assert scored.online is None and "is not a text file" in scored.reasons["online"]
+    assert build_report(str(store.root), tmp_path / "report").html.is_file()
+
+
+@pytest.mark.parametrize("content", [b"\xff", b"{}", b"[]", None])
+def test_damaged_metrics_are_taken_again(store: RunStore, content: bytes | None) -> None:
+    record = store.read(BAD)
+    right = score(store, record).metrics
+    (path,) = [path for path in store.root.glob(f"metrics/*/{BAD}.json") if "tum-rgbd/v1" in path.read_text()]
+    swapped = path.read_bytes().replace(BAD.encode(), GOOD.encode())  # those of another run
+    path.write_bytes(swapped if content is None else content)
+    assert right["ate_rmse_m"] > 0 and score(store, record).metrics == right
+    assert json.loads(path.read_text())["run_id"] == BAD
+
+
+def test_a_store_that_can_only_be_read_is_scored(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise DynslamError("cannot write: Read-only file system")
+
+    monkeypatch.setattr("dynslam_bench.runs.storage.store.write_atomic", refuse)  # root may write anywhere
+    assert score(store, store.read(BAD), "evo-default").metrics["ate_rmse_m"] > 0
+    assert len(store.frame("evo-default")) == 2
+
+
+@pytest.mark.parametrize(
+    "line",
+    ['{"index": 1}', "[]", "null", "\udcff", '{"index": 1, "timestamp": 1e400, "state": "ok"}', "[" * 9999,
+     '{"index": 1, "timestamp": 2, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 0]}',
+     '{"index": 1, "timestamp": 2, "state": "ok", "stats": {"a": ' + "9" * 400 + "}}",
+     '{"index": 1, "timestamp": 2, "state": "flying"}', '{"index": 1, "timestamp": 0.5, "state": "ok"}',
+     '{"index": 1, "timestamp": 2, "state": "ok", "extra": 1}'],
+)  # fmt: skip
+def test_a_damaged_log_of_frames_is_taken_up_to_the_damage(tmp_path: Path, line: str) -> None:
+    good = '{"index": 0, "timestamp": 1.0, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 1], "stats": {"a": 1}}'
+    path = tmp_path / "frames.jsonl"
+    path.write_bytes(f"{good}\n{line}\n{good}\n".encode(errors="surrogateescape"))
+    rows, damage = read_log(path)
+    # a line that is no UTF-8 may take those before it in the same block with it
+    assert len(rows) in ((0, 1) if "\udcff" in line else (1,)) and "is damaged" in damage and "\n" not in damage
+    FrameLog.read(path).write(tmp_path, "comment")
+    assert len(read_csv(tmp_path / "frames.csv")) == len(rows)
+
+
+def test_stats_named_with_half_characters_are_stored(tmp_path: Path) -> None:
+    path = tmp_path / "frames.jsonl"
+    path.write_text('{"index": 0, "timestamp": 1.0, "state": "ok", "stats": {"a\\ud800": 1}}\n')
+    FrameLog.read(path).write(tmp_path, "by \ud800")
+    assert "stat_a\\ud800" in (tmp_path / "frames.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    "table", ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n", "\xff", "index\n" + "x" * 200_000]
+)
+def test_a_damaged_table_of_frames_is_one_clear_line(tmp_path: Path, table: str) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_bytes(table.encode("latin-1"))
+    with pytest.raises(RunError, match=r"row \d+ is damaged|is not a text file"):
+        read_csv(path)
+
+
+def test_a_reason_with_half_a_character_is_stored(store: RunStore) -> None:
+    record = store.read(GOOD).model_copy(update={"reason": "cannot open caf\udce9", "command": ["run", "\udcff"]})
+    with store.work_folder(GOOD) as work:
+        store.publish(work, record)
+    assert store.read(GOOD).reason == "cannot open caf\\udce9"
+    assert record.normalised().command == ["run", "\\udcff"]
+
+
+def test_packed_runs_that_claim_or_hold_too_much_are_refused(store: RunStore, tmp_path: Path) -> None:
+    import io
+    import zipfile
+
+    def zipped(name: str, content: bytes, how: int) -> bytes:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", how) as archive:
+            archive.writestr(name, content)
+        return buffer.getvalue()
+
+    target = RunStore(tmp_path / "target")
+    run = f"runs/{GOOD}/run.json"
+    with pytest.raises(RunError, match="GB, at most"):
+        unpack(zipped(run, bytes(64 << 20), zipfile.ZIP_DEFLATED), target)
+    with pytest.raises(RunError, match="compressed in a way"):
+        unpack(zipped(run, b"{}", zipfile.ZIP_LZMA), target)
+    with pytest.raises(DynslamError, match="is not a text file"):
+        unpack(zipped(run, b"\xff", zipfile.ZIP_STORED), target)
+    damaged = bytearray(pack(store, store.read(GOOD)))
+    damaged[60] ^= 0xFF
+    with pytest.raises(DynslamError):
+        unpack(bytes(damaged), target)
+    assert target.ids() == [] and list(target.runs.iterdir()) == []
+
+
+def test_every_version_of_a_stored_record_loads() -> None:
+    """A fixture for each version: whoever raises one adds the files of the version before."""
+    data = Path(__file__).parent / "data"
+    for kind, (cls, newest) in VERSIONED.items():
+        for version in range(1, newest + 1):
+            found = cls.read(data / f"{kind}_v{version}.json")
+            assert found.schema_version == version and cls.parse(found.to_json(), kind) == found  # type: ignore[attr-defined]
+    assert json.loads((data / "metrics_v1.json").read_text())["online"]["schema_version"] == EVALUATION == 1

@@ -1,0 +1,88 @@
+"""The list of a store: read once, kept until a record changes, never wrong and never in the way."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
+
+from reports_fake_store import add_run
+
+from dynslam_bench.runs import RunStore
+from dynslam_bench.runs.storage.run_list import FIELDS, list_runs, run_row
+
+
+@pytest.fixture
+def filled(tmp_path):
+    store = RunStore(tmp_path / "results")
+    ids = [add_run(store, "a", "s/a", seed, n=40, started=f"2026-01-0{3 - seed}T00:00:00+00:00") for seed in range(3)]
+    return store, ids
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Ids of the records that are read whole."""
+    seen = []
+    whole = RunStore.read_whole
+    monkeypatch.setattr(RunStore, "read_whole", lambda self, run_id: seen.append(run_id) or whole(self, run_id))
+    return seen
+
+
+def test_rows_are_those_of_the_records_and_are_read_once(filled, reads):
+    store, ids = filled
+    rows, unreadable = list_runs(store)
+    assert [row["run"] for row in rows] == ids[::-1] and unreadable == []
+    for row in rows:
+        record = store.read(row["run"])
+        assert row == run_row(record, store.score(record)) and tuple(row) == FIELDS
+    reads.clear()
+    assert list_runs(store) == (rows, [])
+    assert reads == []
+
+
+def test_what_changed_is_read_again(filled, reads):
+    store, ids = filled
+    list_runs(store)
+    reads.clear()
+    store.relabel(store.read_whole(ids[0]), "another")
+    record = store.folder(ids[1]) / "run.json"
+    changed = json.loads(record.read_text()) | {"reason": "edited by hand"}
+    record.write_text(json.dumps(changed))
+    store.remove(ids[2])
+    new = add_run(store, "b", "s/a", n=40)
+    reads.clear()
+    rows, _ = list_runs(store)
+    assert sorted(reads) == sorted([ids[0], ids[1], new])
+    assert {row["run"] for row in rows} == {ids[0], ids[1], new}
+    assert next(row for row in rows if row["run"] == ids[1])["reason"] == "edited by hand"
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"head": 1}', '{"head": [], "rows": {}}', "\x00", '{"rows": [1]}'])
+def test_a_damaged_index_is_made_again(filled, text):
+    store, _ = filled
+    rows, _ = list_runs(store)
+    (index,) = (store.root / "index").iterdir()
+    whole = index.read_bytes()
+    index.write_text(text)
+    assert list_runs(store)[0] == rows
+    assert index.read_bytes() == whole
+
+
+def test_an_unreadable_record_is_named_every_time(filled):
+    store, ids = filled
+    (store.folder(ids[0]) / "run.json").write_text("{")
+    for _ in range(2):
+        rows, (bad,) = list_runs(store)
+        assert len(rows) == 2 and bad.path == store.folder(ids[0])
+
+
+def test_a_store_that_cannot_be_written_is_listed(filled, monkeypatch):
+    store, _ = filled
+    rows, _ = list_runs(store)
+    for path in (store.root / "index").iterdir():
+        path.unlink()
+    (store.root / "index").rmdir()
+    (store.root / "index").write_text("a file in its place")
+    assert list_runs(store) == (rows, [])

@@ -1,0 +1,84 @@
+"""A server of one published archive that cuts, lies and refuses as it is told to."""
+
+import contextlib
+import http.server
+import io
+import re
+import tarfile
+import threading
+
+NAME, FOLDER = "tum/fr3/sitting_static", "rgbd_dataset_freiburg3_sitting_static"
+"""The archive that is served: its id, and the folder inside."""
+
+
+class Server:
+    """Serves one file; `plan` holds what goes wrong with each of the next requests."""
+
+    def __init__(self, data):
+        self.data, self.plan, self.requests, self.etag, self.ranges = data, [], [], '"one"', True
+        owner = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def log_message(self, *args):
+                pass
+
+            def do_GET(self):
+                owner.requests.append(self.headers.get("Range"))
+                owner.answer(self, owner.plan.pop(0) if owner.plan else {})
+
+        self.http = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
+        self.url = f"http://127.0.0.1:{self.http.server_port}/{FOLDER}.tgz"
+
+    def answer(self, handler, fault):
+        handler.close_connection = True
+        if "status" in fault:
+            handler.send_error(fault["status"])
+            return
+        start = 0
+        wanted = re.fullmatch(r"bytes=(\d+)-", handler.headers.get("Range") or "")
+        if wanted and self.ranges and handler.headers.get("If-Range", self.etag) == self.etag:
+            start = int(wanted[1])
+            if start >= len(self.data):
+                handler.send_response(416)
+                handler.send_header("Content-Range", f"bytes */{len(self.data)}")
+                handler.send_header("Content-Length", "0")
+                handler.end_headers()
+                return
+        body = self.data[start:]
+        handler.send_response(206 if start else 200)
+        if start:
+            handler.send_header("Content-Range", f"bytes {start}-{len(self.data) - 1}/{len(self.data)}")
+        handler.send_header("ETag", self.etag)
+        if fault.get("chunked"):
+            handler.send_header("Transfer-Encoding", "chunked")
+            handler.end_headers()
+            half = len(body) // 2
+            handler.wfile.write(b"%x\r\n" % half + body[:half] + b"\r\n")
+            if fault["chunked"] == "whole":
+                handler.wfile.write(b"%x\r\n" % len(body[half:]) + body[half:] + b"\r\n0\r\n\r\n")
+            return
+        handler.send_header("Content-Length", str(len(body) + fault.get("lie", 0)))
+        handler.end_headers()
+        with contextlib.suppress(ConnectionError):
+            handler.wfile.write(body[: fault.get("cut", len(body))])
+
+    def close(self):
+        self.http.shutdown()
+        self.http.server_close()
+
+
+def tgz(folder, name=FOLDER, extra=()):
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz", compresslevel=0) as tar:
+        tar.add(folder, arcname=name)
+        for info, data in extra:
+            tar.addfile(info, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+def left_behind(root):
+    """Every file below the root, hidden ones included."""
+    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())

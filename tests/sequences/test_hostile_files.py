@@ -1,0 +1,180 @@
+"""Images and archives that claim to be huge, lists that name files elsewhere, text of ten million lines."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import resource
+import struct
+import subprocess
+import sys
+import tarfile
+import zipfile
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from sequence_folders import make_folder
+
+from dynslam_bench.core.errors import SequenceError, TrajectoryError
+from dynslam_bench.core.image_header import image_size
+from dynslam_bench.core.images import read_image
+from dynslam_bench.geometry.tum_file import load_tum
+from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.fetch import MANIFEST, verify
+from dynslam_bench.sequences.published import archives
+from dynslam_bench.sequences.readers.lists import read_image_list
+
+
+def lying_png(width: int, height: int) -> bytes:
+    """A PNG of a few hundred bytes that claims any size, with right checksums."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    pixels = chunk(b"IDAT", zlib.compress(bytes(99)))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + pixels + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".ppm"])
+def test_the_size_is_known_before_anything_is_decoded(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"image{suffix}"
+    cv2.imwrite(str(path), np.zeros((11, 23, 3), np.uint8))
+    assert image_size(path.read_bytes()) == (23, 11)
+    assert read_image(path, size=(23, 11)).shape == (11, 23, 3)
+    for cut in range(0, 60, 7):
+        image_size(path.read_bytes()[:cut])
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth"])
+def test_an_image_that_claims_to_be_huge_costs_nothing(tmp_path: Path, kind: str) -> None:
+    folder, *_ = make_folder(tmp_path / "seq")
+    (folder / kind / "2.png").write_bytes(lying_png(40_000, 35_000))
+    sequence = open_sequence(folder)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(SequenceError, match="is 40000x35000, but"):
+        sequence[2]
+    with pytest.raises(SequenceError, match=r"claims to be 40000x35000, at most 64 megapixels"):
+        read_image(folder / kind / "2.png", kind=SequenceError)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # KB
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/passwd", "rgb/../../secret.png", "a\\..\\b.png"])
+def test_lists_name_nothing_outside_their_folder(tmp_path: Path, name: str) -> None:
+    folder, *_ = make_folder(tmp_path / "seq")
+    cv2.imwrite(str(tmp_path / "secret.png"), np.zeros((24, 32, 3), np.uint8))
+    (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text() + f"99.0 {name}\n")
+    with pytest.raises(SequenceError, match="does not lie in"):
+        open_sequence(folder)
+
+
+def test_a_manifest_that_leads_outside_is_a_fault(tmp_path: Path) -> None:
+    folder, *_ = make_folder(tmp_path / "seq")
+    for content in (f"{'0' * 64}  ../../etc/passwd\n".encode(), b"\xff\xfe"):
+        (folder / MANIFEST).write_bytes(content)
+        (fault,) = verify(str(folder)).faults
+        assert "does not lie in" in fault or "is not a text file" in fault
+
+
+def test_ten_million_lines_are_refused_early_and_cheaply(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_bytes(b"#\n" * 4_000_001)
+    with pytest.raises(TrajectoryError, match="has more than 4000000 lines"):
+        load_tum(path)
+    with pytest.raises(SequenceError, match="has more than 1000000 lines"):
+        read_image_list(path)
+
+
+def tar_header(name: bytes, size: int, kind: bytes) -> bytes:
+    """A tar header of any size, with a right checksum."""
+    block = bytearray(tarfile.TarInfo(name.decode()).tobuf(tarfile.GNU_FORMAT)[:512])
+    block[124:136] = b"\x80" + size.to_bytes(11, "big")
+    block[156:157] = kind
+    block[148:156] = b" " * 8
+    block[148:156] = b"%06o\0 " % sum(block)
+    return bytes(block)
+
+
+@pytest.mark.parametrize("kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK])
+def test_a_tar_header_that_claims_gigabytes_costs_nothing(tmp_path: Path, kind: bytes) -> None:
+    archive, target = tmp_path / "a.tgz", tmp_path / "out"
+    archive.write_bytes(gzip.compress(tar_header(b"x", 3 << 30, kind) + bytes(10 << 20), 1))
+    target.mkdir()
+    with pytest.raises(SequenceError, match="a header claims 3221225472 bytes"):
+        archives.extract(archive, target)
+
+
+def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archives, "MAX_MEMBERS", 20)
+    archive = tmp_path / "a.tar"
+    with tarfile.open(archive, "w") as tar:
+        for number in range(30):
+            tar.addfile(tarfile.TarInfo(f"seq/{number}"))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SequenceError, match="holds more than 20 files, refused"):
+        archives.extract(archive, tmp_path / "out")
+    with zipfile.ZipFile(archive, "w") as made:
+        for number in range(30):
+            made.writestr(f"zip/{number}", "")
+    with pytest.raises(SequenceError, match="holds more than 20 files, refused"):
+        archives.extract(archive, tmp_path / "out")
+
+
+def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        tar.addfile(tarfile.TarInfo("seq/rgb.txt"))
+    archive = tmp_path / "a.tgz"
+    archive.write_bytes(gzip.compress(buffer.getvalue(), 1) + gzip.compress(bytes(140_000_000), 9))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SequenceError, match=r"unpacks to more than 0\.1 GB"):
+        archives.extract(archive, tmp_path / "out")
+
+
+def test_other_compressions_are_refused(tmp_path: Path) -> None:
+    """LZMA takes as much memory as the file asks for."""
+    archive = tmp_path / "a.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_LZMA) as made:
+        made.writestr("seq/rgb.txt", "x")
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SequenceError, match="compressed in a way that is not unpacked here"):
+        archives.extract(archive, tmp_path / "out")
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "garbage"])
+def test_damaged_zip_files_are_one_clear_line(tmp_path: Path, damage: str) -> None:
+    archive = tmp_path / "a.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as made:
+        made.writestr("seq/rgb.txt", os.urandom(2000))
+    data = bytearray(archive.read_bytes())
+    if damage == "flip":
+        data[500] ^= 255
+    archive.write_bytes(bytes(data[:900]) if damage == "cut" else b"x" * 99 if damage == "garbage" else bytes(data))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SequenceError, match=r"a.zip is damaged \(\d+ bytes\)"):
+        archives.extract(archive, tmp_path / "out")
+
+
+def test_the_memory_of_hostile_files_is_bounded(tmp_path: Path) -> None:
+    """All of them in one fresh process: its peak stays far below what they claim."""
+    (tmp_path / "1.png").write_bytes(lying_png(30_000, 30_000))
+    (tmp_path / "a.tgz").write_bytes(gzip.compress(tar_header(b"x", 3 << 30, b"x") + bytes(100 << 20), 1))
+    program = (
+        "import resource, sys, pathlib\n"
+        "from dynslam_bench.core.errors import DynslamError\n"
+        "from dynslam_bench.core.images import read_image\n"
+        "from dynslam_bench.sequences.published.archives import extract\n"
+        "folder = pathlib.Path(sys.argv[1]); (folder / 'out').mkdir()\n"
+        "base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "for read in (lambda: read_image(folder / '1.png'), lambda: extract(folder / 'a.tgz', folder / 'out')):\n"
+        "    try: read()\n"
+        "    except DynslamError as error: print(error)\n"
+        "print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) // 1024)\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(said) == 3 and int(said[-1]) < 100

@@ -1,0 +1,141 @@
+"""No study samples a dead setting: each that a system's space offers changes something, on frames that show it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from steering_scene import SmallScene, construct, difference
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.settings import Parameter
+from dynslam_bench.segmentation.availability import embedded_weights
+from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.systems.composition import SystemSettings
+from dynslam_bench.tuning import SpaceSpec, search_space
+
+SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
+DENSE = "emfoa-oft-paper-no-masks"
+FRAMES, FEW = 14, 3
+
+
+def offered() -> dict[str, tuple[str, Parameter]]:
+    """Every setting that a study of some system draws on rendered sequences, with the first such system.
+
+    What changes in mid-episode is left to `test_steering`, which asks the same of it.
+    """
+    found: dict[str, tuple[str, Parameter]] = {}
+    for spec in SYSTEMS.values():
+        for parameter in search_space(spec.settings, SpaceSpec(), ["synthetic/walking_xyz"]):
+            if not parameter.online:
+                found.setdefault(parameter.name, (spec.id, parameter))
+    return found
+
+
+OFFERED = offered()
+MANY = {
+    "backend.keyframes.tracked_share": 0.95, "backend.keyframes.established": 1, "backend.keyframes.moved_share": 1.0,
+    "backend.keyframes.view_share": 0.98,
+}  # fmt: skip
+"""A keyframe nearly every frame."""
+FEW_KEYFRAMES = {
+    "backend.keyframes.tracked_share": 0.4, "backend.keyframes.moved_share": 0.8, "backend.keyframes.view_share": 0.5,
+}  # fmt: skip
+JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
+"""F judges every frame."""
+NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
+CASES: dict[str, tuple[str, dict[str, object]]] = {
+    "backend.tracking.local_map": ("orb-slam2", MANY),
+    "backend.keyframes.max_gap": ("orb-slam2", FEW_KEYFRAMES),
+    "backend.keyframes.redundant_share": ("orb-slam2", MANY),
+    "backend.mapping.neighbours": ("orb-slam2", MANY),
+    "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
+    "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
+    **{f"backend.relocalisation.{name}": ("orb-slam2", MANY)
+       for name in ("searched", "candidates", "iterations", "max_distance")},
+    "segmentation.mask_threshold": NETWORK,
+    "segmentation.nms_iou": NETWORK,
+    "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
+    **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
+    **{f"epipolar.{name}": ("emfoa-oft-paper-sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
+}  # fmt: skip
+"""Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
+
+
+class Scene(SmallScene):
+    """The small scene with frames that show nothing, after which a system has to find itself again."""
+
+    def __init__(self) -> None:
+        super().__init__(frames=FRAMES)
+        for number in (8, 9):
+            seen = self.frames[number]
+            self.frames[number] = Frame(number, seen.timestamp, np.zeros_like(seen.rgb), np.zeros_like(seen.depth))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene()
+
+
+@lru_cache(maxsize=64)
+def _usual(system: str, others: tuple[tuple[str, object], ...], scene: Scene) -> tuple[object, list[object]]:
+    tracker = construct(SYSTEMS[system], scene, **dict(others))
+    tracker.reset(scene.camera, rng=np.random.default_rng(0))
+    return tracker, []
+
+
+def usual(system: str, others: dict[str, object], scene: Scene, number: int) -> object:
+    """What the system does on a frame without the change; tracked as far as somebody asked."""
+    tracker, results = _usual(system, tuple(sorted(others.items())), scene)
+    while len(results) <= number:
+        results.append(tracker.track(scene.frames[len(results)]))
+    return results[number]
+
+
+def acts(system: str, others: dict[str, object], name: str, value: object, scene: Scene) -> bool:
+    """Whether a value makes any frame come out otherwise."""
+    tracker = construct(SYSTEMS[system], scene, **{**others, name: value})
+    tracker.reset(scene.camera, rng=np.random.default_rng(0))
+    return any(
+        difference([usual(system, others, scene, number)], [tracker.track(frame)])
+        for number, frame in enumerate(scene.frames[: FEW if system == DENSE else FRAMES])
+    )
+
+
+def others_of(parameter: Parameter) -> dict[str, object]:
+    """What must be set for the parameter's conditions to hold."""
+    return {name: allowed[0] for name, allowed in parameter.when}
+
+
+def values_of(parameter: Parameter) -> tuple[object, ...]:
+    return parameter.choices or (parameter.low, parameter.high)
+
+
+@pytest.mark.parametrize("name", OFFERED)
+def test_every_setting_that_a_study_may_draw_changes_something(name: str, scene: Scene) -> None:
+    system, parameter = OFFERED[name]
+    system, others = CASES.get(name, (system, {}))
+    base = SYSTEMS[system].settings()
+    wanted = {key: value for key, value in others_of(parameter).items()
+              if _value(base, key) not in dict(parameter.when)[key]}  # fmt: skip
+    shown = False
+    for value in values_of(parameter):
+        if shown or value == _value(base, name):
+            continue
+        try:
+            shown = acts(system, wanted | others, name, value, scene)
+        except DynslamError:
+            continue  # the value does not go with the others
+    assert shown, f"{name} changes nothing in {system}, at any of {values_of(parameter)}"
+
+
+def _value(settings: object, name: str) -> object:
+    for part in name.split("."):
+        settings = getattr(settings, part)
+    return settings
+
+
+def test_the_weights_that_some_cases_name_are_here() -> None:
+    assert embedded_weights() is not None

@@ -1,0 +1,125 @@
+"""Blocks: what a study file names, and what is refused in one clear line."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import toy_tracker
+
+from dynslam_bench.core.errors import DynslamError, StudyError
+from dynslam_bench.tuning.blocks import Block, parse_blocks
+from dynslam_bench.tuning.design import design_of, fresh_starts, with_more_starts
+from dynslam_bench.tuning.splits import check_splits
+from dynslam_bench.tuning.study_file import StudySpec
+
+WALK = "synthetic/walking_xyz"
+
+
+def test_a_text_names_instances_lengths_and_starts() -> None:
+    blocks = parse_blocks(f"{WALK}@0-1,7?frames=80&offsets=0-4")
+    assert len(blocks) == 15
+    assert blocks[0] == Block(f"{WALK}@0?frames=80") and blocks[-1] == Block(f"{WALK}@7?frames=80", offset=4)
+    assert list(dict.fromkeys(block.scene for block in blocks)) == [f"{WALK}@0", f"{WALK}@1", f"{WALK}@7"]
+
+
+@pytest.mark.parametrize("text", [
+    "bonn/crowd[0:120]", "bonn/crowd[40:]?offsets=2,5&stride=2", "bonn/crowd?frames=120&degrade=blur:0.5,glare:0.2",
+    f"{WALK}@3[10:40]?frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
+])  # fmt: skip
+def test_what_a_block_prints_is_read_as_that_block(text: str) -> None:
+    blocks = parse_blocks(text)
+    assert blocks
+    for block in blocks:
+        assert parse_blocks(str(block)) == (block,)
+
+
+def test_parts_strides_and_degradation_reach_the_run() -> None:
+    (block,) = parse_blocks("bonn/crowd[20:120]?offsets=3&stride=2&degrade=blur:0.5&seeds=4")
+    run = block.run_spec("orb-slam2", threads=2)
+    assert (run.frames, run.offset, run.stride, run.seed, run.threads) == ((20, 120), 3, 2, 4, 2)
+    assert run.degrade == {"blur": 0.5} and run.frames_seen == (23, 120)
+    assert parse_blocks("bonn/crowd?frames=120")[0].frames == (0, 120)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("bonn/crowd[0:10", 'names no blocks.*write it as "bonn/crowd'),
+    ("bonn/crowd[9:3]", "9:3 is no range of frames"),
+    (f"{WALK}@5-2", "'5-2' of .* is neither a number nor a range"),
+    (f"{WALK}@1,0-2", "names a number twice"),
+    ("bonn/crowd?offset=3", "unknown option 'offset=3'.*offsets"),
+    ("bonn/crowd?stride=2&stride=3", "names stride twice"),
+    ("bonn/crowd?noise=3", "noise is a draw of rendered sequences only"),
+    ("bonn/crowd[0:9]?frames=3", "names its frames twice"),
+    ("bonn/crowd?degrade=blurr:0.3", "unknown degradation 'blurr'.*'blur'"),
+    ("bonn/crowd?degrade=blur:3", "'blur' is 3.0, expected a strength"),
+    ("bonn/crowd?degrade=blur:much", "strength 'much' of blur is no number"),
+])  # fmt: skip
+def test_what_cannot_be_read_is_one_clear_line(text: str, message: str) -> None:
+    with pytest.raises(DynslamError, match=message) as caught:
+        parse_blocks(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_blocks_are_measured_against_their_sequence(tmp_path: Path) -> None:
+    folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
+    assert len(Block(folder, (2, 10), offset=1, stride=3).open()) == 3
+    for block, message in (
+        (Block(folder, (0, 20)), r"takes the frames 0 to 19, but .* has 12 frames"),
+        (Block(folder, offset=11), "holds 1 frames, it needs 2"),
+    ):
+        with pytest.raises(StudyError, match=message):
+            block.open()
+    (Path(folder) / "groundtruth.txt").unlink()
+    with pytest.raises(StudyError, match="has no ground truth"):
+        Block(folder).open()
+
+
+def test_the_digest_names_the_content(tmp_path: Path) -> None:
+    folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
+    block = Block(folder, (0, 12), offset=2)
+    assert block.digest() == replace(block, frames=None).digest()
+    others = [replace(block, **change) for change in ({"offset": 1}, {"stride": 2}, {"frames": (0, 9)}, {"seed": 1})]
+    others.append(replace(block, degradation=(("blur", 0.5),)))
+    assert len({block.digest(), *(other.digest() for other in others)}) == 6
+
+
+def test_blocks_of_one_recording_are_apart_or_repeats(tmp_path: Path) -> None:
+    folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
+    one, later = Block(folder, (0, 6)), Block(folder, (6, 12))
+    assert check_splits("s", {"tune": [one, replace(one, offset=1), later]}) == []
+    for blocks, message in (
+        ([one, Block(folder, (4, 12))], "share 2 frames"),
+        ([one, one], "is named twice"),
+        ([Block(folder), Block(folder, (0, 12))], "are the same frames"),
+    ):
+        with pytest.raises(StudyError, match=message):
+            check_splits("s", {"tune": blocks})
+    with pytest.raises(StudyError, match=f"{re.escape(folder)}' held out are the same sequence"):
+        check_splits("s", {"tune": [one], "held_out": [later]})
+
+
+def test_the_default_runs_from_three_starts_and_the_choice_is_made_on_unseen_blocks(tmp_path: Path) -> None:
+    few = parse_blocks(f"{WALK}@0-3?frames=20&offsets=0,3")
+    assert sorted(block.offset for block in with_more_starts(few) if block.scene.endswith("@0")) == [0, 1, 3]
+    fresh = fresh_starts(few)
+    assert [block.offset for block in fresh[:2]] == [1, 2] and not {b.offset for b in fresh} & {0, 3}
+    spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}@0-3?frames=20",), recorded=())
+    design = design_of(spec)
+    assert {block.scene for block in design.confirm} == {block.scene for block in design.race}
+    many = design_of(spec.model_copy(update={"tune": (f"{WALK}@0-11?frames=20",)}))
+    confirm, race = ({block.scene for block in blocks} for blocks in (many.confirm, many.race))
+    assert len(confirm) == 4 and len(race) == 8 and not confirm & race
+    assert len({block.scene for block in many.race[:8]}) == 8, "a growing set takes one of each scene in turn"
+
+
+def test_a_recording_that_is_here_is_in_the_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tune = (str(toy_tracker.make_sequence(tmp_path / "a", 0.7)),)
+    root = tmp_path / "data"
+    toy_tracker.make_sequence(root / "bonn" / "rgbd_bonn_crowd", 0.2)
+    recorded = design_of(StudySpec(name="s", tune=tune, data_root=str(root))).recorded
+    assert [(block.sequence, block.offset) for block in recorded] == [("bonn/crowd", offset) for offset in range(4)]
+    assert design_of(StudySpec(name="s", tune=tune, recorded=(), data_root=str(root))).recorded == ()
+    assert design_of(StudySpec(name="s", tune=tune, data_root=str(tmp_path / "empty"))).recorded == ()

@@ -1,0 +1,116 @@
+"""What users want: values by hand, speed at shown equal accuracy, a front of presets that hold tuned settings alone."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from simulated import SimulatedTuner, make_spec
+
+from dynslam_bench.cli.options import read_settings
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.tuning import Block, Outcome, finish, read_preset_text, write_page
+from dynslam_bench.tuning.objectives import OBJECTIVES, find_objective, own_objective, together
+
+PLAIN = [Block(f"synthetic/walking_xyz@{scene}") for scene in range(4)]
+BLURRED = replace(PLAIN[0], degradation=(("blur", 0.5),))
+
+
+def outcome(block: Block, ate: float, time: float = 0.03, coverage: float = 1.0) -> Outcome:
+    return Outcome(block, "", ate, coverage, time, time, 1.0)
+
+
+def test_objectives_are_logarithms_of_ratios_by_hand() -> None:
+    default = {block: outcome(block, 0.02) for block in [*PLAIN, BLURRED]}
+    tuned = {block: outcome(block, 0.01 * (1 + scene), 0.015, 0.98) for scene, block in enumerate(PLAIN)}
+    values = {name: each.value(tuned, default) for name, each in OBJECTIVES.items() if name != "robustness"}
+    assert values["accuracy"] == pytest.approx(sum(math.log(n / 2) for n in (1, 2, 3, 4)) / 4)
+    assert values["speed"] == pytest.approx(math.log(0.5))
+    assert values["worst"] == pytest.approx(math.log(2)), "the worst of four scenes"
+    assert values["coverage"] == pytest.approx(math.log(3)), "2 % more lost, beside a floor of 1 %"
+    blurred = {**tuned, BLURRED: outcome(BLURRED, 0.06)}
+    assert OBJECTIVES["robustness"].value(blurred, default) == pytest.approx(math.log(3))
+    balance = together([OBJECTIVES["accuracy"], OBJECTIVES["speed"]])
+    assert balance.value(tuned, default) == pytest.approx((values["accuracy"] + values["speed"]) / 2)
+
+
+def test_what_cannot_be_an_objective_is_one_clear_line() -> None:
+    default = {block: outcome(block, 0.02) for block in PLAIN}
+    with pytest.raises(StudyError, match=r"'robustness' counts degraded blocks alone, but none .*degrade=blur:0.5"):
+        OBJECTIVES["robustness"].value(default, default)
+    with pytest.raises(StudyError, match=r"unknown objective 'sped'.*'speed'"):
+        find_objective("sped")
+
+    def nothing_at_all(run: Outcome) -> float:
+        return 0.0
+
+    with pytest.raises(StudyError, match=r"'nothing_at_all' gives 0 on block 'synthetic/walking_xyz@0\?offsets=0'"):
+        own_objective(nothing_at_all).value(default, default)
+
+
+class TimedTuner(SimulatedTuner):
+    """`wobble` takes time and leaves the poses alone; a smaller `gain` saves time and may cost accuracy."""
+
+    price = 0.0
+
+    def evaluate(
+        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
+    ) -> dict[Block, Outcome]:
+        gain, wobble = float(settings.get("gain", 1.5)), int(settings.get("wobble", 2))
+        found = super().evaluate({"gain": gain}, blocks, jobs=jobs, cache=cache)
+        time = 0.02 * (0.5 + 0.25 * wobble) * gain
+        cost = math.exp(self.price * max(0.0, 1.5 - gain))
+        return {block: replace(each, ate_m=each.ate_m * cost, processor_s=time) for block, each in found.items()}
+
+
+def spec(objectives: list[str], include: list[str], **changes: object):
+    return make_spec(objectives=objectives, space={"include": include}, trials=14, top=3, **changes)
+
+
+def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
+    tuner = TimedTuner(spec(["speed"], ["wobble"]), tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # a constraint is told once, when it is final
+        tuner.run()
+    summary = finish(tuner)
+    chosen = summary.candidates[0]
+    assert summary.improves and chosen.params == {"wobble": 0}
+    assert chosen.held_out is not None and chosen.held_out.ratio == pytest.approx(0.5)
+    assert chosen.on_held_out["accuracy"].ratio == pytest.approx(1.0)
+    assert "50.0 % less processor time" in summary.conclusion and "ATE x 1.000" in summary.conclusion
+
+
+def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None:
+    tuner = TimedTuner(spec(["speed"], ["gain"]), tmp_path)
+    tuner.price = 0.6
+    tuner.run()
+    summary = finish(tuner)
+    assert summary.chosen is None and not summary.improves
+    assert "no trial could be shown to be as accurate" in summary.conclusion, summary.conclusion
+    assert "asked for: below 1.05" in summary.conclusion
+    assert read_settings(tuner.folder / "best.toml") == {}, "the default"
+
+
+@pytest.mark.parametrize("objectives", [["accuracy", "speed"], ["speed", "accuracy"]])
+def test_a_front_gives_three_presets_in_either_order(objectives: list[str], tmp_path: Path) -> None:
+    study = spec(objectives, ["wobble"]).model_copy(update={"trials": 20})
+    study = study.model_copy(update={"space": study.space.model_copy(update={"fixed": {"mode": "fine"}})})
+    tuner = TimedTuner(study, tmp_path)
+    tuner.run()
+    summary = finish(tuner)
+    assert set(summary.picks) == {"best", "fast", "balanced", "accurate"}
+    assert summary.picks["fast"] is not None and summary.picks["accurate"] is None, "no wobble is more accurate"
+    presets = {name: read_settings(tuner.folder / f"{name}.toml") for name in summary.picks}
+    assert presets["fast"] == {"wobble": 0} == presets["balanced"] and presets["accurate"] == {}
+    text = read_preset_text(study, tmp_path, "fast")
+    assert "mode" not in presets["fast"] and 'Fixed in that study, not part of these settings: mode = "fine"' in text
+    assert "processor time x 0.500" in text and "Judged on" in text
+    page = write_page(tuner, summary).read_text()
+    assert "x real time" not in page and "real-time factor" not in page
+    with pytest.raises(StudyError, match=r"no preset 'fats'.*'fast'"):
+        read_preset_text(study, tmp_path, "fats")

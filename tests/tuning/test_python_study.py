@@ -1,0 +1,127 @@
+"""Studies from Python: own objective, sampler, callbacks, a preset to start from; old files; mistakes in one line."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import optuna
+import pytest
+from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, _design, valley
+
+from dynslam_bench.core.errors import DynslamError, StudyError
+from dynslam_bench.tuning import Block, Outcome, Study, StudySpec, Tuner, read_study
+from dynslam_bench.tuning.old_form import converted
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
+FIELDS: dict[str, Any] = {
+    "name": "py", "tracker": TRACKER, "tune": [TUNE], "held_out": [HELD_OUT], "recorded": (), "trials": 8,
+    "space": {"include": ["gain", "wobble"]}, "min_coverage": None, "pilot": False,
+}  # fmt: skip
+
+
+class DrawnTuner(SimulatedTuner):
+    """A study whose runs are drawn, made as `Study` makes one."""
+
+    def __init__(self, spec: StudySpec, results: Path, **given: Any) -> None:
+        self.effect, self.noise_seed, self.runs = valley, 0, 0
+        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: _design((TUNE,), (HELD_OUT,))):
+            Tuner.__init__(self, spec, results, **given)
+
+
+@pytest.fixture(autouse=True)
+def drawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    if request.node.name != "test_the_example_runs_as_it_stands":
+        monkeypatch.setattr("dynslam_bench.tuning.python_study.Tuner", DrawnTuner)
+
+
+def steady(run: Outcome) -> float:
+    return run.ate_m
+
+
+def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
+    (tmp_path / "preset.toml").write_text("gain = 0.9\n")
+    seen: list[int] = []
+    study = Study(
+        **FIELDS, results=tmp_path, objective=steady, sampler=optuna.samplers.RandomSampler(seed=3),
+        callbacks=[lambda study, trial: seen.append(trial.number)], start=[tmp_path / "preset.toml", {"wobble": 0}],
+    ).run()  # fmt: skip
+    trials = study.study.get_trials()
+    assert [trial.params for trial in trials[:3]] == [
+        {"gain": 1.5, "wobble": 2}, {"gain": 0.9, "wobble": 2}, {"gain": 1.5, "wobble": 0},
+    ]  # fmt: skip
+    assert sorted(seen) == list(range(8)) and len(study.frame()) == 8
+    assert study.spec.objectives == ("steady",) and isinstance(study.study.sampler, optuna.samplers.RandomSampler)
+    summary = study.finish()
+    assert summary.candidates[0].confirm is not None and summary.candidates[0].confirm.what == "steady"
+    again = Study(**FIELDS, results=tmp_path, objective=steady, start=[{"wobble": 0}])
+    assert len(again.run().study.get_trials()) == 8, "resumed, and nothing enqueued twice"
+    looked = Study.open(tmp_path / "studies" / "py")
+    assert len(looked.frame()) == 8 and optuna.load_study(study_name="py", storage=study.study._storage)
+    with pytest.raises(StudyError, match=r"opened to be looked at.*Study\(\.\.\.\)"):
+        looked.run()
+
+
+def test_blocks_may_be_given_as_blocks(tmp_path: Path) -> None:
+    block = Block("synthetic/walking_xyz@3?frames=20", offset=2)
+    study = Study(**{**FIELDS, "tune": [block, TUNE]}, results=tmp_path)
+    assert study.spec.tune == ("synthetic/walking_xyz@3?frames=20&offsets=2", TUNE)
+    assert study.spec.blocks(study.spec.tune[0]) == [block]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"start": [{"gian": 1.0}]}, "sets 'gian', which there is not.*'gain'"),
+        ({"start": [{"mode": "crash"}]}, "sets mode = 'crash', but the study holds it at 'fine'"),
+        ({"start": [{"gain": 99.0}]}, "sets gain = 99.0, outside the range"),
+        ({"objective": "sped"}, "unknown objective 'sped'.*'speed'"),
+        ({"trails": 3}, "the study: unknown key 'trails'.*'trials'"),
+        ({"start": ["nowhere.toml"]}, "nowhere.toml"),
+    ],
+)
+def test_mistakes_are_one_clear_line(given: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(DynslamError, match=message) as caught:
+        Study(**{**FIELDS, **given}, results=tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_study_file_of_the_old_form_is_converted_with_a_note(tmp_path: Path) -> None:
+    path = tmp_path / "old.toml"
+    path.write_text(f'tune = ["{TUNE}"]\npruner = "median"\nobjectives = ["accuracy", "speed"]\nseeds = [0, 1]\n')
+    notes: list[str] = []
+    spec = read_study(path, notes.append)
+    assert spec.race == "halving" and spec.seeds == (0, 1) and spec.objectives == ("accuracy", "speed")
+    assert len(notes) == 2 and 'pruner = "median" became race = "halving"' in notes[0] and "processor time" in notes[1]
+    assert read_study(path) == spec, "without anybody to tell"
+    path.write_text(f'tune = ["{TUNE}"]\npruner = "best"\n')
+    with pytest.raises(StudyError, match="race: Input should be 'halving'"):
+        read_study(path)
+    assert converted({"tune": ["a"], "race": "none"}) == ({"tune": ["a"], "race": "none"}, []), "today's stays"
+
+
+def test_a_stored_study_of_the_old_form_can_be_looked_at(tmp_path: Path) -> None:
+    Study(**FIELDS, results=tmp_path).run()
+    stored = tmp_path / "studies" / "py" / "study.json"
+    values = json.loads(stored.read_text())
+    for key in ("race", "confirm", "recorded", "ate_margin", "pilot"):
+        del values[key]
+    stored.write_text(json.dumps({**values, "pruner": "wilcoxon"}))
+    assert Study.open(stored.parent).spec.race == "wilcoxon"
+
+
+def test_all_trials_infeasible_keeps_the_default_and_says_so(tmp_path: Path) -> None:
+    study = Study(**{**FIELDS, "min_fps": 1e6}, results=tmp_path).run()
+    summary = study.finish()
+    assert summary.chosen is None and not summary.improves
+    assert "violates a constraint when run again, as do all" in summary.conclusion
+
+
+def test_the_example_runs_as_it_stands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(EXAMPLE))["main"](str(tmp_path), 8)
+    told = capsys.readouterr().out
+    assert "trial 0: {'frames': 5}" in told and "trial 1: {'frames': 2}" in told
+    assert "default" in told.splitlines()[-1], "an honest conclusion"

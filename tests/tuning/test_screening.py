@@ -1,0 +1,89 @@
+"""Screening: what matters is kept, what only stirs the chaos is not, what does nothing is said to be dead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import SimulatedTuner, make_spec
+from toy_tracker import ToySettings
+
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.settings import flatten, parameters
+from dynslam_bench.tuning import Block, Outcome, screen_study
+from dynslam_bench.tuning.evaluate import BlockFailedError
+from dynslam_bench.tuning.screening import KEPT, size_of
+from dynslam_bench.tuning.screening_plan import live, plan, stepped
+from dynslam_bench.tuning.starting import SCREENING_FILE
+
+SPACE = parameters(ToySettings)
+BASE = flatten(ToySettings())
+
+
+def steep(settings: Mapping[str, Any]) -> float:
+    """A strong effect of the gain; none of the rest."""
+    return 2.0 * abs(math.log(float(settings.get("gain", 1.5))))
+
+
+class ScreenedTuner(SimulatedTuner):
+    """The error depends on the gain alone, the time on the wobble; everything but the mode stirs the chaos."""
+
+    def evaluate(
+        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
+    ) -> dict[Block, Outcome]:
+        if settings.get("mode") == "crash":
+            raise BlockFailedError("the toy broke")
+        stirring = {key: value for key, value in settings.items() if key != "mode"}
+        found = super().evaluate(stirring, blocks, jobs=jobs, cache=cache)
+        return {block: replace(each, processor_s=0.02 + 0.01 * settings["wobble"]) for block, each in found.items()}
+
+
+def test_what_matters_is_kept_and_said_in_what(tmp_path: Path) -> None:
+    spec = make_spec(space={"include": ["gain", "wobble"]}, objectives=["accuracy", "speed"])
+    tuner = ScreenedTuner(spec, tmp_path, effect=steep)
+    done: list[tuple[int, int]] = []
+    found = screen_study(tuner, blocks=8, on_done=lambda number, total: done.append((number, total)))
+    assert found.kept == ["wobble", "gain"] or found.kept == ["gain", "wobble"]
+    assert {effect.name: effect.objective for effect in found.effects} == {"gain": "ATE", "wobble": "processor time"}
+    assert all(effect.low <= effect.size <= effect.high for effect in found.effects)
+    assert found.runs == 8 * 2 * 3 == tuner.runs and done[-1] == (6, 6)
+    assert (tuner.folder / SCREENING_FILE).is_file() and len(found.kept) <= KEPT
+
+
+def test_a_setting_that_breaks_runs_is_named_and_the_rest_goes_on(tmp_path: Path) -> None:
+    tuner = ScreenedTuner(make_spec(space={"include": ["gain", "wobble", "mode"]}), tmp_path, effect=steep)
+    found = screen_study(tuner, blocks=8)
+    assert found.failed == {"mode": "the toy broke"} and "gain" in found.kept
+    assert "mode" not in {effect.name for effect in found.effects}
+    with pytest.raises(StudyError, match="screening on 1 block cannot tell an effect from chance"):
+        screen_study(tuner, blocks=1)
+
+
+def test_chaos_alone_is_hardly_ever_kept_and_a_dead_setting_never() -> None:
+    rng = np.random.default_rng(0)
+    kept = [size_of(rng.normal(0, 0.31, (2, 6)))[1] > 0 for _ in range(2000)]
+    assert np.mean(kept) < 0.05
+    felt = [size_of(rng.normal(0.6, 0.31, (2, 6)))[1] > 0 for _ in range(500)]
+    assert np.mean(felt) > 0.8
+    sizes = [size_of(rng.normal(0.3, 0.31, (2, 6)))[0] for _ in range(2000)]
+    assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(0.3, abs=0.02), "free of the chaos' own square"
+    assert size_of(np.zeros((2, 6))) == (0.0, 0.0, 0.0)
+
+
+def test_points_and_steps_stay_in_the_ranges_and_obey_conditions() -> None:
+    usable = live(SPACE, BASE)
+    assert [parameter.name for parameter in usable] == ["gain", "wobble", "mode"], "anger asks for another mode"
+    for point in plan(usable, BASE, 6, 0):
+        for parameter in usable:
+            before, after = point.base[parameter.name], point.steps[parameter.name]
+            assert before != after
+            if parameter.low is not None:
+                assert parameter.low <= before <= parameter.high and parameter.low <= after <= parameter.high
+    rng = np.random.default_rng(0)
+    gain = usable[0]
+    assert math.log(stepped(gain, 0.2, rng) / 0.2) == pytest.approx(math.log(3.0 / 0.2) / 3), "a third of the range"

@@ -1,0 +1,148 @@
+"""What a configuration is worth on blocks: each is a run of the run store, made once, in a process of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.runs import RunRecord, RunStore, run_many, score
+
+from .blocks import Block
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One configuration on one block.
+
+    Attributes:
+        block: Where.
+        run_id: The run.
+        ate_m: ATE RMSE in metres, lost frames held at the last pose.
+        coverage: Share of frames that were tracked.
+        frame_s: Mean seconds a frame, segmentation included.
+        processor_s: Mean processor seconds of that, all threads together; `frame_s` where the work is done elsewhere (a
+            foreign program, a GPU). Unlike `frame_s` it hardly depends on what else the machine does.
+        rtf: Real-time factor: duration of the block's frames over the time they took.
+    """
+
+    block: Block
+    run_id: str
+    ate_m: float
+    coverage: float
+    frame_s: float
+    processor_s: float
+    rtf: float
+
+
+FOREIGN = "transfer"
+"""Stage that only trackers in another program have."""
+
+
+class BlockFailedError(StudyError):
+    """A run did not come to its end; carries the block, the run's status and the reason."""
+
+
+class CancelledError(Exception):
+    """The caller wanted no more of it."""
+
+
+def evaluate(
+    tracker: str,
+    settings: Mapping[str, Any],
+    blocks: Iterable[Block],
+    *,
+    results: RunStore | str | Path = "results",
+    jobs: int = 1,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    threads: int = 1,
+    cache: bool = False,
+    data_root: str | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> dict[Block, Outcome]:
+    """Run a configuration on blocks; runs that are stored are taken from there.
+
+    Args:
+        tracker: Id, ``module:Attr`` or ``file.py:Attr``.
+        settings: Overrides of its settings, dotted name to value.
+        blocks: Where; in the order in which they are begun.
+        results: The results folder, or a store.
+        jobs: Runs at a time.
+        protocol: Protocol of the errors; lost frames are always held at the last pose.
+        threads: Threads of a run.
+        cache: Whether runs use the stage cache; times are then those of when its entries were made.
+        data_root: Folder of the recorded sequences.
+        cancelled: Asked many times a second; True ends the runs at once.
+
+    Returns:
+        The outcome on each block, in their order.
+
+    Raises:
+        BlockFailedError: A run crashed, timed out, ran out of memory or was invalid; the others are not waited for.
+        CancelledError: `cancelled` said so.
+        DynslamError: Tracker, settings or a block are unknown or unfit; nothing ran.
+    """
+    store = results if isinstance(results, RunStore) else RunStore(results)
+    held, blocks = held_protocol(protocol), list(blocks)
+    stop = [False]
+
+    def ended() -> bool:
+        return stop[0] or (cancelled is not None and cancelled())
+
+    def one(block: Block) -> Outcome:
+        spec = block.run_spec(tracker, settings=dict(settings), threads=threads, cache=cache, data_root=data_root)
+        if ended():
+            raise CancelledError(str(block))
+        (record,) = run_many([spec], results=store, protocol=held, cancelled=ended)
+        if record.status == "stopped":
+            raise CancelledError(str(block))
+        if record.failed:
+            raise BlockFailedError(f"{block}: {record.status}: {record.reason}")
+        return outcome(store, record, block, held, data_root)
+
+    with ThreadPoolExecutor(max(1, min(jobs, len(blocks))), thread_name_prefix="dynslam-block") as pool:
+        try:
+            return dict(zip(blocks, pool.map(one, blocks), strict=True))
+        except BaseException:
+            stop[0] = True
+            raise
+
+
+def outcome(store: RunStore, record: RunRecord, block: Block, protocol: Protocol, data_root: str | None) -> Outcome:
+    """What a stored run amounts to; one in which nothing was tracked counts as never having moved."""
+    evaluation = score(store, record, protocol).online
+    ate = never_moved_m(block, data_root) if evaluation is None else float(evaluation.metrics["ate_rmse_m"])
+    total = record.timings["total"].mean_s
+    period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
+    return Outcome(block, record.run_id, ate, record.coverage, total, processor_seconds(record), period / total)
+
+
+def processor_seconds(record: RunRecord) -> float:
+    """Mean processor seconds a frame of a run; its frame time where the work is not that of its own process."""
+    own = record.timings.get("processor")
+    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
+    return record.timings["total"].mean_s if own is None or elsewhere else own.mean_s
+
+
+def held_protocol(protocol: Protocol | str) -> Protocol:
+    """The protocol with lost frames held at the last pose, so that losing track never pays."""
+    found = get_protocol(protocol)
+    if found.lost_frames == "hold":
+        return found
+    return found.model_copy(update={"id": f"{found.id}+hold", "lost_frames": "hold"})
+
+
+@lru_cache(maxsize=256)
+def never_moved_m(block: Block, data_root: str | None) -> float:
+    """ATE RMSE in metres of a camera that never moves on a block, from the ground truth of its frames alone."""
+    sequence: Any = block.open(data_root)
+    truth, stamps = sequence.ground_truth, sequence.timestamps
+    positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+    return float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
