@@ -132,19 +132,16 @@ def fine_levels(
         coarse: uint16 ``[quarter rows, >= 8 quarter columns]``, receives the means of 2 x 2 histograms.
     """
     rows, columns = half.shape[0] - 2 * border, half.shape[1] - 2 * border
-    levels = len(blurs)
-    length = 32 * ((8 * columns + 31) // 32)
-    pitch = length + SPILL
+    levels, length = len(blurs), 32 * ((8 * columns + 31) // 32)
+    pitch, sum_pitch = length + SPILL, columns + 2 + SPILL
     rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
     line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
-    sum_pitch = columns + 2 + SPILL
     sums = np.zeros(4 * sum_pitch, dtype=np.uint16)
     top, bottom = 2 * start, min(2 * stop, rows)
     reach = np.zeros(levels + 1, dtype=np.int64)  # rows that later levels need beyond the stripe
     for level in range(levels - 1, -1, -1):
         reach[level] = reach[level + 1] + (blurs[level, 0] // 2) * blurs[level, 1]
-    first = max(top - reach[0], 0)
-    summed = max(first - 1, 0)
+    first, summed = max(top - reach[0], 0), max(top - reach[0] - 1, 0)
     for row in range(first, bottom + reach[0]):
         if row < min(bottom + reach[0], rows):
             while summed <= min(row + 1, rows - 1):
