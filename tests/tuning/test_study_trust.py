@@ -51,6 +51,12 @@ def test_nothing_but_its_own_classes_is_restored(guarded: Path, name: bytes) -> 
         optuna_cmaes.pickle.loads(name)
 
 
+def test_a_few_bytes_cost_no_gigabytes(guarded: Path) -> None:
+    """The number of a stored object is the length of the table that Python makes for them."""
+    with pytest.raises(StudyError, match="it asks for room for 680813941 objects"):
+        optuna_cmaes.pickle.loads(b"\x80\x04Nr" + (680813941).to_bytes(4, "little") + b".")
+
+
 def test_its_own_state_comes_back(guarded: Path) -> None:
     cmaes = pytest.importorskip("cmaes")
     made = cmaes.CMA(mean=np.zeros(2), sigma=1.0, seed=1)
