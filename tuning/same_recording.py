@@ -43,12 +43,14 @@ def same_recording(one: Sequence, other: Sequence) -> bool:
 def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
     shapes = [_shapes(each) for each in (one, other)]
     if len(shapes[0]) and len(shapes[1]):
-        apart, likest = map(np.asarray, cKDTree(shapes[1]).query(shapes[0]))
-        apart = apart / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+        found = cKDTree(shapes[1]).query(shapes[0])
+        likest = np.asarray(found[1], np.intp)
+        apart = np.asarray(found[0], np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
         yield from ((int(here), int(likest[here])) for here in np.argsort(apart, kind="stable")[:_PAIRS])
     if is_rendered(one) or is_rendered(other):
         return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
-    stamps, twins = (np.round(each.timestamps, 6) for each in (one, other))
+    stamps: NDArray[np.float64] = np.round(one.timestamps, 6)
+    twins: NDArray[np.float64] = np.round(other.timestamps, 6)
     _, here, there = np.intersect1d(stamps, twins, assume_unique=True, return_indices=True)
     spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
     yield from ((int(here[k]), int(there[k])) for k in spread)
