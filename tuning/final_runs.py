@@ -58,9 +58,8 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         note(f"trial {trial_number} on the held-out blocks")
         place = next(index for index, each in enumerate(candidates) if each.trial == trial_number)
         candidates[place] = _judged(tuner, candidates[place], jobs)
-    if chosen is not None:
-        chosen = next(each for each in candidates if each.trial == chosen.trial)
-        candidates = [chosen, *(each for each in candidates if each is not chosen)]
+    candidates.sort(key=lambda each: chosen is None or each.trial != chosen.trial)
+    chosen = None if chosen is None else candidates[0]
     names = [parameter.name for parameter in tuner.space]
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     notes = list(design.notes)
