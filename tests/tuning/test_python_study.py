@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import optuna
 import pytest
-from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, _design, valley
+from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, simulated_design, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.tuning import Block, Outcome, Study, StudySpec, Tuner, read_study
@@ -28,7 +28,7 @@ class DrawnTuner(SimulatedTuner):
 
     def __init__(self, spec: StudySpec, results: Path, **given: Any) -> None:
         self.effect, self.noise_seed, self.runs = valley, 0, 0
-        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: _design((TUNE,), (HELD_OUT,))):
+        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
             Tuner.__init__(self, spec, results, **given)
 
 
