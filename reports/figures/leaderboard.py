@@ -1,4 +1,4 @@
-"""The report's figures as plotly-like specifications (plain dictionaries: data and layout), drawn by the page itself."""
+"""The report's figures as plotly-like specifications (plain data and layout), drawn by the page itself."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..model.board import Board
 
 Figure = dict[str, Any]
-"""A specification in the words of plotly, ``data`` and ``layout``; `html/templates/chart.js` draws what is used of it."""
+"""``data`` and ``layout`` in the words of plotly; `reports/html/templates/chart.js` draws what is used of them."""
 
 COLOURS = (
     "#1f6fb4", "#d9542b", "#2a9d6f", "#8a5cc2", "#c9970c", "#3aa6c9", "#c2427f", "#6b7a1f", "#8c564b", "#4b5fd6",

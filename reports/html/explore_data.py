@@ -25,7 +25,7 @@ FEWEST_FRAMES = 5
 
 
 class FrameSums:
-    """What the exploring part shows of frames: quartiles of a run's errors, and errors by the share of dynamic pixels."""
+    """What the exploring part shows of frames: quartiles of a run's errors, and errors by dynamic share."""
 
     def __init__(self) -> None:
         self.quartiles: dict[str, list[float | None]] = {}

@@ -37,11 +37,6 @@ def write_side(output: Path, name: str, value: Any) -> Path:
     return path
 
 
-def packed(values: ArrayLike) -> list[float | str]:
-    """One series of numbers ``[N]`` as `packed_rows` writes it."""
-    return packed_rows([values])[0]
-
-
 def packed_rows(rows: ArrayLike) -> list[list[float | str]]:
     """Series of numbers in 16 bits each between their smallest and their largest; what is no number stays missing.
 

@@ -11,6 +11,15 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 EXECUTABLE = next((path for name in NAMES if (path := shutil.which(name))), None)
+HELPERS = """
+globalThis.one = (selector) => document.querySelector(selector);
+globalThis.all = (selector) => [...document.querySelectorAll(selector)];
+globalThis.choose = (select) => {
+  select.selectedIndex = select.options.length - 1;
+  select.dispatchEvent(new Event("change"));
+};
+globalThis.slide = (input, value) => { input.value = value; input.dispatchEvent(new Event("input")); };
+"""
 needs_browser = pytest.mark.skipif(EXECUTABLE is None, reason=f"no browser is installed: {', '.join(NAMES)}")
 
 
@@ -100,6 +109,7 @@ class Browser:
         self.call("Page.navigate", url=path.absolute().as_uri() + anchor)
         while "Page.loadEventFired" not in self._events:
             self._next()
+        self.run(HELPERS)
         self.settle()
 
     def size(self, width, height=900):

@@ -1,4 +1,4 @@
-"""The exploring table and the pages of runs in a real browser: filters, switches, the view in the address, the slider."""
+"""The exploring table and the pages of runs in a browser: filters, switches, the view in the address, the slider."""
 
 from reports_browser import needs_browser
 from test_reports_browser import browser, open_page, report, run_of
@@ -6,20 +6,18 @@ from test_reports_browser import browser, open_page, report, run_of
 __all__ = ["browser", "report"]  # fixtures
 
 pytestmark = needs_browser
-ROWS = "[...document.querySelectorAll('#explore-table tbody tr')].map((row) => row.cells[0].textContent)"
-HEADS = "[...document.querySelectorAll('#explore-table thead th')].map((head) => head.textContent)"
-CELL = "document.querySelector('#explore-table tbody tr td:last-child a').textContent"
+ROWS = "all('#explore-table tbody tr').map((row) => row.cells[0].textContent)"
+HEADS = "all('#explore-table thead th').map((head) => head.textContent)"
+CELL = "one('#explore-table tbody tr td:last-child a').textContent"
 
 
 def explore(browser, report, anchor=""):
     browser.open(report.html, anchor=anchor)
-    browser.until("document.querySelector('#explore-table tbody tr')")
+    browser.until("one('#explore-table tbody tr')")
 
 
 def press(browser, place, text):
-    browser.run(
-        f"[...document.querySelectorAll('#{place} button')].find((each) => each.textContent === '{text}').click()"
-    )
+    browser.run(f"all('#{place} button').find((each) => each.textContent === '{text}').click()")
 
 
 def test_search_tags_and_ranked_only(browser, report):
@@ -43,26 +41,27 @@ def test_the_view_is_in_the_address(browser, report):
     explore(browser, report)
     press(browser, "explore-kind", "RPE")
     press(browser, "explore-scale", "ratio")
-    browser.run("document.querySelectorAll('#explore-columns input')[1].click()")
-    wanted = browser.run("[location.hash, document.querySelector('#explore-table').innerText]")
+    browser.run("all('#explore-columns input')[1].click()")
+    wanted = browser.run("[location.hash, one('#explore-table').innerText]")
     assert "kind=rpe" in wanted[0] and "scale=ratio" in wanted[0] and "extra=" in wanted[0]
     explore(browser, report, wanted[0])
-    assert browser.run("document.querySelector('#explore-table').innerText") == wanted[1]
+    assert browser.run("one('#explore-table').innerText") == wanted[1]
     assert "ATE ratio" in browser.run(HEADS)
-    browser.run("document.querySelector('nav a[href=\"#s-errors\"]').click()")
+    browser.run("one('nav a[href=\"#s-errors\"]').click()")
     assert browser.run("location.hash").startswith("#s-errors&") and "kind=rpe" in browser.run("location.hash")
 
 
 def test_numbers_are_those_of_the_table_below(browser, report):
     explore(browser, report)
-    name = browser.run("document.querySelector('#explore-table tbody tr').cells[0].textContent")
-    shown = browser.run("Object.fromEntries([...document.querySelector('#explore-table tbody tr').cells].slice(3)"
-                        ".map((cell, at) => [document.querySelectorAll('#explore-table thead th')[at + 3].textContent,"
+    name = browser.run("one('#explore-table tbody tr').cells[0].textContent")
+    shown = browser.run("Object.fromEntries([...one('#explore-table tbody tr').cells].slice(3)"
+                        ".map((cell, at) => [all('#explore-table thead th')[at + 3].textContent,"
                         " cell.querySelector('a')?.textContent ?? cell.textContent]))")  # fmt: skip
     below = browser.run(f"""(() => {{
-      const table = document.querySelector("#per_sequence"), heads = [...table.tHead.rows].at(-1).cells;
+      const table = one("#per_sequence"), heads = [...table.tHead.rows].at(-1).cells;
       const row = [...table.tBodies[0].rows].find((each) => each.cells[0].textContent.trim() === {name!r});
-      return Object.fromEntries([...row.cells].slice(1).map((cell, at) => [heads[at + 1].textContent, cell.firstChild.textContent]));
+      const cells = [...row.cells].slice(1);
+      return Object.fromEntries(cells.map((cell, at) => [heads[at + 1].textContent, cell.firstChild.textContent]));
     }})()""")
     assert shown == below and len(shown) == 5
 
@@ -70,58 +69,50 @@ def test_numbers_are_those_of_the_table_below(browser, report):
 def test_a_failure_is_hatched_says_how_and_is_never_best(browser, report):
     explore(browser, report)
     failed = browser.run(
-        "[...document.querySelectorAll('#explore-table tbody small a')].filter((each) => each.textContent === '✕').map((each) => each.title)"
+        "all('#explore-table tbody small a').filter((each) => each.textContent === '✕').map((each) => each.title)"
     )
     assert failed == ["seed 1, crashed at 30/120"]
-    best = browser.run(
-        "[...document.querySelectorAll('#explore-table .best')].map((cell) => cell.parentElement.cells[0].textContent)"
-    )
+    best = browser.run("all('#explore-table .best').map((cell) => cell.parentElement.cells[0].textContent)")
     assert best and not any("DS-SLAM" in name for name in best)
 
 
 def test_a_cell_leads_to_its_run_and_the_run_to_its_like(browser, report):
     explore(browser, report)
-    link = browser.run("document.querySelector('#explore-table td a').href")
+    link = browser.run("one('#explore-table td a').href")
     browser.open(report.run, anchor="#" + link.partition("#")[2])
-    browser.until("document.querySelector('.card')")
+    browser.until("one('.card')")
     assert "DynaSLAM" in browser.run("document.title") and browser.faults == []
-    browser.run(
-        "(() => { const select = document.querySelectorAll('#run-choice select')[0]; select.selectedIndex = select.options.length - 1; select.dispatchEvent(new Event('change')); })()"
-    )
+    browser.run("choose(one('#run-choice select'))")
     browser.until("!document.title.includes('DynaSLAM')")
-    assert browser.run("document.querySelectorAll('.card').length") >= 4 and browser.faults == []
+    assert browser.run("all('.card').length") >= 4 and browser.faults == []
 
 
 def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
     open_page(browser, report, "run", 1400)
-    assert browser.run("document.querySelector('h1').textContent") == "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} on toy"
+    assert browser.run("one('h1').textContent") == "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} on toy"
     for figure in ("over-time", "poses", "spread", "stage-stack"):
-        browser.until(f"document.querySelector('#{figure} svg .line, #{figure} svg .bar')")
-    text = browser.run("document.querySelector('main').innerText")
+        browser.until(f"one('#{figure} svg .line, #{figure} svg .bar')")
+    text = browser.run("one('main').innerText")
     assert "dynslam-bench run ours" in text and "a log" in text and "20 of 50 features culled" in text
-    assert "image that shows people (%)" in browser.run("document.querySelector('#over-time svg').textContent")
-    gaps = browser.run(
-        "document.querySelector('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1"
-    )
+    assert "image that shows people (%)" in browser.run("one('#over-time svg').textContent")
+    gaps = browser.run("one('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1")
     assert gaps == 2  # the lost frame breaks the line
 
 
 def test_the_slider_moves_image_track_and_cursor(browser, report):
     open_page(browser, report, "run", 1400)
-    state = "[document.querySelector('#looks .caption').textContent, document.querySelector('#over-time .cursor').getAttribute('d'), document.querySelector('#looks canvas').toDataURL()]"
-    browser.until("document.querySelector('#over-time .cursor')")
+    state = "[one('#looks .caption').textContent, one('#over-time .cursor').outerHTML]"
+    browser.until("one('#over-time .cursor')")
     last = browser.run(state)
-    browser.run(
-        "(() => { const slider = document.querySelector('#looks input[type=range]'); slider.value = 0; slider.dispatchEvent(new Event('input')); })()"
-    )
+    browser.run("slide(one('#looks input[type=range]'), 0)")
     browser.settle()
     first = browser.run(state)
     assert "frame 0" in first[0] and "frame 39" in last[0]
-    assert all(a != b for a, b in zip(first, last, strict=True))
-    compare = "document.querySelectorAll('#frames .view')[document.querySelectorAll('#frames .view').length - 1].style.clipPath"
-    browser.run(
-        "(() => { const slider = [...document.querySelectorAll('#frames input[type=range]')].at(-1); slider.value = 80; slider.dispatchEvent(new Event('input')); })()"
-    )
+    assert first[1] != last[1]
+    shown = {url.rpartition("/")[2] for url in browser.fetched if "/frames/" in url}
+    assert {"0.webp", "39.webp"} <= shown
+    compare = "all('#frames .view')[all('#frames .view').length - 1].style.clipPath"
+    browser.run("slide(all('#frames input[type=range]').at(-1), 80)")
     assert "80%" in browser.run(compare)
 
 
@@ -132,36 +123,35 @@ def test_error_against_dynamic_pixels_rises_as_it_was_made(browser, report):
     )
     assert len(figure) == 1
     known = [value for value in figure[0] if value is not None]
-    assert len(known) >= 3 and known == sorted(known) and known[-1] > 2 * known[0]
+    assert len(known) == 2 and known[1] > 1.4 * known[0]  # 40 to 60 % and above; the other bins hold too few frames
 
 
 def test_a_figure_hides_what_is_clicked_and_tells_what_is_pointed_at(browser, report):
     browser.open(report.html)
     browser.run("draw(document.getElementById('speed'))")
-    count = "document.querySelectorAll('#speed svg .point').length"
+    count = "all('#speed svg .point').length"
     before = browser.run(count)
-    browser.run("document.querySelector('#speed .legend button').click()")
+    browser.run("all('#speed .legend button').at(-1).click()")
     assert browser.run(count) == before - 1
     browser.run("""(() => {
-      const mark = document.querySelector("#speed svg .point").getBoundingClientRect(), chart = document.querySelector("#speed .chart");
-      chart.dispatchEvent(new PointerEvent("pointermove", {clientX: mark.x + mark.width / 2, clientY: mark.y + mark.height / 2}));
+      const mark = one("#speed svg .point").getBoundingClientRect(), chart = one("#speed .chart");
+      const at = {clientX: mark.x + mark.width / 2, clientY: mark.y + mark.height / 2};
+      chart.dispatchEvent(new PointerEvent("pointermove", at));
     })()""")
-    assert "real time" in browser.run("document.querySelector('#speed .tip.on').textContent")
+    assert "real time" in browser.run("one('#speed .tip.on').textContent")
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
     browser.open(report.run, anchor="#" + "0" * 16)
-    browser.until("document.querySelector('main .note')")
-    assert (
-        browser.run("document.querySelector('main .note').textContent") == f"There is no run {'0' * 16} in this report."
-    )
+    browser.until("one('main .note')")
+    assert browser.run("one('main .note').textContent") == f"There is no run {'0' * 16} in this report."
     victim = report.html.parent / "data" / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
     kept = victim.read_text()
     victim.unlink()
     browser.open(report.run, anchor="#" + victim.stem.removeprefix("run-"))
-    browser.until("document.querySelector('main .note')")
+    browser.until("one('main .note')")
     victim.write_text(kept)
-    assert "is missing beside this page" in browser.run("document.querySelector('main .note').textContent")
+    assert "is missing beside this page" in browser.run("one('main .note').textContent")
 
 
 def test_print_shows_all(browser, report, tmp_path):
@@ -172,8 +162,6 @@ def test_print_shows_all(browser, report, tmp_path):
     browser.call("Emulation.setEmulatedMedia", media="print")
     browser.size(1045)
     browser.run("preparePrint()")
-    wide = browser.run(
-        "[...document.querySelectorAll('main table')].map((each) => Math.round(each.getBoundingClientRect().right))"
-    )
+    wide = browser.run("all('main table').map((each) => Math.round(each.getBoundingClientRect().right))")
     browser.call("Emulation.setEmulatedMedia", media="")
     assert len(wide) >= 8 and max(wide) <= 1046

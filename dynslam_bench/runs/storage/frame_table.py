@@ -30,7 +30,8 @@ def load_frames(run: RunRecord | Path | str, results: RunStore | Path | str = "r
         ``dropped``), reward_m (``float64``, metres). ``Float64``, missing (``pd.NA``) where there is no ground truth,
         no mask, or the stage did not run: frame_error_trans_m and frame_error_rot_deg (frame to frame, metres and
         degrees), pose_error_trans_m and pose_error_rot_deg (cumulative), mask_iou (0 to 1), dynamic_share (0 to 1, only
-        where the sequence has exact masks), ``<stage>_s`` (seconds of each stage; ``total_s`` is the frame time; ``read`` is decoding), ``stat_<name>`` (diagnostics).
+        where the sequence has exact masks), ``<stage>_s`` (seconds of each stage; ``total_s`` is the frame time;
+        ``read`` is decoding), ``stat_<name>`` (diagnostics).
 
     Raises:
         RunError: There is no such run, it has no frames (an imported trajectory), or its table is damaged.

@@ -201,7 +201,7 @@ function decoded(value) {
 /** Draw a figure into its element, with a legend that shows and hides, and values where the pointer rests. */
 function drawChart(element, given) {
   const figure = decoded(given);
-  const layout = figure.layout ?? {}, hidden = new Set(), chart = { figure, panels: [] };
+  const layout = figure.layout ?? {}, hidden = new Set(), chart = { figure, panels: [], cursorAt: given.cursor };
   const keyOf = (trace) => trace.legendgroup ?? trace.name ?? "";
   for (const trace of figure.data) if (trace.visible === "legendonly") hidden.add(keyOf(trace));
   const shown = (trace) => !hidden.has(keyOf(trace));

@@ -86,7 +86,9 @@ function addSlider(place, looks, run, space) {
       if (space.at < 0) space.at = Math.round(share * (run.track.t.length - 1));
       space.draw();
     }
-    $("over-time")?.chart?.cursor(t);
+    if (!FIGURES["over-time"]) return;
+    FIGURES["over-time"].cursor = t;
+    $("over-time").chart?.cursor(t);
   };
   slider.addEventListener("input", step);
   veil.addEventListener("change", step);
