@@ -20,7 +20,7 @@ from .html.page import render
 from .html.paper_section import add_paper
 from .model.board import Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
-from .model.rows import OnProgress, load_runs, open_stores, unheard
+from .model.rows import Loaded, OnProgress, load_runs, open_stores, unheard
 from .tables.latex import to_latex
 from .tables.table import Table, csv_text, prose, to_csv, to_markdown
 
@@ -88,6 +88,29 @@ def build_report(
     loaded = load_runs(stores, protocol, on_progress)
     board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
     again = command or _command([store.root for store in stores], output, board)
+    draft = _draft(board, loaded, protocol, output, title, again, picture_seconds, on_progress)
+    data = ReportData(
+        title=title,
+        protocol=protocol.describe(),
+        reference=board.reference_name,
+        version=dynslam_bench.__version__,
+        rows=board.rows,
+    )
+    on_progress(0, None, "writing")
+    return _write(draft, board, output, data)
+
+
+def _draft(
+    board: Board,
+    loaded: Loaded,
+    protocol: Protocol,
+    output: Path,
+    title: str,
+    again: str,
+    picture_seconds: float,
+    on_progress: OnProgress,
+) -> Draft:
+    """All sections of the page; writes the pages of the runs, which some of them lead to."""
     draft = Draft()
     explored = write_explore(
         board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
@@ -105,15 +128,7 @@ def build_report(
     sections.add_masks(draft, board)
     sections.add_failures(draft, board)
     sections.add_provenance(draft, board, again)
-    data = ReportData(
-        title=title,
-        protocol=protocol.describe(),
-        reference=board.reference_name,
-        version=dynslam_bench.__version__,
-        rows=board.rows,
-    )
-    on_progress(0, None, "writing")
-    return _write(draft, board, output, data)
+    return draft
 
 
 def _command(roots: Sequence[Path], output: Path, board: Board) -> str:
