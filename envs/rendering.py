@@ -60,7 +60,7 @@ class Canvas:
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
         picture = self.picture(frame, result)
-        path = _beside_truth(episode, self._truth)
+        path = beside_truth(episode, self._truth)
         body = np.concatenate([picture, self._plan.draw(episode, path)], axis=1)
         return np.concatenate([body, self._strip(result, episode, path.ate_m, body.shape[1])], axis=0)
 
@@ -142,7 +142,7 @@ def main_plane(positions: Array) -> Plane:
 
 
 @dataclass(frozen=True)
-class _Path:
+class PathBesideTruth:
     """Estimated centres ``[N, 3]`` in the truth's frame, the pieces without a gap, and the ATE where it is known."""
 
     centres: Array
@@ -159,7 +159,7 @@ class _Plan:
         self._plane = main_plane(places)
         self._known = self._plane(places)
 
-    def draw(self, episode: Episode, path: _Path) -> Image:
+    def draw(self, episode: Episode, path: PathBesideTruth) -> Image:
         plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
         estimate = self._plane(path.centres)
         to_pixel, metres_a_pixel = self._view(estimate)
@@ -208,7 +208,7 @@ def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
     return {i: origin @ pose for i, pose in known.items()}
 
 
-def _beside_truth(episode: Episode, truth: dict[int, Array]) -> _Path:
+def beside_truth(episode: Episode, truth: dict[int, Array]) -> PathBesideTruth:
     """The estimate in the truth's frame.
 
     They are joined at the first frame that has both, and aligned by least squares over all frames so far (as for the
@@ -216,7 +216,7 @@ def _beside_truth(episode: Episode, truth: dict[int, Array]) -> _Path:
     """
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
-        return _Path(np.zeros((0, 3)), [])
+        return PathBesideTruth(np.zeros((0, 3)), [])
     poses = np.array([pose for _, pose in tracked])
     both = [row for row, (index, _) in enumerate(tracked) if index in truth]
     true = np.array([truth[tracked[row][0]] for row in both])
@@ -230,7 +230,7 @@ def _beside_truth(episode: Episode, truth: dict[int, Array]) -> _Path:
         placed = se3.inverse(poses[0]) @ poses
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
     bounds = [0, *breaks.tolist(), len(placed)]
-    return _Path(placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m)
+    return PathBesideTruth(placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m)
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:

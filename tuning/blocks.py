@@ -235,5 +235,5 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
             found[kind] = float(strength)
         except ValueError:
             raise StudyError(f"'{whole}': strength '{strength}' of {kind} is no number", "degrade=blur:0.5") from None
-        Degradation(**{kind: found[kind]})  # a strength out of range is refused here
+        Degradation(**{kind: found[kind]})  # type: ignore[arg-type]  # a strength out of range is refused here
     return tuple(sorted(found.items()))

@@ -61,10 +61,20 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
     if chosen is not None:
         chosen = next(each for each in candidates if each.trial == chosen.trial)
         candidates = [chosen, *(each for each in candidates if each is not chosen)]
+    summary = _summary(tuner, candidates, chosen, picks)
+    write_presets(tuner, summary)
+    write_atomic(tuner.folder / "summary.json", summary.to_json())
+    return summary
+
+
+def _summary(
+    tuner: Tuner, candidates: list[Candidate], chosen: Candidate | None, picks: dict[str, int | None]
+) -> StudySummary:
+    """What came out of the study."""
+    spec, design, notes = tuner.spec, tuner.design, list(tuner.design.notes)
     names = [parameter.name for parameter in tuner.space]
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    notes = list(design.notes)
-    summary = StudySummary(
+    return StudySummary(
         name=spec.name,
         tracker=spec.tracker,
         protocol=held_protocol(spec.protocol).describe(),
@@ -82,9 +92,6 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         tune=[str(block) for block in design.race],
         picks=picks,
     )
-    write_presets(tuner, summary)
-    write_atomic(tuner.folder / "summary.json", summary.to_json())
-    return summary
 
 
 def _confirmed(tuner: Tuner, trial: FrozenTrial, default: Outcomes, candidates: int, jobs: int) -> Candidate:

@@ -13,12 +13,13 @@ from dynslam_bench.core.errors import StudyError, did_you_mean
 
 from .blocks import Block
 from .evaluate import Outcome
-from .statistics import FLOOR_M, by_scene, by_start, centre
+from .statistics import by_scene, by_start, centre
 
 Outcomes = Mapping[Block, Outcome]
 Cost = Callable[[Outcome], float]
 WORST_SHARE = 0.25
 """Share of the scenes, the worst ones, that the worst case is the mean of; always one at least."""
+_MANY = 1e9
 _LOST_FLOOR = 0.01
 """So many lost frames are added on both sides, as a share, so that a default without any can be compared with."""
 
@@ -122,11 +123,8 @@ def own_objective(cost: Cost) -> Objective:
 
     def checked(run: Outcome) -> float:
         value = float(cost(run))
-        if not (math.isfinite(value) and value >= FLOOR_M):
-            raise StudyError(
-                f"objective '{name}' gives {value:g} on block '{run.block}'",
-                f"a ratio needs finite numbers from {FLOOR_M:g} on: give it in a smaller unit, or add a constant",
-            )
-        return value
+        if not (math.isfinite(value) and value > 0):
+            raise StudyError(f"objective '{name}' gives {value:g} on block '{run.block}'", "give numbers above 0")
+        return _MANY * value  # ratios do not mind, and the floor of errors in metres is none of this cost
 
     return Objective(name, name.replace("_", " "), checked)

@@ -24,8 +24,8 @@ def converted(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     found, notes = dict(values), []
     if is_old(found):
         pruner = found.pop("pruner")
-        found.setdefault("race", RACES.get(pruner, pruner))
+        found.setdefault("race", RACES.get(str(pruner), pruner))
         notes.append(f'pruner = "{pruner}" became race = "{found["race"]}"')
-        if "speed" in found.get("objectives", ()):
+        if "speed" in str(found.get("objectives", "")):
             notes.append('objective "speed" is the processor time beside the default\'s, no real-time factor')
     return found, notes

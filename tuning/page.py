@@ -24,7 +24,7 @@ from .preset import preset_text
 from .ratio import Ratio
 from .samplers import is_feasible
 from .study import Tuner
-from .summary import Candidate, StudySummary
+from .summary import Candidate, StudySummary, worth
 from .trials import errors_of
 
 _MODEBAR = {"bgcolor": "rgba(0,0,0,0)", "color": "#c4c9d1", "activecolor": "#1f6fb4"}
@@ -50,7 +50,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     result = [Piece("table", table=tables[0]), *_shown(figures, "ratios")]
     sections = [
         Section("result", "What the study found", "Result", [summary.verdict], result),
-        Section("preset", "The chosen settings", "Settings", [], _preset(tuner, summary)),
+        Section("preset", "The chosen settings", "Settings", _picks(summary), _preset(tuner, summary)),
         Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
         Section("trials", "All trials", "Trials", [], [Piece("table", table=tables[1])]),
@@ -107,6 +107,16 @@ def _preset(tuner: Tuner, summary: StudySummary) -> list[Piece]:
         return [Piece("code", title="Not recommended: they do not hold up; shown as a record", text=text)]
     command = f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"
     return [Piece("code", text=text), Piece("code", title="Use them", text=command)]
+
+
+def _picks(summary: StudySummary) -> list[str]:
+    """What the presets of a study of several objectives are worth."""
+    by_trial = {candidate.trial: candidate for candidate in summary.candidates}
+    return [
+        worth(name, None if number is None else by_trial[number], summary.split_notes)
+        for name, number in summary.picks.items()
+        if name != "best"
+    ]
 
 
 def _importance_notes(tuner: Tuner, summary: StudySummary) -> list[str]:

@@ -61,7 +61,6 @@ class Pilot(Record):
 
     Attributes:
         objective: What the ratio is one of.
-        configurations: Changed settings that were tried beside the default.
         scenes: Different scenes that they ran on.
         starts: Starts a scene.
         within: Standard deviation between starts of one scene.
@@ -72,7 +71,6 @@ class Pilot(Record):
     """
 
     objective: str
-    configurations: int
     scenes: int
     starts: float
     within: float
@@ -181,7 +179,7 @@ def judge_pilot(
         blocks = math.ceil(needed * starts)
         needs.append(Need(effect=effect, scenes=needed, blocks=blocks, minutes=math.ceil(blocks / jobs) * run_s / 60))
     return Pilot(
-        objective=objective.what, configurations=len(pairs), scenes=len(judged), starts=round(starts, 2), within=within,
+        objective=objective.what, scenes=len(judged), starts=round(starts, 2), within=within,
         between=between, run_s=run_s, detectable=detectable(within, between, len(judged), starts), needs=needs,
     )  # fmt: skip
 

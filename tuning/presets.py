@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
+from dynslam_bench.core.reading import read_text
 from dynslam_bench.core.records import write_atomic
 
 from .preset import preset_text
@@ -48,7 +49,7 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", pick: str
         if pick not in picks:
             hint = did_you_mean(pick, picks) if len(picks) > 1 else 'objectives = ["accuracy", "speed"] make three'
             raise StudyError(f"study '{spec.name}' has no preset '{pick}'", hint)
-        return (folder / f"{pick}.toml").read_text()
+        return read_text(folder / f"{pick}.toml", kind=StudyError)
     if pick != "best":
         raise StudyError(f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml")
     found = best_trials(Tuner(spec, results, reading=True).study, 1)

@@ -43,13 +43,15 @@ def same_recording(one: Sequence, other: Sequence) -> bool:
 def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
     shapes = [_shapes(each) for each in (one, other)]
     if len(shapes[0]) and len(shapes[1]):
-        apart, there = cKDTree(shapes[1]).query(shapes[0])
-        apart = apart / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
-        yield from ((int(here), int(there[here])) for here in np.argsort(apart, kind="stable")[:_PAIRS])
+        found = cKDTree(shapes[1]).query(shapes[0])
+        likest = np.asarray(found[1], np.intp)
+        apart = np.asarray(found[0], np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+        yield from ((int(here), int(likest[here])) for here in np.argsort(apart, kind="stable")[:_PAIRS])
     if is_rendered(one) or is_rendered(other):
         return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
-    stamps = [np.round(each.timestamps, 6) for each in (one, other)]
-    _, here, there = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
+    stamps: NDArray[np.float64] = np.round(one.timestamps, 6)
+    twins: NDArray[np.float64] = np.round(other.timestamps, 6)
+    _, here, there = np.intersect1d(stamps, twins, assume_unique=True, return_indices=True)
     spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
     yield from ((int(here[k]), int(there[k])) for k in spread)
     yield from ((0, 0), (len(one) - 1, len(other) - 1))
@@ -81,9 +83,10 @@ def _shapes(sequence: Sequence) -> NDArray[np.float64]:
 def _thumbnail(sequence: Sequence, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Colour ``[24, 32, 3]`` and depth ``[24, 32]`` of a frame, depth in the numbers that its file holds."""
     frame = sequence[index]
-    colour = cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
     raw = (frame.depth * sequence.camera.depth_factor).astype(np.float32)  # as stored, whatever the camera says
-    return colour, cv2.resize(raw, _THUMB, interpolation=cv2.INTER_NEAREST)
+    colour = cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(raw, _THUMB, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(colour, np.float32), np.asarray(depth, np.float32)
 
 
 def _alike(

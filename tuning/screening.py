@@ -98,8 +98,8 @@ def screen(
     if len(bases[0]) < FEWEST_BLOCKS:
         raise StudyError(f"screening on {len(bases[0])} block cannot tell an effect from chance", "name two or more")
     names = list(points[0].base)
-    todo = [(number, None) for number in range(1, len(points))]
-    todo += [(number, name) for number in range(len(points)) for name in names]  # type: ignore[misc]
+    todo: list[tuple[int, str | None]] = [(number, None) for number in range(1, len(points))]
+    todo += [(number, name) for number in range(len(points)) for name in names]
     failed: dict[str, str] = {}
     done = [1]
 

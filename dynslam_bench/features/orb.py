@@ -118,7 +118,8 @@ class OrbExtractor:
         chosen: list[NDArray[np.int64]] = []
         missing = 0
         for i in reversed(range(len(levels))):
-            index = levels[i].choose(quotas[i] + missing, self.settings.fast_threshold, allowed and allowed[i])
+            among = None if allowed is None else allowed[i]
+            index = levels[i].choose(quotas[i] + missing, self.settings.fast_threshold, among)
             missing += quotas[i] - len(index)  # what a coarse level cannot give is sought in the next finer one
             chosen.append(index)
         return chosen[::-1]

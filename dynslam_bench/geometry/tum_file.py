@@ -87,7 +87,7 @@ def load_tum(path: str | Path) -> TumFile:
     """
     path = Path(path)
     values = read_table(path, 8, _COLUMNS)
-    finite = np.isfinite(values).all(axis=1)
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
     counted = {

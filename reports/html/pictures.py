@@ -156,7 +156,7 @@ def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
     if shot.mask is None or not shot.mask.any():
         return seen | {"share": None if shot.mask is None else 0.0}
     mask = _shrunk(shot.mask.astype(np.uint8) * 255, _MASK_WIDTH)
-    coded = base64.b64encode(_webp(cv2.merge([mask, mask, mask]), _LOSSLESS)).decode()
+    coded = base64.b64encode(_webp(np.asarray(cv2.merge([mask, mask, mask]), np.uint8), _LOSSLESS)).decode()
     return seen | {"mask": f"data:image/webp;base64,{coded}", "share": significant(100 * float(shot.mask.mean()), 3)}
 
 

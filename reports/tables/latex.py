@@ -32,6 +32,7 @@ _LATEX |= {
     "°": r"$^\circ$",
     "²": r"$^2$",
     "§": r"\S{}",
+    "¶": r"\P{}",
 }
 _LATEX |= {"†": r"$^\dagger$", "‡": r"$^\ddagger$", "…": r"\ldots{}", "’": "'", "“": "``", "”": "''", '"': "''"}
 
@@ -115,8 +116,8 @@ def _together_pt(table: Table, columns: Sequence[int], widths: Mapping[int, floa
     """About how wide neighbouring columns are, in points, with the headings above several of them."""
     return sum(
         max(sum(widths[at] + _GAP_PT for at in group), _text_pt(name) + _GAP_PT)
-        for name, group in groupby(columns, key=lambda at: table.columns[at].group)
-        for group in [list(group)]
+        for name, run in groupby(columns, key=lambda at: table.columns[at].group)
+        for group in [list(run)]
     )
 
 

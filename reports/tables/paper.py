@@ -15,7 +15,7 @@ from .table import Column, Emphasis, Table, TableCell
 SUBJECT = "emfoa-oft"
 """Tracker whose improvement over the others is shown, where it was run."""
 STATISTICS = {"rmse": "RMSE", "mean": "mean", "median": "median", "std": "SD"}
-LOST_MARK = "§"
+LOST_MARK = "¶"
 _LOST = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
 Found = Mapping[tuple[str, str], float]
 """Variant key and sequence to a number."""

@@ -9,7 +9,20 @@ from envs_toys import TARGET, ToySequence
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.envs import SlamEnv
-from dynslam_bench.envs.rendering import CULLED, ESTIMATE, HEIGHT, KEPT, MASK, STRIP, TRUTH
+from dynslam_bench.envs.rendering import (
+    ALIGN_FROM,
+    CULLED,
+    ESTIMATE,
+    HEIGHT,
+    KEPT,
+    MASK,
+    PLANES,
+    STRIP,
+    TRUTH,
+    beside_truth,
+    main_plane,
+)
+from dynslam_bench.evaluation.online import OnlineError
 
 
 def pixels(image: np.ndarray, colour: tuple[int, int, int]) -> int:
@@ -52,6 +65,31 @@ def test_no_ground_truth_and_lost_frames_are_no_trouble() -> None:
     rendered(sequence=ToySequence(12, has_truth=False))
     rendered(settings={"mode": "lost", "at": 3, "until": 6})
     rendered(settings={"mode": "initialising", "at": 0})
+
+
+def test_the_path_is_seen_in_the_plane_in_which_it_spreads_most() -> None:
+    along = np.linspace(0, 1, 50)[:, None]
+    flat = {(1, 0.1, 0.5): "from above", (1, 0.5, 0.1): "from behind", (0.1, 0.5, 1): "from the side"}
+    for spread, name in flat.items():
+        assert main_plane(np.sin(along * [5, 9, 13]) * spread).name.startswith(name)
+    assert main_plane(np.zeros((0, 3))) == main_plane(along * [1, 0, 0]) == PLANES[0]
+    assert main_plane(np.zeros((1, 3)))(np.array([[1.0, 2.0, 3.0]])).tolist() == [[1.0, 3.0]]
+
+
+def test_the_error_in_the_picture_is_the_protocols() -> None:
+    env = SlamEnv(ToySequence(45), TARGET, render_mode="rgb_array")
+    env.reset(seed=0)
+    truth = {}
+    shown = []
+    for index in range(45):
+        if index:
+            env.step(0)
+        env.render()
+        pose = OnlineError(env.sequence.ground_truth).truth_at(float(env.sequence.timestamps[index]))
+        truth |= {} if pose is None else {index: pose}
+        shown.append(beside_truth(env.episode, truth).ate_m)
+    assert all(value is None for value in shown[: ALIGN_FROM - 1]) and shown[-1] is not None
+    assert shown[-1] == pytest.approx(env.episode_metrics()["ate_rmse_m"], rel=1e-6)
 
 
 def test_two_pictures_of_one_frame_are_equal() -> None:

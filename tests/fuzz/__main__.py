@@ -6,35 +6,62 @@ import argparse
 import hashlib
 import json
 import logging
+import multiprocessing
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 from .campaign import attack
 from .readers import TARGETS
+from .target import Target
 
 
-def _job(name: str, seconds: float, seed: int, findings: str) -> dict[str, Any]:
-    """One reader, in a process of its own: its peak of memory is its own, and a crash ends nothing else."""
+def _all(targets: list[Target], jobs: int, seconds: float, seed: int, findings: Path) -> list[dict[str, Any]]:
+    """Each reader in a process of its own: its peak of memory is its own, and a crash of native code is a finding."""
+    findings.mkdir(parents=True, exist_ok=True)
+    running: dict[int, tuple[Target, Path, Any]] = {}
+    found: list[dict[str, Any]] = []
+    waiting = list(targets)
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            target = waiting.pop(0)
+            said = findings / f".{target.name.replace(' ', '-')}.{os.getpid()}.json"
+            child = multiprocessing.get_context("fork").Process(
+                target=_job, args=(target, seconds, seed, findings, said)
+            )
+            child.start()
+            running[child.sentinel] = target, said, child
+        for sentinel in wait(list(running)):
+            target, said, child = running.pop(sentinel)  # type: ignore[arg-type]
+            child.join()
+            if child.exitcode == 0:
+                found.append(json.loads(said.read_text()))
+                said.unlink()
+            else:
+                what = [f"its process ended with {child.exitcode} (seed {seed})"]
+                found.append(dict(reader=target.name, inputs=0, refused=0, seen=[], lines=[], findings=what))
+    return found
+
+
+def _job(target: Target, seconds: float, seed: int, findings: Path, said: Path) -> None:
     logging.disable(logging.CRITICAL)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libpng and libjpeg tell what they think of every file
-    result = attack(next(target for target in TARGETS if target.name == name), seconds=seconds, seed=seed)
+    result = attack(target, seconds=seconds, seed=seed)
     for finding in result.findings:
         data = finding.data or b""
-        file = Path(findings) / f"{name.replace(' ', '-')}-{hashlib.sha256(data).hexdigest()[:8]}"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(data)
-    return {
-        "reader": name,
+        (findings / f"{target.name.replace(' ', '-')}-{hashlib.sha256(data).hexdigest()[:8]}").write_bytes(data)
+    found = {
+        "reader": target.name,
         "inputs": result.inputs,
         "refused": result.refused,
         "seen": sorted(result.coverage.seen),
         "lines": sorted(result.coverage.lines),
         "findings": [finding.what for finding in result.findings],
     }
+    said.write_text(json.dumps(found))
 
 
 def main() -> int:
@@ -44,15 +71,15 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=int(time.time()), help="of the damage; another one every time")
     parser.add_argument("--reader", action="append", help="only this reader; repeatable")
-    parser.add_argument("--findings", default="/tmp/dynslam-fuzz", help="inputs that escaped are kept there")
+    parser.add_argument(
+        "--findings", type=Path, default=Path("/tmp/dynslam-fuzz"), help="inputs that escaped are kept there"
+    )
     parser.add_argument("--record", type=Path, help="JSON file whose figures are added to")
     options = parser.parse_args()
-    names = [target.name for target in TARGETS if not options.reader or target.name in options.reader]
-    seconds = 60 * options.minutes * options.jobs / len(names)
+    chosen = [target for target in TARGETS if not options.reader or target.name in options.reader]
+    seconds = 60 * options.minutes * options.jobs / len(chosen)
     began = time.monotonic()
-    with ProcessPoolExecutor(options.jobs, max_tasks_per_child=1) as pool:
-        jobs = [pool.submit(_job, name, seconds, options.seed, options.findings) for name in names]
-        found = [job.result() for job in jobs]
+    found = _all(chosen, options.jobs, seconds, options.seed, options.findings)
     rows = _add(options.record, found, time.monotonic() - began)
     for row in rows:
         sys.stdout.write(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import tempfile
 import zipfile
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the ca
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunRecord, RunStore
 from dynslam_bench.runs import frame_row as rows
-from dynslam_bench.runs.storage import packing
+from dynslam_bench.runs.storage import packing, run_list
 from dynslam_bench.runs.storage.evaluating import evaluate_run
 from dynslam_bench.runs.storage.frame_table import load_frames
 from dynslam_bench.runs.storage.frames import FrameLog
@@ -63,6 +64,23 @@ def _read_run(data: bytes | None, folder: Path) -> None:
     record = store.read(RUN)
     record.describe()
     store.score(record)
+
+
+def _read_list(data: bytes | None, folder: Path) -> None:
+    """A damaged index of the runs is made again; whatever it says, the runs are those that lie there."""
+    store = _store(folder, _stored(f"runs/{RUN}/run.json"))
+    at(store.root / "metrics" / get_protocol("tum-rgbd/v1").digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
+    at(store.root / "index", f"{get_protocol('tum-rgbd/v1').digest()}.json", data)
+    rows, unreadable = run_list.list_runs(store)
+    assert [row["run"] for row in rows] == [RUN] and not unreadable
+
+
+@cache
+def _index() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        _read_list(None, Path(folder))
+        (path,) = Path(folder).glob("results/index/*.json")
+        return path.read_bytes()
 
 
 def _read_metrics(data: bytes | None, folder: Path) -> None:
@@ -141,8 +159,6 @@ def _read_journal(data: bytes | None, folder: Path) -> None:
 
 @cache
 def _entry() -> bytes:
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         StageCache(Path(folder)).put("masks", "ab12", {"a": np.eye(3), "b": np.array(["person"])}, 0.1)
         (path,) = Path(folder).rglob("*.npz")
@@ -181,9 +197,10 @@ TARGETS = [
         "run record",
         _read_run,
         lambda: [_stored(f"runs/{RUN}/run.json"), _other(_stored(f"runs/{RUN}/run.json"))],
-        (RunStore._read, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
+        (RunStore.read_whole, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
         mutate_json,
     ),
+    Target("list of runs", _read_list, lambda: [_index()], (run_list.list_runs, run_list._read), mutate_json),
     Target(
         "metric record", _read_metrics, lambda: [_stored(f"metrics/*/{RUN}.json")], (RunStore.metrics,), mutate_json
     ),

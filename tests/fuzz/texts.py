@@ -216,7 +216,7 @@ TARGETS = [
         "study",
         lambda data, folder: study_file.read_study(at(folder, "s.toml", data)),
         lambda: [(FIXTURE.parent / "small.toml").read_bytes(), (ROOT / "docs/studies/thresholds.toml").read_bytes()],
-        (study_file.read_study, study_file.make_study, study_file._identity),
+        (study_file.read_study, study_file.make_spec),
     ),
     Target(
         "COCO annotations",

@@ -14,7 +14,8 @@ import pytest
 from envs_toys import TARGET
 
 from dynslam_bench.core.errors import DynslamError, RunError
-from dynslam_bench.runs import MetricRecord, RunRecord, RunSpec, RunStore, resolve, run_one, score
+from dynslam_bench.core.machine import versions
+from dynslam_bench.runs import MetricRecord, RunRecord, RunSpec, RunStore, identity, resolve, run_one, score
 
 HERE = Path(__file__).parent
 
@@ -51,6 +52,19 @@ def test_run_id_depends_on_what_matters_and_on_nothing_else(toy_folder: str, tmp
     ]
     ids = [resolve(RunSpec(**(base | change))).run_id for change in other]
     assert len({first, *ids}) == len(ids) + 1
+
+
+def test_run_id_tells_the_packages_that_change_the_bits(toy_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV and torch bring kernels of their own; the others are in the record."""
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder)
+    known = versions()
+    ids = {}
+    for name in ("nothing", "opencv", "torch", "numpy", "scipy", "numba"):
+        monkeypatch.setattr(identity, "versions", lambda name=name: known | {name: "another"})
+        ids[name] = resolve(spec).run_id
+    assert ids["opencv"] != ids["nothing"] != ids["torch"] != ids["opencv"]
+    assert ids["numpy"] == ids["scipy"] == ids["numba"] == ids["nothing"]
+    assert {"numpy", "scipy", "numba", "gtsam"} <= set(known)
 
 
 def test_a_part_has_one_run_id_however_it_is_written() -> None:

@@ -185,7 +185,7 @@ def test_recorded_classes(tmp_path):
     with pytest.raises(SegmentationError, match="object 2 has no class"):
         RecordedSegmenter(tmp_path).segment(frame())
     (tmp_path / "classes.json").write_text("{nope")
-    with pytest.raises(SegmentationError, match="cannot read"):
+    with pytest.raises(SegmentationError, match="is no valid JSON"):
         RecordedSegmenter(tmp_path)
 
 
@@ -195,7 +195,7 @@ def test_recorded_refuses_what_does_not_fit(tmp_path):
     with pytest.raises(SegmentationError, match="holds no PNG files"):
         RecordedSegmenter(tmp_path)
     record(tmp_path, "0.png", [1], shape=(12, 16))
-    with pytest.raises(SegmentationError, match=r"mask is 16x12, the frame 32x24"):
+    with pytest.raises(SegmentationError, match=r"is 16x12, but the frame is 32x24"):
         RecordedSegmenter(tmp_path).segment(frame())
     (tmp_path / "0.png").write_bytes(b"\x89PNG nothing")
     with pytest.raises(SegmentationError, match="cannot read the mask"):

@@ -11,7 +11,8 @@ from steering_scene import SmallScene, construct, difference
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.segmentation.availability import embedded_weights
+from dynslam_bench.sequences.preprocessing import normalise
+from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.trackers.specs import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
@@ -55,6 +56,11 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
     **{f"backend.relocalisation.{name}": ("orb-slam2", MANY)
        for name in ("searched", "candidates", "iterations", "max_distance")},
+    **{f"motion.{name}": ("emfoa-oft-no-masks", {"motion.threshold_px": 0.5, "motion.threshold_sigma": 1.0})
+       for name in ("threshold_share", "memory")},
+    **{f"multiview.{name}": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }) for name in ("order", "max_parallax_deg")},
     "segmentation.mask_threshold": NETWORK,
     "segmentation.nms_iou": NETWORK,
     "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
@@ -62,6 +68,12 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     **{f"epipolar.{name}": ("emfoa-oft-paper-sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
 }  # fmt: skip
 """Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
+UNSEEN = frozenset({
+    "backend.tracking.local_map", "backend.keyframes.max_gap", "epipolar.confidence", "free_space.max_age_s",
+    "correlation.largest", "moving_vote.corners", "class_rule.vote_share", "box_depth.max_cover",
+    *(f"backend.relocalisation.{name}" for name in ("searched", "candidates", "iterations", "max_distance")),
+})  # fmt: skip
+"""Settings that change nothing on fourteen frames: they ask for long maps, long ages, or for being lost for long."""
 
 
 class Scene(SmallScene):
@@ -113,7 +125,23 @@ def values_of(parameter: Parameter) -> tuple[object, ...]:
     return parameter.choices or (parameter.low, parameter.high)
 
 
-@pytest.mark.parametrize("name", OFFERED)
+def test_normalisation_changes_the_images_that_trackers_see(scene: Scene) -> None:
+    settings, rgb = PreprocessingSettings(), scene.frames[0].rgb
+    names = [name for name in OFFERED if name.startswith("preprocessing.")]
+    assert len(names) == 5
+    for name in names:
+        parameter = OFFERED[name][1]
+        base = settings.model_copy(update={key.split(".")[1]: value for key, value in others_of(parameter).items()})
+        seen = {normalise(rgb, base.model_copy(update={name.split(".")[1]: value})).tobytes()
+                for value in values_of(parameter)}  # fmt: skip
+        assert len(seen) == len(values_of(parameter)), name
+
+
+def test_what_is_not_seen_here_is_offered() -> None:
+    assert UNSEEN <= set(OFFERED)
+
+
+@pytest.mark.parametrize("name", [name for name in OFFERED if name not in UNSEEN and "preprocessing" not in name])
 def test_every_setting_that_a_study_may_draw_changes_something(name: str, scene: Scene) -> None:
     system, parameter = OFFERED[name]
     system, others = CASES.get(name, (system, {}))
@@ -135,7 +163,3 @@ def _value(settings: object, name: str) -> object:
     for part in name.split("."):
         settings = getattr(settings, part)
     return settings
-
-
-def test_the_weights_that_some_cases_name_are_here() -> None:
-    assert embedded_weights() is not None

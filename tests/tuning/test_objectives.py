@@ -111,6 +111,7 @@ def test_a_front_gives_three_presets_in_either_order(objectives: list[str], tmp_
     assert "mode" not in presets["fast"] and 'Fixed in that study, not part of these settings: mode = "fine"' in text
     assert "processor time x 0.500" in text and "Judged on" in text
     page = write_page(tuner, summary).read_text()
+    assert "The &#39;fast&#39; pick is trial" in page or "The 'fast' pick is trial" in page
     assert "x real time" not in page and "real-time factor" not in page
     with pytest.raises(StudyError, match=r"no preset 'fats'.*'fast'"):
         read_preset_text(study, tmp_path, "fats")

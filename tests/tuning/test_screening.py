@@ -27,7 +27,7 @@ BASE = flatten(ToySettings())
 
 def steep(settings: Mapping[str, Any]) -> float:
     """A strong effect of the gain; none of the rest."""
-    return 2.0 * abs(math.log(float(settings.get("gain", 1.5))))
+    return 2.0 * math.log(float(settings.get("gain", 1.5)))
 
 
 class ScreenedTuner(SimulatedTuner):

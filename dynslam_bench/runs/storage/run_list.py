@@ -119,11 +119,16 @@ def _stamp(path: str) -> list[int]:
     return [found.st_mtime_ns, found.st_size]
 
 
+def _is_row(run_id: str, values: list[Any]) -> bool:
+    """Whether a row of an index that somebody may have made by hand can be sorted and shown."""
+    return len(values) == len(FIELDS) + 1 and values[1] == run_id and isinstance(values[-1], str)
+
+
 def _read(path: Path) -> dict[str, list[Any]]:
     """The rows of an index by run id; none if there is none, or it is damaged or of another version."""
     try:
         found = json.loads(path.read_bytes())
         rows = found["rows"] if found["head"] == _HEAD else {}
-        return rows if all(len(values) == len(FIELDS) + 1 for values in rows.values()) else {}
+        return rows if all(_is_row(run_id, values) for run_id, values in rows.items()) else {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {}

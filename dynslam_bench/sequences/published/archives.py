@@ -169,7 +169,7 @@ def _tar_members(archive: Path, room: _Room) -> Iterator[_Member]:
         with tarfile.open(fileobj=counted, mode="r|", tarinfo=_Header) as tar:
             for entry in tar:
                 room.take_member()
-                tar.members = []  # it would keep the header of every file
+                tar.members = []  # type: ignore[attr-defined]  # it would keep the header of every file
                 if entry.isdir():
                     if PurePosixPath(entry.name).parts:  # "." names the archive itself
                         safe_name(archive, entry.name)

@@ -1,0 +1,229 @@
+"""Kills and faults, counted: the command line is disturbed, then does the same again, and has to end as if undisturbed.
+
+    python tests/benchmarks/kills.py operations [--every 1] [--fault kill full read-only gone]
+    python tests/benchmarks/kills.py moments [--times 20]
+    python tests/benchmarks/kills.py signals
+
+`operations`: two runs through `dynslam-bench bench` with a fault at every file operation of the parent (by
+`tests/core/faults.py`). `moments`: `bench` and `tune run` killed (SIGKILL, to the whole group) and interrupted (SIGINT)
+after random times. `signals`: a foreign program that ignores signals and hides its children in sessions of their own,
+ended by each signal to the command line, its group, the fork server, a keeper; how long until nothing is left.
+
+Bars: every disturbed folder, gone on from, holds the same runs with the same trajectories; no traceback; all processes
+gone within 2 s; nothing left in shared memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "core"), str(ROOT / "tests" / "envs"), str(ROOT / "tests" / "runs")]
+
+from envs_toys import write_folder  # noqa: E402
+from test_runs_infrastructure import STRAYS  # noqa: E402
+
+from dynslam_bench.core.temporary import SHARED_MEMORY  # noqa: E402
+from dynslam_bench.runs.process.family import children, family  # noqa: E402
+
+SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
+STUDY = (
+    'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\npruner = "none"\nseeds = [0]\nallow_overlap = true\n'
+)
+DISTURBED = (
+    "import atexit, sys; from pathlib import Path; from faults import Injector\n"
+    "injector = Injector(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]); injector.install()\n"
+    "atexit.register(lambda: sys.stderr.write(f'operations {injector.count}\\n'))\n"
+    "from dynslam_bench.cli import main; sys.argv[1:] = sys.argv[4:]; main()"
+)
+
+
+def environment() -> dict[str, str]:
+    """With this checkout, and the faults, on the import path."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(sys.path[:4])}
+
+
+def command(*arguments: str) -> list[str]:
+    """The command line in this interpreter."""
+    return [sys.executable, "-m", "dynslam_bench.cli", *arguments]
+
+
+def outcome(results: Path) -> dict[str, tuple[str, str]]:
+    """Status and trajectory of every stored run."""
+    found = {}
+    for record in sorted(results.glob("runs/[0-9a-f]*/run.json")):
+        track = record.with_name("trajectory_online.txt").read_text().partition("\n")[2]
+        found[record.parent.name] = (json.loads(record.read_text())["status"], track)
+    return found
+
+
+def go_on(work: Path, arguments: list[str], expected: object | None) -> tuple[object, str]:
+    """Do it undisturbed; what is there, and what is wrong with that."""
+    done = subprocess.run(command(*arguments), cwd=work, env=environment(), capture_output=True, text=True)
+    there = outcome(work / "results")
+    left = [path.name for path in (work / "results" / "runs").glob(".*") if path.suffix in (".tmp", ".claim")]
+    if done.returncode:
+        return there, f"exit code {done.returncode}: {done.stderr.strip()[-200:]}"
+    if expected is not None and there != expected:
+        return there, "other runs than undisturbed"
+    return there, f"left: {left}" if left else ""
+
+
+def operations(work: Path, faults: list[str], every: int) -> Counter[str]:
+    """A fault at every file operation of the parent of two runs."""
+    (work / "suite.toml").write_text(SUITE.format(folder=write_folder(work / "toy", 20)))
+    arguments = ["bench", "suite.toml"]
+    expected, wrong = go_on(work, arguments, None)
+    assert not wrong, wrong
+    counted: Counter[str] = Counter()
+    total = int(disturb(work, 0, "kill", arguments).stderr.rpartition("operations ")[2])
+    sys.stdout.write(f"{total} file operations\n")
+    for fault in faults:
+        for at in range(1, total + 1, every):
+            first = disturb(work, at, fault, arguments)
+            if "Traceback" in first.stderr:
+                sys.stdout.write(f"{fault} at {at}: traceback: {first.stderr.strip()[-300:]}\n")
+                counted["tracebacks"] += 1
+            _, wrong = go_on(work, arguments, expected)
+            note(counted, f"{fault} at {at}", wrong)
+    return counted
+
+
+def disturb(work: Path, at: int, fault: str, arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    """The command line on an empty results folder, with a fault at one file operation; 0 for none."""
+    shutil.rmtree(work / "results")
+    (work / "results").mkdir()
+    program = [sys.executable, "-c", DISTURBED, str(work / "results"), str(at), fault, *arguments]
+    return subprocess.run(program, cwd=work, env=environment(), capture_output=True, text=True)
+
+
+def moments(work: Path, times: int) -> Counter[str]:
+    """Killed and interrupted after random times."""
+    folder = write_folder(work / "toy", 30)
+    (work / "suite.toml").write_text(SUITE.format(folder=folder))
+    (work / "study.toml").write_text(STUDY.format(folder=folder))
+    rng, counted = random.Random(0), Counter[str]()
+    for arguments in (["bench", "suite.toml"], ["tune", "run", "study.toml"]):
+        began = time.monotonic()
+        shutil.rmtree(work / "results", ignore_errors=True)
+        expected, wrong = go_on(work, arguments, None)
+        assert not wrong, wrong
+        whole = time.monotonic() - began
+        for turn in range(times):
+            number = (signal.SIGKILL, signal.SIGINT)[turn % 2]
+            shutil.rmtree(work / "results", ignore_errors=True)
+            after = rng.uniform(0.05, 1.0) * whole
+            program = subprocess.Popen(
+                command(*arguments), cwd=work, env=environment(), stderr=subprocess.PIPE, text=True,
+                stdout=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
+            time.sleep(after)
+            if program.poll() is None:
+                os.killpg(program.pid, number)
+            _, said = program.communicate()
+            if "Traceback" in said and program.returncode != -signal.SIGINT:  # Python itself was loading
+                sys.stdout.write(f"{arguments[0]}, {number.name} after {after:.1f} s: {said.strip()[-300:]}\n")
+                counted["tracebacks"] += 1
+            _, wrong = go_on(work, arguments, expected if arguments[0] == "bench" else None)
+            note(counted, f"{arguments[0]}, {number.name} after {after:.2f} of {whole:.1f} s", wrong)
+    return counted
+
+
+def signals(work: Path) -> Counter[str]:
+    """A foreign program that hides its children, ended in every way."""
+    folder = write_folder(work / "toy", 10)
+    (work / "strays.py").write_text(STRAYS)
+    counted: Counter[str] = Counter()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+    cases = [(whom, number) for whom in ("command", "group") for number in numbers]
+    for whom, number in [*cases, ("server", signal.SIGKILL), ("server", signal.SIGTERM), ("keeper", signal.SIGKILL)]:
+        pids = work / f"pids.{whom}.{number.name}"
+        tracker = f"subprocess:{sys.executable} {work / 'strays.py'} {pids}"
+        program = subprocess.Popen(
+            command("run", tracker, str(folder), "--frames", "0:6"), cwd=work, env=environment(),
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        while not (pids.is_file() and len(pids.read_text().split()) >= 4):
+            time.sleep(0.05)
+        mine = [int(line) for line in pids.read_text().split()]
+        server = children(program.pid)[0]
+        keeper = children(server)[0]
+        mine += family(server) if whom in ("command", "group") else family(keeper)
+        target = {"command": program.pid, "group": program.pid, "server": server, "keeper": keeper}[whom]
+        (os.killpg if whom == "group" else os.kill)(target, number)
+        took = until_gone(mine)
+        if whom not in ("command", "group"):
+            program.kill()
+        code = program.wait()
+        frame = Path(pids.with_suffix(f"{pids.suffix}.frame").read_text())
+        wrong = (
+            "" if took < 2 else f"alive after {took:.1f} s: {[pid for pid in mine if Path(f'/proc/{pid}').exists()]}"
+        )
+        if whom == "command" and number != signal.SIGKILL and code != 128 + number:
+            wrong = f"exit code {code}"
+        if not wrong and frame.parent.exists():
+            wrong = f"{frame.parent} is left in {SHARED_MEMORY}"
+        note(
+            counted, f"{number.name} to the {whom}: {len(mine)} processes gone in {took:.2f} s, exit code {code}", wrong
+        )
+    return counted
+
+
+def until_gone(pids: list[int]) -> float:
+    """Seconds until none of the processes runs; 10 if some still do."""
+    began = time.monotonic()
+    while time.monotonic() - began < 10:
+        if not any(_runs(pid) for pid in pids):
+            break
+        time.sleep(0.01)
+    return time.monotonic() - began
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def note(counted: Counter[str], what: str, wrong: str) -> None:
+    """Count and print."""
+    counted["tried"] += 1
+    counted["survived"] += not wrong
+    sys.stdout.write(f"{what}: {wrong or 'fine'}\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Disturb, and print the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("operations", "moments", "signals"))
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--times", type=int, default=20)
+    parser.add_argument("--fault", nargs="+", default=["kill", "full", "read-only", "gone"])
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="kills-") as folder:
+        work = Path(folder)
+        if options.what == "operations":
+            counted = operations(work, options.fault, options.every)
+        elif options.what == "moments":
+            counted = moments(work, options.times)
+        else:
+            counted = signals(work)
+    sys.stdout.write(f"{options.what}: {dict(counted)}\n")
+    return 0 if counted["tried"] == counted["survived"] and not counted["tracebacks"] else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
