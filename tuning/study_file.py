@@ -180,6 +180,8 @@ def make_spec(values: Any, where: str) -> StudySpec:
     """
     try:
         return StudySpec.model_validate(values)
+    except OSError as error:  # a sequence is named by what cannot be a path
+        raise StudyError(f"{where}: {error.strerror}: {error.filename}") from error
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))

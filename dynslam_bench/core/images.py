@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,6 @@ MOST_PIXELS = 1 << 26
 MOST_BYTES = 512 * MEGABYTE
 AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-_PNG_END = b"IEND\xaeB`\x82"
 
 
 def read_image(
@@ -49,8 +49,8 @@ def read_image(
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
     if not data:
         raise kind(f"image {path} is empty (0 bytes)", "fetch it again")
-    if data.startswith(_PNG_START) and _PNG_END not in data[-64:]:
-        # some OpenCV versions fill what is missing of a truncated PNG with zeros, hence this check
+    if data.startswith(_PNG_START) and not _is_whole_png(data):
+        # some OpenCV versions fill what is missing of a PNG with zeros, some take the memory that a chunk claims
         raise kind(f"image {path} is truncated ({len(data)} bytes)", "fetch it again")
     found = image_size(data)
     if found is not None and size is not None and found != size:
@@ -67,3 +67,14 @@ def read_image(
             f"image {path} cannot be decoded ({len(data)} bytes)", "it is damaged, or no PNG, JPEG, TIFF, BMP or PNM"
         )
     return np.asarray(image)
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether every chunk up to the last ends within the file."""
+    position = len(_PNG_START)
+    while position + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        position += 12 + length
+        if kind == b"IEND":
+            return position <= len(data)
+    return False

@@ -63,6 +63,14 @@ def test_an_image_that_claims_to_be_huge_costs_nothing(tmp_path: Path, kind: str
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # KB
 
 
+def test_a_png_whose_chunk_claims_gigabytes_is_refused(tmp_path: Path) -> None:
+    data = lying_png(16, 12)
+    at = data.index(b"IDAT") - 4
+    (tmp_path / "1.png").write_bytes(data[:at] + b"\xff\xff\xff\xff" + data[at + 4 :])
+    with pytest.raises(SequenceError, match="is truncated"):
+        read_image(tmp_path / "1.png", kind=SequenceError)
+
+
 @pytest.mark.parametrize("name", ["../secret.png", "/etc/passwd", "rgb/../../secret.png", "a\\..\\b.png"])
 def test_lists_name_nothing_outside_their_folder(tmp_path: Path, name: str) -> None:
     folder, *_ = make_folder(tmp_path / "seq")
