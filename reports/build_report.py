@@ -15,7 +15,7 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
-from .html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
+from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
 from .model.board import Board, On, make_board
@@ -88,7 +88,12 @@ def build_report(
     loaded = load_runs(stores, protocol, on_progress)
     board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
     again = command or _command([store.root for store in stores], output, board)
-    draft = _draft(board, loaded, protocol, output, title, again, picture_seconds, on_progress)
+    explored = write_explore(
+        board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
+        progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
+    )  # fmt: skip
+    on_progress(0, None, "putting the tables and figures together")
+    draft = _drafted(board, protocol, loaded, explored, again)
     data = ReportData(
         title=title,
         protocol=protocol.describe(),
@@ -100,29 +105,14 @@ def build_report(
     return _write(draft, board, output, data)
 
 
-def _draft(
-    board: Board,
-    loaded: Loaded,
-    protocol: Protocol,
-    output: Path,
-    title: str,
-    again: str,
-    picture_seconds: float,
-    on_progress: OnProgress,
-) -> Draft:
-    """All sections of the page; writes the pages of the runs, which some of them lead to."""
+def _drafted(board: Board, protocol: Protocol, loaded: Loaded, explored: Explored, again: str) -> Draft:
+    """The sections of the page in their order."""
     draft = Draft()
-    explored = write_explore(
-        board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
-        progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
-    )  # fmt: skip
-    on_progress(0, None, "comparing on common frames")
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
     sections.add_errors(draft, board, protocol, loaded)
     add_paper(draft, board, protocol)
-    on_progress(0, None, "drawing trajectories")
     sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)

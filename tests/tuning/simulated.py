@@ -65,7 +65,9 @@ class SimulatedTuner(Tuner):
         self, spec: StudySpec, results: Path, *, effect: Effect = nothing, seed: int = 0, in_memory: bool = True
     ) -> None:
         self.effect, self.noise_seed, self.runs = effect, seed, 0
-        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: _design(spec.tune, spec.held_out)):
+        with patch(
+            "dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design(spec.tune, spec.held_out)
+        ):
             if not in_memory:
                 super().__init__(spec, results)
                 return
@@ -87,6 +89,6 @@ class SimulatedTuner(Tuner):
 
 
 @cache
-def _design(tune: tuple[str, ...], held_out: tuple[str, ...]) -> Design:
+def simulated_design(tune: tuple[str, ...], held_out: tuple[str, ...]) -> Design:
     """Opening the sequences takes longer than a study here."""
     return design_of(make_spec(tune=tune, held_out=held_out))

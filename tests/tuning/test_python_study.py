@@ -10,11 +10,12 @@ from unittest.mock import patch
 
 import optuna
 import pytest
-from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, _design, valley
+from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, simulated_design, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.tuning import Block, Outcome, Study, StudySpec, Tuner, read_study
 from dynslam_bench.tuning.old_form import converted
+from dynslam_bench.tuning.storage import open_storage
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
 FIELDS: dict[str, Any] = {
@@ -28,7 +29,7 @@ class DrawnTuner(SimulatedTuner):
 
     def __init__(self, spec: StudySpec, results: Path, **given: Any) -> None:
         self.effect, self.noise_seed, self.runs = valley, 0, 0
-        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: _design((TUNE,), (HELD_OUT,))):
+        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
             Tuner.__init__(self, spec, results, **given)
 
 
@@ -59,7 +60,7 @@ def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
     again = Study(**FIELDS, results=tmp_path, objective=steady, start=[{"wobble": 0}])
     assert len(again.run().study.get_trials()) == 8, "resumed, and nothing enqueued twice"
     looked = Study.open(tmp_path / "studies" / "py")
-    assert len(looked.frame()) == 8 and optuna.load_study(study_name="py", storage=study.study._storage)
+    assert len(looked.frame()) == 8 and optuna.load_study(study_name="py", storage=open_storage(tmp_path, study.spec))
     with pytest.raises(StudyError, match=r"opened to be looked at.*Study\(\.\.\.\)"):
         looked.run()
 
