@@ -99,7 +99,7 @@ class PictureBook:
         number = (record.frames or (0, None))[0] + (index * record.stride) + record.offset
         path = self.output / FOLDER / (record.sequence.block or record.sequence.part) / f"{number}.webp"
         if not path.is_file():
-            if self._spent > self.seconds:
+            if self._spent >= self.seconds:
                 raise DynslamError(f"not drawn within {self.seconds:.0f} s", "make the report again: it goes on there")
             began = time.perf_counter()
             image = self._sequence(run)[index].rgb
