@@ -15,12 +15,12 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
-from .html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
+from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
 from .model.board import Board, On, make_board
 from .model.report_data import REPORT_FILE, ReportData
-from .model.rows import OnProgress, load_runs, open_stores, unheard
+from .model.rows import Loaded, OnProgress, load_runs, open_stores, unheard
 from .tables.latex import to_latex
 from .tables.table import Table, csv_text, prose, to_csv, to_markdown
 
@@ -88,23 +88,12 @@ def build_report(
     loaded = load_runs(stores, protocol, on_progress)
     board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
     again = command or _command([store.root for store in stores], output, board)
-    draft = Draft()
     explored = write_explore(
         board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
         progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
     )  # fmt: skip
-    on_progress(0, None, "comparing on common frames")
-    sections.add_leaderboard(draft, board, protocol, loaded)
-    sections.add_explore(draft, explored)
-    sections.add_speed(draft, board)
-    sections.add_errors(draft, board, protocol, loaded)
-    add_paper(draft, board, protocol)
-    on_progress(0, None, "drawing trajectories")
-    sections.add_trajectories(draft, board, loaded, protocol)
-    sections.add_repeatability(draft, board)
-    sections.add_masks(draft, board)
-    sections.add_failures(draft, board)
-    sections.add_provenance(draft, board, again)
+    on_progress(0, None, "putting the tables and figures together")
+    draft = _drafted(board, protocol, loaded, explored, again)
     data = ReportData(
         title=title,
         protocol=protocol.describe(),
@@ -114,6 +103,22 @@ def build_report(
     )
     on_progress(0, None, "writing")
     return _write(draft, board, output, data)
+
+
+def _drafted(board: Board, protocol: Protocol, loaded: Loaded, explored: Explored, again: str) -> Draft:
+    """The sections of the page in their order."""
+    draft = Draft()
+    sections.add_leaderboard(draft, board, protocol, loaded)
+    sections.add_explore(draft, explored)
+    sections.add_speed(draft, board)
+    sections.add_errors(draft, board, protocol, loaded)
+    add_paper(draft, board, protocol)
+    sections.add_trajectories(draft, board, loaded, protocol)
+    sections.add_repeatability(draft, board)
+    sections.add_masks(draft, board)
+    sections.add_failures(draft, board)
+    sections.add_provenance(draft, board, again)
+    return draft
 
 
 def _command(roots: Sequence[Path], output: Path, board: Board) -> str:

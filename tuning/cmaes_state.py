@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 from typing import Any
 
 from optuna.samplers import _cmaes as optuna_cmaes
@@ -41,6 +42,9 @@ class _OnlyStates:
     @staticmethod
     def loads(data: bytes) -> Any:
         try:
+            for operation, argument, _ in pickletools.genops(data):
+                if operation.name in ("PUT", "LONG_BINPUT") and int(argument) > len(data):
+                    raise pickle.UnpicklingError(f"it asks for room for {argument} objects")
             return _State(io.BytesIO(data)).load()
         except Exception as error:  # a pickle that somebody made can raise whatever it likes
             raise StudyError(

@@ -143,8 +143,15 @@ class Study:
         return screen_study(self._running(), points=points, blocks=blocks, jobs=jobs)
 
     def frame(self) -> pd.DataFrame:
-        """All trials; see `frame.trials_frame`."""
-        return trials_frame(self.spec, self.study)
+        """All trials; see `frame.trials_frame`.
+
+        Raises:
+            StudyError: The storage holds something else than this package stores of a trial.
+        """
+        try:
+            return trials_frame(self.spec, self.study)
+        except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError) as error:
+            raise StudyError(f"the storage of study '{self.spec.name}' holds what is no trial: {error}") from error
 
     def _running(self) -> Tuner:
         if self._tuner is None:

@@ -84,7 +84,7 @@ class StudySpec(_Part):
         data_root: Folder of the recorded sequences.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)
     tracker: str = "emfoa-oft"
     tune: tuple[str, ...] = Field(min_length=1)
     confirm: tuple[str, ...] = ()

@@ -17,7 +17,7 @@ _received: list[int] = []
 def watch_signals() -> None:
     """From now on each of the signals raises `KeyboardInterrupt` in the main thread; a second one ends at once.
 
-    A signal that is ignored already, as SIGHUP is under ``nohup``, stays so.
+    A signal that is ignored already, as a program that is to outlive its terminal ignores SIGHUP, stays so.
     """
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:

@@ -207,7 +207,7 @@ def run_trials(spec: StudySpec, results: Path, jobs: int) -> Tuner:
             if event.kind == "pilot":
                 note(event.text)
             if event.kind == "finished":
-                note(f"trial {event.number}: {event.text}")
+                note(event.text)
                 advance(event.number + 1, event.total)
             elif event.kind == "reference":
                 advance(0, spec.trials, f"{spec.tracker} as it is by default on {event.text}")

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from statistics import median
 
-from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.evaluation.evaluate import evaluate
+import numpy as np
+
+from dynslam_bench.core.errors import DynslamError, EvaluationError
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.evaluation.association import match
+from dynslam_bench.evaluation.error_statistics import statistics
 from dynslam_bench.evaluation.frames import common_frames
 from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
 
 from .board import Board
 from .rows import Loaded, LoadedRun
@@ -19,7 +24,6 @@ def common_errors(
     """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are."""
     errors: dict[tuple[str, str], float] = {}
     frames: dict[str, str] = {}
-    brief = protocol.model_copy(update={"rpe": (), "segments_m": (), "lost_frames": "exclude"})
     for sequence in board.sequences:
         runs = successful(board, sequence, loaded)
         pairs = [(run, run.trajectory(protocol.trajectory)) for run in runs]
@@ -38,12 +42,26 @@ def common_errors(
             if truth is None:
                 continue
             try:
-                error = evaluate(trajectory, truth, brief).metrics["ate_rmse_m"]
+                error = _ate(trajectory, truth, protocol)
             except DynslamError:
                 continue
             values.setdefault(run.row.variant_key, []).append(error)
         errors |= {(key, sequence): median(found) for key, found in values.items()}
     return errors, frames
+
+
+def _ate(estimate: Trajectory, truth: Trajectory, protocol: Protocol) -> float:
+    """The ATE alone in metres, as `evaluate` takes it: there are as many of these as runs.
+
+    Raises:
+        EvaluationError: Fewer than two poses have ground truth.
+    """
+    association = match(estimate, truth, protocol)
+    if len(association) < 2:
+        raise EvaluationError("only one pose has ground truth")
+    matched, true = estimate.T_world_cam[association.estimate], truth.T_world_cam[association.ground_truth]
+    left = align(matched, true, protocol.alignment).apply(matched)[:, :3, 3] - true[:, :3, 3]
+    return statistics(np.linalg.norm(left, axis=1))["rmse"]
 
 
 def representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:

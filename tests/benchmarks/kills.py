@@ -39,7 +39,7 @@ from dynslam_bench.runs.process.family import children, family  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
 STUDY = (
-    'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\npruner = "none"\nseeds = [0]\nallow_overlap = true\n'
+    'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\nseeds = [0]\noffsets = [0]\nallow_overlap = true\n'
 )
 DISTURBED = (
     "import atexit, sys; from pathlib import Path; from faults import Injector\n"

@@ -20,7 +20,8 @@ MOST_MB = 512
 """One input may not take more memory than this, whatever it claims to be."""
 MOST_S = 5.0
 """Nor more processor time."""
-HANGS_S = 60
+HANGS_S = 30.0
+"""Processor time after which an input is given up."""
 LONGEST_MESSAGE = 2100
 WATCHED = 16
 """Every so many inputs the lines are counted, and an input that reaches new ones joins the seeds."""
@@ -100,8 +101,8 @@ def _one(target: Target, data: bytes | None, folder: Path, coverage: Coverage | 
     folder.mkdir()
     before, began, seen = _peak_mb(), time.process_time(), 0 if coverage is None else len(coverage.seen)
     refused, fault = False, ""
-    signal.signal(signal.SIGALRM, _hangs)
-    signal.alarm(HANGS_S)
+    signal.signal(signal.SIGPROF, _hangs)
+    signal.setitimer(signal.ITIMER_PROF, HANGS_S)
     try:
         if coverage is None:
             target.read(data, folder)
@@ -117,7 +118,7 @@ def _one(target: Target, data: bytes | None, folder: Path, coverage: Coverage | 
         last = traceback.extract_tb(error.__traceback__)[-1]
         fault = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}"
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     if not fault and _peak_mb() - before > MOST_MB:
         fault = f"takes more than {MOST_MB} MB"
     if not fault and time.process_time() - began > MOST_S:
@@ -130,4 +131,4 @@ def _peak_mb() -> float:
 
 
 def _hangs(*_: object) -> None:
-    raise TimeoutError(f"no end within {HANGS_S} s")
+    raise TimeoutError(f"no end within {HANGS_S:g} s")

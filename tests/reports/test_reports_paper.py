@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from reports_fake_store import add_run, truth_of
+from reports_fake_store import add_run, stamps_of, truth_of
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError
@@ -13,6 +13,8 @@ from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import load_board, publish
 from dynslam_bench.reports.figures.paper import FIGURES, bar_figure
+from dynslam_bench.reports.model.common import common_errors
+from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.paper import LOST_MARK, absolute_table, relative_table, subject_of, time_table
 from dynslam_bench.runs.storage.store import RunStore
 
@@ -110,3 +112,22 @@ def test_tables_of_the_paper_are_in_the_report(store, tmp_path):
         with (tmp_path / "leaderboard" / "csv" / f"{name}.csv").open() as file:
             assert len(list(csv.DictReader(file))) >= 3
     assert "paper-rmse" in (tmp_path / "leaderboard" / "index.html").read_text()
+
+
+def test_errors_on_common_frames_are_those_of_the_evaluation(store):
+    """Of the loser's 58 of 60 frames all have the same, and the number is what `evaluate` says of them."""
+    loaded = load_runs([store], PROTOCOL)
+    board = load_board(store)
+    found, frames = common_errors(board, PROTOCOL, loaded)
+    assert frames["s/a"] == "58 of 60"
+    errors = {}
+    for run in loaded.runs:
+        if run.row.sequence == "s/a" and not run.row.failed:
+            whole = store.trajectory(run.row.run_id)
+            stamps = stamps_of(60)
+            kept = np.isin(whole.timestamps.round(6), np.delete(stamps, [20, 21]).round(6))
+            metrics = evaluate(whole.select(kept), truth_of("s/a", 60)).metrics
+            errors[run.row.variant_key] = metrics["ate_rmse_m"]
+    assert len(errors) == 3
+    for key, error in errors.items():
+        assert found[key, "s/a"] == pytest.approx(error, rel=1e-8)

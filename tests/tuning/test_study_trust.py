@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import pickletools
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +53,12 @@ def test_nothing_but_its_own_classes_is_restored(guarded: Path, name: bytes) -> 
         optuna_cmaes.pickle.loads(name)
 
 
+def test_a_few_bytes_cost_no_gigabytes(guarded: Path) -> None:
+    """The number of a stored object is the length of the table that Python makes for them."""
+    with pytest.raises(StudyError, match="it asks for room for 680813941 objects"):
+        optuna_cmaes.pickle.loads(b"\x80\x04Nr" + (680813941).to_bytes(4, "little") + b".")
+
+
 def test_its_own_state_comes_back(guarded: Path) -> None:
     cmaes = pytest.importorskip("cmaes")
     made = cmaes.CMA(mean=np.zeros(2), sigma=1.0, seed=1)
@@ -88,8 +96,25 @@ def test_the_password_is_in_nothing_that_is_stored() -> None:
     assert "s3cret" not in str(spec.for_others()) and "s3cret" not in spec.digest()
 
 
-@pytest.mark.parametrize("content", [b"\xff", b"[]", b"{", b'{"name": "../../x", "tune": ["a"]}', b"[" * 10**5])
+@pytest.mark.parametrize(
+    "content",
+    [b"\xff", b"[]", b"{", b'{"name": "../../x", "tune": ["a"]}', b'{"name": "' + b"a" * 300 + b'"}', b"[" * 10**5],
+)
 def test_a_damaged_stored_study_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "study.json").write_bytes(content)
     with pytest.raises(StudyError, match=r"study\.json"):
         Study.open(tmp_path)
+
+
+@pytest.mark.parametrize("value", ["", {}, [1], "x" * 400])
+def test_a_journal_that_holds_no_trials_is_one_clear_line(tmp_path: Path, value: object) -> None:
+    fixture = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results" / "studies" / "small"
+    study = shutil.copytree(fixture, tmp_path / "results" / "studies" / "small")
+    assert len(Study.open(study).frame()) > 0
+    lines = [json.loads(line) for line in (study / "journal.log").read_text().splitlines()]
+    for line in lines:
+        if "coverage" in line.get("user_attr", {}):
+            line["user_attr"]["coverage"] = value
+    (study / "journal.log").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(StudyError, match="holds what is no trial"):
+        Study.open(study).frame()

@@ -128,7 +128,7 @@ def _read(path: Path) -> dict[str, list[Any]]:
     """The rows of an index by run id; none if there is none, or it is damaged or of another version."""
     try:
         found = json.loads(path.read_bytes())
-        rows = found["rows"] if found["head"] == _HEAD else {}
+        rows: dict[str, list[Any]] = found["rows"] if found["head"] == _HEAD else {}
         return rows if all(_is_row(run_id, values) for run_id, values in rows.items()) else {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {}
