@@ -128,6 +128,6 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
             Snapshot(int(index), points[at], kept[at], masks[at] if found["masked"][at] else None)
             for at, index in enumerate(found["index"])
         ]
-    except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
         raise RunError(f"{path} holds no snapshots: {error}") from error
     return (height, width), shots

@@ -15,7 +15,7 @@ SUITE = (
     '[settings]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
 )
 STUDY = (
-    'tracker = {tracker!r}\ntune = [{folder!r}]\ntrials = 4\nseeds = [0]\noffsets = [0]\n'
+    "tracker = {tracker!r}\ntune = [{folder!r}]\ntrials = 4\nseeds = [0]\noffsets = [0]\n"
     '[space.fixed]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
 )
 

@@ -1,4 +1,5 @@
 // Figures: plotly-like specifications (data and layout) drawn as SVG that follows theme and width.
+const DEFAULT_COLOURS = ["#1f6fb4", "#d9542b", "#2a9d6f", "#8a5cc2"];
 const NARROW = 620, FONT = "12.5px Inter, system-ui, sans-serif";
 const ruler = document.createElement("canvas").getContext("2d");
 const widthOf = (text) => { ruler.font = FONT; return ruler.measureText(text).width; };
@@ -201,6 +202,9 @@ function decoded(value) {
 /** Draw a figure into its element, with a legend that shows and hides, and values where the pointer rests. */
 function drawChart(element, given) {
   const figure = decoded(given);
+  figure.data.forEach((trace, at) => {
+    if (!trace.marker?.color && !trace.line?.color) trace.line = { ...trace.line, color: DEFAULT_COLOURS[at % DEFAULT_COLOURS.length] };
+  });
   const layout = figure.layout ?? {}, hidden = new Set(), chart = { figure, panels: [], cursorAt: given.cursor };
   const keyOf = (trace) => trace.legendgroup ?? trace.name ?? "";
   for (const trace of figure.data) if (trace.visible === "legendonly") hidden.add(keyOf(trace));

@@ -16,6 +16,7 @@ function logTicks(low, high, count) {
   for (let power = Math.floor(low); power <= Math.ceil(high); power++)
     for (const multiple of multiples) ticks.push(multiple * 10 ** power);
   ticks = ticks.filter((tick) => Math.log10(tick) >= low - 1e-9 && Math.log10(tick) <= high + 1e-9);
+  if (ticks.length < 3) return linearTicks(10 ** low, 10 ** high, Math.min(count, 5));
   const every = Math.ceil(ticks.length / Math.max(count, 2));
   return every > 1 ? ticks.filter((_, at) => at % every === 0) : ticks;
 }
