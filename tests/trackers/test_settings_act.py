@@ -56,6 +56,9 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
     **{f"backend.relocalisation.{name}": ("orb-slam2", MANY)
        for name in ("searched", "candidates", "iterations", "max_distance")},
+    "multiview.order": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }),
     "segmentation.mask_threshold": NETWORK,
     "segmentation.nms_iou": NETWORK,
     "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
@@ -65,9 +68,9 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
 """Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
 UNSEEN = frozenset({
     "backend.tracking.local_map", "backend.keyframes.max_gap", "epipolar.confidence", "free_space.max_age_s",
-    "correlation.largest", "moving_vote.corners", "class_rule.vote_share", "class_rule.unmatched",
-    "box_depth.max_cover", "motion.threshold_share", "motion.memory", "multiview.order", "multiview.max_parallax_deg",
-    "depth_ransac.confidence", "depth_ransac.max_draws",
+    "correlation.largest", "moving_vote.corners", "class_rule.vote_share", "box_depth.max_cover",
+    "motion.threshold_share", "motion.memory", "multiview.max_parallax_deg",
+    "depth_ransac.max_draws",
     *(f"backend.relocalisation.{name}" for name in ("searched", "candidates", "iterations", "max_distance")),
 })  # fmt: skip
 """Settings that have not been seen to change anything on these frames: nothing is proved of them here.
