@@ -198,7 +198,7 @@ def test_recorded_refuses_what_does_not_fit(tmp_path):
     with pytest.raises(SegmentationError, match=r"is 16x12, but the frame is 32x24"):
         RecordedSegmenter(tmp_path).segment(frame())
     (tmp_path / "0.png").write_bytes(b"\x89PNG nothing")
-    with pytest.raises(SegmentationError, match="cannot read the mask"):
+    with pytest.raises(SegmentationError, match="cannot be decoded"):
         RecordedSegmenter(tmp_path).segment(frame())
     colour = np.zeros((24, 32, 3), np.uint8)
     colour[3, 3] = 1, 2, 3
