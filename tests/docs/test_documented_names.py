@@ -40,6 +40,8 @@ FOREIGN = {
     "GraphProto",
     "ValueInfoProto",
     "Dimension",
+    "PGPASSWORD",
+    "run_grpc_proxy_server",
 }
 """First parts of names that belong to other libraries and that our code never spells."""
 FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--fixed_delta"}
