@@ -43,7 +43,7 @@ class _OnlyStates:
     def loads(data: bytes) -> Any:
         try:
             for operation, argument, _ in pickletools.genops(data):
-                if operation.name in ("PUT", "LONG_BINPUT") and int(argument) > len(data):
+                if operation.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > len(data):
                     raise pickle.UnpicklingError(f"it asks for room for {argument} objects")
             return _State(io.BytesIO(data)).load()
         except Exception as error:  # a pickle that somebody made can raise whatever it likes

@@ -73,8 +73,8 @@ def _is_whole_png(data: bytes) -> bool:
     """Whether every chunk up to the last ends within the file."""
     position = len(_PNG_START)
     while position + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, position)
-        position += 12 + length
+        (length,), kind = struct.unpack_from(">I", data, position), data[position + 4 : position + 8]
+        position += 12 + int(length)
         if kind == b"IEND":
             return position <= len(data)
     return False
