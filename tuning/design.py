@@ -57,9 +57,11 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
     race, confirm = _race_and_confirm(spec.blocks(*spec.tune), spec.blocks(*spec.confirm))
     held_out = spec.blocks(*spec.held_out)
     notes = check_splits(
-        spec.name, {"tune": race, "confirm": confirm, "held_out": held_out}, data_root=spec.data_root,
+        spec.name,
+        {"tune": race, "confirm": confirm, "held_out": held_out},
+        data_root=spec.data_root,
         accept=accept or spec.allow_overlap,
-    )  # fmt: skip
+    )
     taken = {block.scene for block in (*race, *confirm, *held_out)}
     recorded = _recordings(spec, taken) if spec.recorded is None else spec.blocks(*spec.recorded)
     if spec.recorded:
@@ -68,7 +70,7 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
     race = running_order(race, spec.sampler_seed)
     return Design(
         tuple(race), tuple(with_more_starts(race)), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes)
-    )  # fmt: skip
+    )
 
 
 def with_more_starts(blocks: Sequence[Block]) -> list[Block]:

@@ -93,16 +93,21 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
         with warnings.catch_warnings():  # `group` (for conditional spaces) counts as experimental
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             return optuna.samplers.TPESampler(
-                n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2), multivariate=True, group=True,
-                constant_liar=True, **options,
-            )  # fmt: skip
+                n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2),
+                multivariate=True,
+                group=True,
+                constant_liar=True,
+                **options,
+            )
     if spec.sampler == "nsga2":
         return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), **options)
     if spec.sampler == "gp":
         return optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, **options)
     if len(spec.objectives) > 1:
-        raise StudyError(f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
-                         "use tpe, nsga2, gp or random")  # fmt: skip
+        raise StudyError(
+            f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
+            "use tpe, nsga2, gp or random",
+        )
     if spec.sampler == "cmaes":
         if find_spec("cmaes") is None:
             raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")

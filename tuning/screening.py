@@ -168,14 +168,17 @@ def _effect_of(
         return None
     dead = all(
         (base[block].ate_m, base[block].coverage) == (outcome.ate_m, outcome.coverage)
-        for base, moved in usable for block, outcome in moved.items()
-    )  # fmt: skip
+        for base, moved in usable
+        for block, outcome in moved.items()
+    )
     best: Effect | None = None
     for objective in objectives:
-        logs = np.array([
-            [math.log(objective.cost(outcome) / objective.cost(base[block])) for block, outcome in moved.items()]
-            for base, moved in usable
-        ])  # fmt: skip
+        logs = np.array(
+            [
+                [math.log(objective.cost(outcome) / objective.cost(base[block])) for block, outcome in moved.items()]
+                for base, moved in usable
+            ]
+        )
         size, low, high = size_of(logs)
         effect = Effect(name=name, objective=objective.what, size=size, low=low, high=high, dead=dead)
         best = effect if best is None or (effect.low, effect.size) > (best.low, best.size) else best

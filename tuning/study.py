@@ -103,8 +103,10 @@ class Tuner:
         )
         self.base = flatten(defaults)
         if spec.race == "wilcoxon" and len(spec.objectives) > 1:
-            raise StudyError(f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
-                             "use halving, rejection or none")  # fmt: skip
+            raise StudyError(
+                f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
+                "use halving, rejection or none",
+            )
         self.objectives = [find_objective(each) for each in spec.objectives] if objectives is None else list(objectives)
         sampler = build_sampler(spec) if sampler is None else sampler
         self.design = design_of(spec, accept=reading)
@@ -187,9 +189,10 @@ class Tuner:
         """The steps of the race at which every objective has a block that counts."""
         found = race.steps(self.spec.race, len(self.design.race))
         return [
-            step for step in found[:-1]
+            step
+            for step in found[:-1]
             if all(any(map(each.counts, self.design.race[:step])) for each in self.objectives)
-        ] + found[-1:]  # fmt: skip
+        ] + found[-1:]
 
     def _one(self, on_event: OnEvent | None) -> None:
         with self._lock:

@@ -90,8 +90,10 @@ def screen(
         write_json(found)
         return
     state = {name: "kept" for name in found.kept} | dict.fromkeys(found.dead, "no effect")
-    rows = [(each.name, each.objective, f"{each.size:.3f}", f"[{each.low:.3f}, {each.high:.3f}]",
-             state.get(each.name, "")) for each in found.effects]  # fmt: skip
+    rows = [
+        (each.name, each.objective, f"{each.size:.3f}", f"[{each.low:.3f}, {each.high:.3f}]", state.get(each.name, ""))
+        for each in found.effects
+    ]
     write_table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows)
     write()
     for name, reason in found.failed.items():

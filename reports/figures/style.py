@@ -37,7 +37,7 @@ def layout_of(height: int, **more: Any) -> dict[str, Any]:
         "legend": {"x": 1.02, "y": 1, "xanchor": "left", "yanchor": "top", "font": {"size": 12}, "tracegroupgap": 0},
         "hoverlabel": {"bgcolor": "white"},
         "showlegend": True,
-    }  # fmt: skip
+    }
     return base | more
 
 

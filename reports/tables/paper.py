@@ -42,11 +42,13 @@ def relative_table(board: Board, protocol: Protocol) -> Table | None:
         return None
     spec = protocol.rpe[0]
     return _statistics_table(
-        board, {name: f"rpe_{spec.key}_trans_{name}_m" for name in STATISTICS}, "paper_rpe",
+        board,
+        {name: f"rpe_{spec.key}_trans_{name}_m" for name in STATISTICS},
+        "paper_rpe",
         "Relative pose error, four statistics",
         f"As the paper's Table 2, over {spec.describe()}. {protocol.describe()}.",
         f"Relative pose error over {spec.describe()} (mm)",
-    )  # fmt: skip
+    )
 
 
 def time_table(board: Board) -> Table | None:

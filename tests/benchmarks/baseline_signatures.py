@@ -219,15 +219,21 @@ def report(folder: Path, instances: range | None = None) -> str:
         )
     trackers = sorted({tracker for tracker, _ in cells}, key=lambda name: (provenance[name] not in FAITHFUL, name))
     lines = [
-        "| twin | never-move m | exact masks m | fails from m | survives up to m |", "| --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+        "| twin | never-move m | exact masks m | fails from m | survives up to m |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     standstill = {twin: standstill_of(twin, cells, yardstick) for twin in twins}
     for twin in twins:
         known = standstill[twin]
-        lines.append(f"| {short(twin)} | {known:.3f} | {yardstick[twin].ate:.4f} | {0.5 * known:.4f} "
-                     f"| {3 * yardstick[twin].ate:.4f} |")  # fmt: skip
-    lines += ["", "| system | provenance | twin | ATE m | coverage | measured | published | verdict |",
-              "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+        lines.append(
+            f"| {short(twin)} | {known:.3f} | {yardstick[twin].ate:.4f} | {0.5 * known:.4f} "
+            f"| {3 * yardstick[twin].ate:.4f} |"
+        )
+    lines += [
+        "",
+        "| system | provenance | twin | ATE m | coverage | measured | published | verdict |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
     matched, by_letter, clear, alone, alone_matched, misses = 0, 0, 0, 0, 0, []
     for tracker in trackers:
         for twin in twins:
@@ -249,15 +255,20 @@ def report(folder: Path, instances: range | None = None) -> str:
                     misses.append(f"{tracker} on {short(twin)}: {measured} ({cell.ate:.4f} m), published {expected}")
             elif verdict != "not clear":
                 verdict += " (not counted)"
-            lines.append(f"| `{tracker}` | {provenance[tracker]} | {short(twin)} | {cell.ate:.4f}{cell.spread} "
-                         f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |")  # fmt: skip
+            lines.append(
+                f"| `{tracker}` | {provenance[tracker]} | {short(twin)} | {cell.ate:.4f}{cell.spread} "
+                f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |"
+            )
     share, other, single = (
         f"{100 * n / of:.0f} %" if of else "-"
         for n, of in ((matched, clear), (by_letter, clear), (alone_matched, alone))
     )
-    lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %).",
-              f"Without the cells where both classes hold: {alone_matched} of {alone} ({single}).",
-              f"With `fails` first where both classes hold: {by_letter} of {clear} ({other})."]  # fmt: skip
+    lines += [
+        "",
+        f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %).",
+        f"Without the cells where both classes hold: {alone_matched} of {alone} ({single}).",
+        f"With `fails` first where both classes hold: {by_letter} of {clear} ({other}).",
+    ]
     lines += ["", "Misses:", "", *(f"- {miss}" for miss in misses)] if misses else []
     return "\n".join([*lines, "", *filter_table(trackers, twins, cells, provenance)])
 
@@ -272,13 +283,17 @@ def filter_table(
     trackers: list[str], twins: list[str], cells: dict[tuple[str, str], Cell], provenance: dict[str, str]
 ) -> list[str]:
     """How long each system's filters take, what they cull, and who culls nothing on walking twins."""
-    lines = ["| system | filters ms per frame (median, worst twin) | culled per frame, walking | sitting |",
-             "| --- | --- | --- | --- |"]  # fmt: skip
+    lines = [
+        "| system | filters ms per frame (median, worst twin) | culled per frame, walking | sitting |",
+        "| --- | --- | --- | --- |",
+    ]
     idle, slow = [], []
     for tracker in trackers:
         found = {twin: cells[tracker, twin] for twin in twins if (tracker, twin) in cells}
-        counts = {kind: [n for twin, cell in found.items() if f"/{kind}_" in twin for n in cell.culled]
-                  for kind in ("walking", "sitting")}  # fmt: skip
+        counts = {
+            kind: [n for twin, cell in found.items() if f"/{kind}_" in twin for n in cell.culled]
+            for kind in ("walking", "sitting")
+        }
         if not any(counts.values()):
             continue  # controls and adapters cull nothing by nature and say nothing
         ms = {twin: float(np.median(cell.filter_ms)) for twin, cell in found.items()}

@@ -177,8 +177,10 @@ def main() -> None:
     first, last = chosen.frames.split(":")
     part = (int(first or 0), int(last) if last else None)
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
-        print("| system | precision | recall | background culled | still people culled | frames without culling "
-              "| ATE, mm | coverage |")  # fmt: skip
+        print(
+            "| system | precision | recall | background culled | still people culled | frames without culling "
+            "| ATE, mm | coverage |"
+        )
         print("| --- | --- | --- | --- | --- | --- | --- | --- |")
         shared = (chosen.sequences, part, chosen.masks, chosen.cache or Path(scratch))
         for line in pool.map(row, chosen.only, *([value] * len(chosen.only) for value in shared)):

@@ -127,9 +127,10 @@ def as_it_was(seen: Values) -> tuple[list[int], dict[int, Values], int]:
 def front(values: Values) -> list[int]:
     """Indices of the trials that none dominates."""
     return [
-        i for i, mine in enumerate(values)
+        i
+        for i, mine in enumerate(values)
         if not any((other <= mine).all() and (other < mine).any() for other in values)
-    ]  # fmt: skip
+    ]
 
 
 def hypervolume(values: Values, reference: tuple[float, float] = (2.0, 1.5)) -> float:

@@ -93,8 +93,9 @@ def main() -> None:
             each = ", ".join(f"{1000 * value:.1f}" for value in found[:, 1])
             print(
                 f"| `{tracker}` | {options.label or sequence} | {100 * share:.0f} % | {1000 * ate:.1f} | {each} | "
-                f"{100 * coverage:.0f} % | {1000 * flow:.1f} | {1000 * total:.0f} |", flush=True,
-            )  # fmt: skip
+                f"{100 * coverage:.0f} % | {1000 * flow:.1f} | {1000 * total:.0f} |",
+                flush=True,
+            )
             if options.write and np.isfinite(share):
                 write(options.write, tracker, f"{options.label or sequence}, frames {options.frames}", share)
 

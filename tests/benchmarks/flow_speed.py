@@ -115,9 +115,11 @@ def main() -> None:
             took = timed(one_frame(flow, first, second, points), repeats)
             result = flow.track(flow.prepare(first), flow.prepare(second), pair.points)
             good = 100 * (np.hypot(*(result.xy - pair.truth).T) < 1.5).mean()
-            note = "default" if settings == FlowSettings() else ", ".join(
-                f"{k}={v}" for k, v in settings.model_dump().items() if v != getattr(FlowSettings(), k)
-            )  # fmt: skip
+            note = (
+                "default"
+                if settings == FlowSettings()
+                else ", ".join(f"{k}={v}" for k, v in settings.model_dump().items() if v != getattr(FlowSettings(), k))
+            )
             cost = f"{took[2]:.1f} | {took[2] / yardstick[2]:.2f}" if threads == 1 else "- | -"
             print(f"| {note} | {threads} | {took[0]:.1f} | {took[1]:.1f} | {cost} | {good:.1f} |", flush=True)
     maps = timed(lambda: build_flow(FlowSettings()).prepare(second), repeats)

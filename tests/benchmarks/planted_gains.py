@@ -73,8 +73,10 @@ def study(case: str, options: argparse.Namespace) -> str:
 
     good = "emfoa-oft" if masked else "emfoa-oft-no-masks"
     published = evaluate(good, fixed, held, results=tuner.store, jobs=options.jobs)
-    loss, left = (ACCURACY.value(tuner.evaluate({**fixed, **own}, held, jobs=options.jobs, cache=False), published)
-                  for own in ({}, chosen))  # fmt: skip
+    loss, left = (
+        ACCURACY.value(tuner.evaluate({**fixed, **own}, held, jobs=options.jobs, cache=False), published)
+        for own in ({}, chosen)
+    )
     share = f"{100 * (1 - left / loss):.0f} %" if loss > LEAST_LOSS else "nothing to recover"
     return (
         f"{case}: planted loss {loss:+.3f} in log ATE, after the study {left:+.3f}: recovered {share} in "

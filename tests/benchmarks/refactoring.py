@@ -50,8 +50,10 @@ def machine() -> dict[str, str]:
     model = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line), "")
     return {
         "processor": model.partition(":")[2].strip() or platform.processor(),
-        "numpy": np.__version__, "opencv": cv2.__version__, "torch": torch.__version__,
-    }  # fmt: skip
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "torch": torch.__version__,
+    }
 
 
 def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:

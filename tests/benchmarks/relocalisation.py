@@ -37,9 +37,12 @@ from dynslam_bench.slam.places import most_alike  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
 DENSE = {
-    "keyframes.tracked_share": 1.0, "keyframes.established": 1, "keyframes.redundant_share": 1.0,
-    "keyframes.maximum": 100000, "bundle_adjustment.enabled": False,
-}  # fmt: skip
+    "keyframes.tracked_share": 1.0,
+    "keyframes.established": 1,
+    "keyframes.redundant_share": 1.0,
+    "keyframes.maximum": 100000,
+    "bundle_adjustment.enabled": False,
+}
 RIGHT_M = 0.05
 
 

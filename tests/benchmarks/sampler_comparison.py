@@ -46,8 +46,11 @@ def ackley(x: np.ndarray) -> float:
 
 
 FUNCTIONS: dict[str, tuple[Callable[[np.ndarray], float], float]] = {
-    "sphere": (sphere, 5.0), "Rosenbrock": (rosenbrock, 2.0), "Rastrigin": (rastrigin, 5.12), "Ackley": (ackley, 32.0),
-}  # fmt: skip
+    "sphere": (sphere, 5.0),
+    "Rosenbrock": (rosenbrock, 2.0),
+    "Rastrigin": (rastrigin, 5.12),
+    "Ackley": (ackley, 32.0),
+}
 
 
 def best_value(sampler: str, function: str, seed: int, trials: int) -> float:

@@ -101,8 +101,10 @@ def main() -> None:
         )
     online, final = np.exp(np.mean(ratios, axis=0))
     spread = np.exp(np.std(ratios, axis=0, ddof=1) / np.sqrt(len(ratios))) if len(ratios) > 1 else (np.nan, np.nan)
-    print(f"\ngeometric mean of {len(ratios)} ratios, online x {online:.3f} (standard error factor {spread[0]:.3f}), "
-          f"final x {final:.3f} ({spread[1]:.3f})")  # fmt: skip
+    print(
+        f"\ngeometric mean of {len(ratios)} ratios, online x {online:.3f} (standard error factor {spread[0]:.3f}), "
+        f"final x {final:.3f} ({spread[1]:.3f})"
+    )
 
 
 if __name__ == "__main__":

@@ -78,8 +78,10 @@ def main() -> None:
     network = untrained(resnet18_config(), 480, arguments.threads, arguments.objects)
     add("Mask R-CNN, ResNet-18, CFPN, shorter side 480", network)
     if embedded_weights() is not None:
-        add("embedded (half-width ResNet-18, CFPN, 320x240)",
-            build_segmenter(SegmentationSettings(source="embedded"), threads=arguments.threads))  # fmt: skip
+        add(
+            "embedded (half-width ResNet-18, CFPN, 320x240)",
+            build_segmenter(SegmentationSettings(source="embedded"), threads=arguments.threads),
+        )
     for name in ("yolov8n-seg_480x640_fp32", "deeplabv3_mnv2_voc_481x641"):
         if (WEIGHTS / f"{name}.onnx").is_file():
             settings = SegmentationSettings(source=f"onnx:{WEIGHTS / name}.onnx")
@@ -92,8 +94,10 @@ def main() -> None:
     rows.append((f"carry {len(found)} masks, sparse", lambda: carry_sparse(found, *grays)))
     rows.append(("dilation by 15 px", lambda: dynamic_mask(found, SegmentationSettings())))
     rows.append(("depth repair and dilation", lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth)))
-    print(f"{os.cpu_count()} cores, {arguments.threads} threads, load {os.getloadavg()[0]:.1f}, "
-          f"torch {torch.__version__}, OpenCV {cv2.__version__}\n")  # fmt: skip
+    print(
+        f"{os.cpu_count()} cores, {arguments.threads} threads, load {os.getloadavg()[0]:.1f}, "
+        f"torch {torch.__version__}, OpenCV {cv2.__version__}\n"
+    )
     print("| stage | wall ms | CPU ms |\n| --- | --- | --- |")
     for label, work in rows:
         wall, cpu = measure(work, arguments.repeats)

@@ -28,9 +28,10 @@ from dynslam_bench.trackers import TRACKERS  # noqa: E402
 def apart_mm(first, second) -> float:
     """Mean distance of the camera centres over the frames that both have a pose for."""
     pairs = [
-        (a.T_world_cam[:3, 3], b.T_world_cam[:3, 3]) for a, b in zip(first, second, strict=True)
+        (a.T_world_cam[:3, 3], b.T_world_cam[:3, 3])
+        for a, b in zip(first, second, strict=True)
         if a.T_world_cam is not None and b.T_world_cam is not None
-    ]  # fmt: skip
+    ]
     return 1e3 * float(np.mean([np.linalg.norm(a - b) for a, b in pairs])) if pairs else float("nan")
 
 

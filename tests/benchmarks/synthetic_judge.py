@@ -102,8 +102,10 @@ def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str,
 
 def table(rows: list[dict]) -> str:
     """Markdown: one line an id and control, the final and online ATE of every run."""
-    lines = ["| sequence | control | runs | final ATE, m: min / median / max | online: median | coverage | still |",
-             "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    lines = [
+        "| sequence | control | runs | final ATE, m: min / median / max | online: median | coverage | still |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
     groups: dict[tuple[str, str], list[dict]] = {}
     rank = [(id, control) for id in SYNTHETIC_IDS for control in CONTROLS]
     for row in sorted(rows, key=lambda row: rank.index((row["id"], row["control"]))):

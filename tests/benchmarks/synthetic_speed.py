@@ -26,15 +26,19 @@ def main() -> None:
         sequence = open_synthetic(f"{arguments.id}?frames={arguments.frames}", Path(folder), threads=arguments.threads)
         wall, cpu = time.perf_counter(), time.process_time()
         sequence[0]
-        print(f"first frame (load, textures, compile if not cached): {time.perf_counter() - wall:.1f} s wall, "
-              f"{time.process_time() - cpu:.1f} s CPU")  # fmt: skip
+        print(
+            f"first frame (load, textures, compile if not cached): {time.perf_counter() - wall:.1f} s wall, "
+            f"{time.process_time() - cpu:.1f} s CPU"
+        )
         wall, cpu = time.perf_counter(), time.process_time()
         made = sequence.render()
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         size = sum(path.stat().st_size for path in Path(folder).rglob("*.png")) / len(sequence)
-        print(f"render and write {made} frames, {arguments.threads} threads: {made / wall:.1f} frames/s wall; "
-              f"{1e3 * cpu / made:.0f} ms CPU a frame = {2 * made / cpu:.1f} frames/s on two free cores; "
-              f"{size / 1e3:.0f} kB a frame")  # fmt: skip
+        print(
+            f"render and write {made} frames, {arguments.threads} threads: {made / wall:.1f} frames/s wall; "
+            f"{1e3 * cpu / made:.0f} ms CPU a frame = {2 * made / cpu:.1f} frames/s on two free cores; "
+            f"{size / 1e3:.0f} kB a frame"
+        )
         wall, cpu = time.perf_counter(), time.process_time()
         for index in range(len(sequence)):
             sequence[index]

@@ -114,9 +114,10 @@ def test_settings_exist() -> None:
     named = [
         Mention(m.where, found.group(1))
         for m in MENTIONS
-        if (found := dotted.fullmatch(m.text)) and found.group(1).partition(".")[0] in groups
+        if (found := dotted.fullmatch(m.text))
+        and found.group(1).partition(".")[0] in groups
         and not re.search(rf"\.{SUFFIXES}$", found.group(1))
-    ]  # fmt: skip
+    ]
     assert not missing(named, lambda text: text in setting_names() or _is_symbol(text))
 
 

@@ -39,8 +39,10 @@ LIST = (
     b"# timestamp filename\n1.000000 rgb/1.png\n2.000000 rgb/2.png\n1.5 rgb/3.png\n2.0 rgb/4.png\nnan rgb/5.png\n3.0\n"
 )
 PAIRS = b"1.0 rgb/1.png 1.01 depth/1.png\n2.0 rgb/2.png 2.01 depth/2.png\n1.0 rgb/3.png 1.0 depth/3.png\n"
-CAMERA = (b"width = 640\nheight = 480\nfx = 525.0\nfy = 525.0\ncx = 319.5\ncy = 239.5\n"
-          b"distortion = [0.1, 0.0, 0.0, 0.0, 0.0]\nfps = 30.0\n")  # fmt: skip
+CAMERA = (
+    b"width = 640\nheight = 480\nfx = 525.0\nfy = 525.0\ncx = 319.5\ncy = 239.5\n"
+    b"distortion = [0.1, 0.0, 0.0, 0.0, 0.0]\nfps = 30.0\n"
+)
 ANSWER = {"state": "ok", "T_world_cam": np.eye(4).ravel().tolist(), "stats": {"a": 1}, "timings": {"orb": 0.01},
           "trajectory": [[1.0, 0, 0, 0, 0, 0, 0, 1], [2.0, 0, 0, 1, 0, 0, 0, 1]]}  # fmt: skip
 COCO = {

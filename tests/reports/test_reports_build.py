@@ -96,9 +96,11 @@ def test_the_leaderboard_orders_and_compares(made):
     _, paths = made
     board = rows_of(paths.csv["leaderboard"])
     assert [row["tracker"] for row in board[:4]] == [
-        "DynaSLAM N+G (our back end)", "Mask R-CNN (our back end)", "DS-SLAM (our back end)", "ORB-SLAM2 (our back "
-        "end)",
-    ]  # fmt: skip
+        "DynaSLAM N+G (our back end)",
+        "Mask R-CNN (our back end)",
+        "DS-SLAM (our back end)",
+        "ORB-SLAM2 (our back end)",
+    ]
     assert {row["#"] for row in board[:4]} == {"1–4 not separable"}  # four sequences tell nobody apart
     assert {row["tracker"] for row in board[4:]} == {"ORB-SLAM3", "constant velocity"}
     assert all(row["#"] == "–" for row in board[4:])

@@ -33,8 +33,10 @@ def test_the_camera_is_part_of_the_column_in_old_records_too(tmp_path):
     add_run(store, "elsewhere", "folder/s", kind="imported")
     board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
     assert set(board.sequences) == {
-        "folder/s (camera 640x480, f 525 525)", "folder/s (camera 640x480, f 400 525)", "folder/s",
-    }  # fmt: skip
+        "folder/s (camera 640x480, f 525 525)",
+        "folder/s (camera 640x480, f 400 525)",
+        "folder/s",
+    }
     alone = RunStore(tmp_path / "q")
     add_run(alone, "a", "folder/s", camera=right)
     add_run(alone, "elsewhere", "folder/s", kind="imported")
@@ -78,8 +80,10 @@ def test_names_lose_what_all_share():
     names = ["synthetic/walking_xyz@0?frames=60", "synthetic/sitting_xyz@0?frames=60"]
     assert list(shortened(names).values()) == ["walking_xyz", "sitting_xyz"]
     assert list(shortened([*names, "synthetic/sitting_xyz@1"]).values()) == [
-        "walking_xyz@0?frames=60", "sitting_xyz@0?frames=60", "sitting_xyz@1",
-    ]  # fmt: skip
+        "walking_xyz@0?frames=60",
+        "sitting_xyz@0?frames=60",
+        "sitting_xyz@1",
+    ]
     assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
     assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
     assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}

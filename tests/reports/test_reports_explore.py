@@ -54,9 +54,11 @@ def test_the_view_is_in_the_address(browser, report):
 def test_numbers_are_those_of_the_table_below(browser, report):
     explore(browser, report)
     name = browser.run("one('#explore-table tbody tr').cells[0].textContent")
-    shown = browser.run("Object.fromEntries([...one('#explore-table tbody tr').cells].slice(3)"
-                        ".map((cell, at) => [all('#explore-table thead th')[at + 3].textContent,"
-                        " cell.querySelector('a')?.textContent ?? cell.textContent]))")  # fmt: skip
+    shown = browser.run(
+        "Object.fromEntries([...one('#explore-table tbody tr').cells].slice(3)"
+        ".map((cell, at) => [all('#explore-table thead th')[at + 3].textContent,"
+        " cell.querySelector('a')?.textContent ?? cell.textContent]))"
+    )
     below = browser.run(f"""(() => {{
       const table = one("#per_sequence"), heads = [...table.tHead.rows].at(-1).cells;
       const row = [...table.tBodies[0].rows].find((each) => each.cells[0].textContent.trim() === {name!r});

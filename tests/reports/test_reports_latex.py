@@ -15,10 +15,13 @@ from dynslam_bench.runs.storage.store import RunStore
 
 needs_tex = pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 NAMES = (
-    "ORB-SLAM2 (our back end)", 'quotes "here" and `there`', r"100 % of_it & {\bf $x^2$} #1 ~ \end{table}", 
+    "ORB-SLAM2 (our back end)",
+    'quotes "here" and `there`',
+    r"100 % of_it & {\bf $x^2$} #1 ~ \end{table}",
     "émoji 😀 猫",
-    "<b>bold</b>", "a name that goes on and on until no column of a page could hold it",
-)  # fmt: skip
+    "<b>bold</b>",
+    "a name that goes on and on until no column of a page could hold it",
+)
 DOCUMENT = (
     "\\documentclass[twocolumn]{article}\\usepackage{booktabs}\\begin{document}\\input{report.tex}\\end{document}"
 )

@@ -11,9 +11,12 @@ def test_best_and_second_share_their_marks():
 
 def test_tables_in_every_format():
     table = Table(
-        "t", "A & B", "50 % of_it.", [Column("name", numeric=False), Column("x", "G"), Column("y", "G")],
+        "t",
+        "A & B",
+        "50 % of_it.",
+        [Column("name", numeric=False), Column("x", "G"), Column("y", "G")],
         [[TableCell("a|b_*", tag="imported"), TableCell("0.5", "±0.1", 0.51234, "best"), TableCell()]],
-    )  # fmt: skip
+    )
     assert "| a\\|b\\_\\* (imported) | **0.5** ±0.1 |  |" in to_markdown(table)
     assert to_csv(table) == "name,G: x,G: y\na|b_* imported,0.51234,\n"
     latex = to_latex(table)

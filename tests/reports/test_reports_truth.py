@@ -67,8 +67,9 @@ def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised
     half = make_board([*rows, row("c", "u"), row("good", "u"), row("bad", "u")])
     for each in relative_errors(half, PROTOCOL):
         assert [(cell.text, cell.emphasis) for cell in next(c for c in each.rows if c[0].text == "C")[1:3]] == [
-            ("", "failed"), ("", "failed"),
-        ]  # fmt: skip
+            ("", "failed"),
+            ("", "failed"),
+        ]
 
 
 def test_a_cell_with_one_failure_is_not_bold_and_not_green():

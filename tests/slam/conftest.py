@@ -48,9 +48,12 @@ class PointWorld:
         bits = np.unpackbits(self.descriptors[rows], axis=1)
         flips = rng.random(bits.shape) < 0.03
         keypoints = Keypoints(
-            xy.astype(np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32), np.ones(n, np.float32),
+            xy.astype(np.float32),
+            np.zeros(n, np.int32),
+            np.zeros(n, np.float32),
+            np.ones(n, np.float32),
             np.packbits(bits ^ flips, axis=1),
-        )  # fmt: skip
+        )
         blank = np.zeros((480, 640), np.uint8)
         return FrameBundle(
             index, index / 30.0 if stamp is None else stamp, np.dstack([blank] * 3), blank,

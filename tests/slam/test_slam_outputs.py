@@ -20,9 +20,12 @@ def outputs(points=50, keyframes=4):
     poses = se3.exp(rng.normal(0, 0.3, (keyframes, 6)))
     records = tuple(KeyframeRecord(i, 3 * i, 100.0 + i / 3, pose, 900, 300 + i) for i, pose in enumerate(poses))
     return MapOutputs(
-        records, np.arange(points), rng.normal(0, 2, (points, 3)), rng.integers(0, 256, (points, 3)).astype(np.uint8),
+        records,
+        np.arange(points),
+        rng.normal(0, 2, (points, 3)),
+        rng.integers(0, 256, (points, 3)).astype(np.uint8),
         rng.integers(1, 9, points),
-    )  # fmt: skip
+    )
 
 
 def test_keyframes_csv(tmp_path):

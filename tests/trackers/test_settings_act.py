@@ -37,13 +37,17 @@ def offered() -> dict[str, tuple[str, Parameter]]:
 
 OFFERED = offered()
 MANY = {
-    "backend.keyframes.tracked_share": 0.95, "backend.keyframes.established": 1, "backend.keyframes.moved_share": 1.0,
+    "backend.keyframes.tracked_share": 0.95,
+    "backend.keyframes.established": 1,
+    "backend.keyframes.moved_share": 1.0,
     "backend.keyframes.view_share": 0.98,
-}  # fmt: skip
+}
 """A keyframe nearly every frame."""
 FEW_KEYFRAMES = {
-    "backend.keyframes.tracked_share": 0.4, "backend.keyframes.moved_share": 0.8, "backend.keyframes.view_share": 0.5,
-}  # fmt: skip
+    "backend.keyframes.tracked_share": 0.4,
+    "backend.keyframes.moved_share": 0.8,
+    "backend.keyframes.view_share": 0.5,
+}
 JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
 """F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
@@ -135,8 +139,10 @@ def test_normalisation_changes_the_images_that_trackers_see(scene: Scene) -> Non
     for name in names:
         parameter = OFFERED[name][1]
         base = settings.model_copy(update={key.split(".")[1]: value for key, value in others_of(parameter).items()})
-        seen = {normalise(rgb, base.model_copy(update={name.split(".")[1]: value})).tobytes()
-                for value in values_of(parameter)}  # fmt: skip
+        seen = {
+            normalise(rgb, base.model_copy(update={name.split(".")[1]: value})).tobytes()
+            for value in values_of(parameter)
+        }
         assert len(seen) == len(values_of(parameter)), name
 
 
@@ -149,8 +155,9 @@ def test_every_setting_that_a_study_may_draw_changes_something(name: str, scene:
     system, parameter = OFFERED[name]
     system, others = CASES.get(name, (system, {}))
     base = SYSTEMS[system].settings()
-    wanted = {key: value for key, value in others_of(parameter).items()
-              if _value(base, key) not in dict(parameter.when)[key]}  # fmt: skip
+    wanted = {
+        key: value for key, value in others_of(parameter).items() if _value(base, key) not in dict(parameter.when)[key]
+    }
     shown = False
     for value in values_of(parameter):
         if shown or value == _value(base, name):

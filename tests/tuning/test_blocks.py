@@ -44,19 +44,22 @@ def test_parts_strides_and_degradation_reach_the_run() -> None:
     assert parse_blocks("bonn/crowd?frames=120")[0].frames == (0, 120)
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("bonn/crowd[0:10", 'names no blocks.*write it as "bonn/crowd'),
-    ("bonn/crowd[9:3]", "9:3 is no range of frames"),
-    (f"{WALK}@5-2", "'5-2' of .* is neither a number nor a range"),
-    (f"{WALK}@1,0-2", "names a number twice"),
-    ("bonn/crowd?offset=3", "unknown option 'offset=3'.*offsets"),
-    ("bonn/crowd?stride=2&stride=3", "names stride twice"),
-    ("bonn/crowd?noise=3", "noise is a draw of rendered sequences only"),
-    ("bonn/crowd[0:9]?frames=3", "names its frames twice"),
-    ("bonn/crowd?degrade=blurr:0.3", "unknown degradation 'blurr'.*'blur'"),
-    ("bonn/crowd?degrade=blur:3", "'blur' is 3.0, expected a strength"),
-    ("bonn/crowd?degrade=blur:much", "strength 'much' of blur is no number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bonn/crowd[0:10", 'names no blocks.*write it as "bonn/crowd'),
+        ("bonn/crowd[9:3]", "9:3 is no range of frames"),
+        (f"{WALK}@5-2", "'5-2' of .* is neither a number nor a range"),
+        (f"{WALK}@1,0-2", "names a number twice"),
+        ("bonn/crowd?offset=3", "unknown option 'offset=3'.*offsets"),
+        ("bonn/crowd?stride=2&stride=3", "names stride twice"),
+        ("bonn/crowd?noise=3", "noise is a draw of rendered sequences only"),
+        ("bonn/crowd[0:9]?frames=3", "names its frames twice"),
+        ("bonn/crowd?degrade=blurr:0.3", "unknown degradation 'blurr'.*'blur'"),
+        ("bonn/crowd?degrade=blur:3", "'blur' is 3.0, expected a strength"),
+        ("bonn/crowd?degrade=blur:much", "strength 'much' of blur is no number"),
+    ],
+)
 def test_what_cannot_be_read_is_one_clear_line(text: str, message: str) -> None:
     with pytest.raises(DynslamError, match=message) as caught:
         parse_blocks(text)

@@ -51,8 +51,10 @@ def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
     ).run()  # fmt: skip
     trials = study.study.get_trials()
     assert [trial.params for trial in trials[:3]] == [
-        {"gain": 1.5, "wobble": 2}, {"gain": 0.9, "wobble": 2}, {"gain": 1.5, "wobble": 0},
-    ]  # fmt: skip
+        {"gain": 1.5, "wobble": 2},
+        {"gain": 0.9, "wobble": 2},
+        {"gain": 1.5, "wobble": 0},
+    ]
     assert sorted(seen) == list(range(8)) and len(study.frame()) == 8
     assert study.spec.objectives == ("steady",) and isinstance(study.study.sampler, optuna.samplers.RandomSampler)
     summary = study.finish()

@@ -148,15 +148,17 @@ def test_importances_need_trials_and_exceed_chance() -> None:
 def test_what_changes_nothing_is_inert() -> None:
     trials = [
         optuna.trial.create_trial(
-            value=float(x), params={"x": x, "mode": mode, "one": 3},
+            value=float(x),
+            params={"x": x, "mode": mode, "one": 3},
             distributions={
-                "x": optuna.distributions.IntDistribution(0, 9), "one": optuna.distributions.IntDistribution(0, 9),
+                "x": optuna.distributions.IntDistribution(0, 9),
+                "one": optuna.distributions.IntDistribution(0, 9),
                 "mode": optuna.distributions.CategoricalDistribution(["a", "b"]),
             },
         )
         for x in range(4)
         for mode in ("a", "b")
-    ]  # fmt: skip
+    ]
     assert inert_parameters(trials, ["x", "mode", "one", "conditional"]) == ["mode", "one", "conditional"]
 
 
