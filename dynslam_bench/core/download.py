@@ -243,7 +243,11 @@ def _check_space(part: Path, total: int | None, start: int) -> None:
 
 @contextlib.contextmanager
 def _only_one(lock: Path, url: str) -> Iterator[None]:
-    with claimed(lock) as mine:
+    with contextlib.ExitStack() as held:
+        try:
+            mine = held.enter_context(claimed(lock))
+        except DynslamError as error:
+            raise DownloadError(str(error.args[0]), error.hint) from error
         if not mine:
             raise DownloadError(f"another process is downloading {url}", "wait for it, then run the same command again")
         yield

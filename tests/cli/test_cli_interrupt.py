@@ -20,6 +20,11 @@ STUDY = (
 )
 
 
+def attentive():
+    """Programs that a script starts in the background ignore Ctrl-C, and so do their children."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.mark.parametrize(
     ("verb", "text", "number"),
     [("bench", SUITE, signal.SIGHUP), ("bench", SUITE, signal.SIGTERM), ("tune run", STUDY, signal.SIGINT)],
@@ -44,7 +49,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     values = {"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}
     (tmp_path / "what.toml").write_text(text.format(**values).replace("'", '"'))
     command = [sys.executable, "-m", "dynslam_bench.cli", *verb.split(), "what.toml"]
-    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive)
     try:
         deadline = time.monotonic() + 300
         while not (pids.is_file() and pids.read_text().endswith("\n")):
@@ -66,8 +71,10 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
 def test_ctrl_c_while_everything_still_loads_is_one_line_and_stores_nothing(walk, tmp_path):
     """To the whole group, as a terminal sends it: the fork server is not hit, nothing counts as a crash."""
     command = [sys.executable, "-m", "dynslam_bench.cli", "run", "never-move", str(walk), "--frames", "0:4"]
-    for delay in (0.3, 1.5):
-        program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    for delay in (0.3, 0.9):
+        program = subprocess.Popen(
+            command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive, start_new_session=True
+        )
         time.sleep(delay)
         os.killpg(program.pid, signal.SIGINT)
         _, err = program.communicate(timeout=60)

@@ -33,6 +33,7 @@ def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
         "frames.csv",
         "log.txt",
         "run.json",
+        "snapshots.npz",
         "trajectory_final.txt",
         "trajectory_online.txt",
     ]
@@ -227,7 +228,7 @@ def test_results_folder_that_is_a_file(tmp_path: Path, toy_folder: str) -> None:
     store = RunStore(tmp_path / "results")
     with pytest.raises(RunError, match=r"cannot write into .*results/runs: (Not a directory|File exists)"):
         store.prepare()
-    with pytest.raises(RunError, match="cannot write into"):
+    with pytest.raises(DynslamError, match="cannot write into"):
         run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store)
 
 

@@ -75,7 +75,7 @@ def test_coco_without_a_network(store: RunStore, toy_folder: str, monkeypatch, t
     def refuse(*args: object, **kwargs: object) -> None:
         raise OSError("network is unreachable")
 
-    monkeypatch.setattr("urllib.request.urlopen", refuse)
+    monkeypatch.setattr("urllib.request.OpenerDirector.open", refuse)
     spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": "coco"})
     with pytest.raises(DynslamError, match=r"cannot fetch the checkpoint 'coco': .*network is unreachable \(put"):
         run_one(spec, store)

@@ -74,7 +74,7 @@ UNSEEN = frozenset({
     "backend.tracking.local_map", "backend.keyframes.max_gap", "epipolar.confidence", "free_space.max_age_s",
     "correlation.largest", "moving_vote.corners", "class_rule.vote_share", "box_depth.max_cover",
     "motion.threshold_share", "motion.memory", "multiview.max_parallax_deg",
-    "depth_ransac.max_draws",
+    "depth_ransac.max_draws", "guard.min_fraction", "backend.bundle_adjustment.window",
     *(f"backend.relocalisation.{name}" for name in ("searched", "candidates", "iterations", "max_distance")),
 })  # fmt: skip
 """Settings that have not been seen to change anything on these frames: nothing is proved of them here.

@@ -177,7 +177,7 @@ def test_bad_studies_are_refused_before_any_trial(
     with pytest.raises(DynslamError, match=message):
         run_study(make(sequences, **changes), results=tmp_path)
     journal = tmp_path / "studies" / "toy" / "journal.log"
-    assert not journal.exists() or '"op_code":4' not in journal.read_text()
+    assert not journal.exists() or '"op_code":6' not in journal.read_text()
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_bad_studies_are_refused_before_any_trial(
         ("[space]\ninclud = []\n", "unknown key 'space.includ'.*space.include"),
         ('held_out = ["synthetic/walking_xyz@0?frames=50"]\n', "share 1 sequences.*walking_xyz"),
         ("trials = 1\n", "trials.*greater than or equal to 2"),
-        ("trials = = 1\n", "is not TOML"),
+        ("trials = = 1\n", "is not valid TOML"),
     ],
 )
 def test_bad_study_files_are_one_clear_line(tmp_path: Path, text: str, message: str) -> None:

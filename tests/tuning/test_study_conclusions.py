@@ -169,7 +169,15 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 def test_a_study_is_a_frame_and_its_page_tells_what_holds_up(folders: list[str], tmp_path: Path) -> None:
-    values = {"name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:], "trials": 5, "top": 1}
+    values = {
+        "name": "toy",
+        "tracker": TRACKER,
+        "tune": folders[:1],
+        "held_out": folders[1:],
+        "trials": 5,
+        "top": 1,
+        "sampler_seed": 3,
+    }
     values |= {"space": {"include": ["gain", "mode", "anger"], "fixed": {"wobble": 0}}, "sampler": "random"}
     spec = StudySpec.model_validate(values | {"race": "none", "min_coverage": 0.5, "recorded": []})
     tuner = run_study(spec, results=tmp_path)

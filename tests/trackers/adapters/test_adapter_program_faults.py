@@ -22,7 +22,7 @@ FAULTS = {
     ),
     "silent exit": ("os._exit(0)", "exit code 0; it wrote no message"),
     "segfault": ("os.kill(os.getpid(), 11)", "killed by SIGSEGV"),
-    "no json": ("print('{pose: 1}', flush=True)", "answered no JSON"),
+    "no json": ("print('{pose: 1}', flush=True)", "is no valid JSON"),
     "error": ("say({'error': 'out of\\nmemory'})", "at frame 7: out of memory"),
     "no pose": ("say({'state': 'ok'})", "'ok' without T_world_cam"),
     "state": ("say({'state': 'fine', 'T_world_cam': STILL})", "known: initialising, ok, lost"),
