@@ -42,11 +42,11 @@ def check_address(url: str, *, checked: bool) -> SplitResult:
 
 
 def connect(request: urllib.request.Request, timeout_s: float) -> Any:
-    """`urllib.request.urlopen` for http and https alone, whatever a server redirects to.
+    """As the standard library opens an address, for http and https alone, whatever a server redirects to.
 
     Raises:
         DownloadError: The server redirects to another scheme.
-        OSError: As of ``urlopen``.
+        OSError: It cannot be reached, or answers with an error.
     """
     opener = urllib.request.OpenerDirector()
     for handler in (
