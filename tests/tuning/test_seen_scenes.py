@@ -1,4 +1,4 @@
-"""Studies whose masks come from a network that was trained on the scenes of the race say so, wherever a number stands."""
+"""Studies say where the masks come from a network that was trained on the scenes, wherever a number stands."""
 
 from __future__ import annotations
 
