@@ -18,6 +18,7 @@ from .importance import importances, inert_parameters
 from .objectives import ACCURACY, SPEED, Objective, Outcomes, together
 from .presets import write_presets
 from .ratio import Ratio, compared
+from .seen import splits_seen
 from .study import Tuner
 from .study_file import StudySpec
 from .summary import Candidate, StudySummary, choose, conclude
@@ -91,6 +92,7 @@ def _summary(
         recorded=[str(block) for block in design.recorded],
         tune=[str(block) for block in design.race],
         picks=picks,
+        seen=splits_seen(tuner.defaults, design),
     )
 
 

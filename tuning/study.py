@@ -101,7 +101,7 @@ class Tuner:
         self.space = search_space(
             self.tracker.settings, spec.space, {block.sequence for block in spec.blocks(*spec.tune)}
         )
-        self.base = flatten(defaults)
+        self.defaults, self.base = defaults, flatten(defaults)
         if spec.race == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(
                 f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
