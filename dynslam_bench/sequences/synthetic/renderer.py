@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .ids import SyntheticId
 from .kernels import motion as motion_kernels
 from .kernels import raycast as kernels
 from .kernels import sensors
 from .scenes.parts import QUAD, ROUND_CONE
 from .scenes.scene import Scene, Snapshot
-from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
+from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
 
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
@@ -54,7 +55,7 @@ class Renderer:
 
     def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
         self.settings = settings
-        self.scene = Scene(sequence, settings)
+        self.scene = Scene(sequence.world(), sequence.instance, settings)
         self.atlas = self.scene.atlas()
         self.threads = threads or default_threads()
         self._pool: ThreadPoolExecutor | None = None
@@ -261,7 +262,7 @@ class Renderer:
 
     def _glare(self, snap: Snapshot, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the room's back wall, brightening and fading."""
-        window = np.array([self.scene.plan.left_x * 0.55, self.scene.plan.back_y, 2.15])
+        window = np.array(self.scene.world.window)
         x, y, z = (window - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
         if z <= 0.1:
             return np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)

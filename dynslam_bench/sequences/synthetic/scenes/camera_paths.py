@@ -20,6 +20,7 @@ from dynslam_bench.core.seeding import stream
 
 Array = NDArray[np.float64]
 
+MOTIONS = ("xyz", "static", "halfsphere", "rpy")
 EYE_HEIGHT_M = 1.35
 TILT_RAD = math.radians(10.0)
 
