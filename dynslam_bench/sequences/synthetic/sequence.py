@@ -185,6 +185,7 @@ class SyntheticSequence:
             progress(done, len(self))
         if todo:
             single = Renderer(self._id, self.settings, 1)
+            single.prepare()
             with ThreadPoolExecutor(self.threads) as pool:
                 try:
                     for _ in pool.map(lambda i: self._make(i, single, lists=False) and None, todo):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from .family import Family
+from .loop import LOOP
 from .twins import SITTING, WALKING
 
-FAMILIES: dict[str, Family] = {family.name: family for family in (WALKING, SITTING)}
+FAMILIES: dict[str, Family] = {family.name: family for family in (WALKING, SITTING, LOOP)}
 TWIN_IDS = (*WALKING.ids(), *SITTING.ids())
 """The eight rendered twins of TUM's fr3 dynamic sequences."""
 SYNTHETIC_IDS = tuple(name for family in FAMILIES.values() for name in family.ids())
