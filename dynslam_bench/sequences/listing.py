@@ -53,7 +53,7 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
             entry = entries.get(name)
             if entry is None:
                 rendered = dataset.spec.id == "synthetic"
-                tags = ("high-dynamic" if "walking" in name else "low-dynamic",) if rendered else ()
+                tags = parse_synthetic_id(name).tags if rendered else ()
                 split = parse_synthetic_id(name).split if rendered else ""
                 size = "rendered" if rendered else ""
                 found.append(Summary(name, True, size, tags, split, license=dataset.spec.license))
