@@ -12,7 +12,7 @@ from dynslam_bench.cli.app import start
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
-from dynslam_bench.segmentation.masks.recording import _Numbers, record_masks
+from dynslam_bench.segmentation.masks.recording import LabelNumbers, record_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -63,8 +63,8 @@ def test_numbers_stand_for_classes_in_every_frame(tmp_path: Path) -> None:
         return Instances(masks, np.zeros((len(names), 4), np.float32), names, scores)
 
     path = tmp_path / "classes.json"
-    first = _Numbers(path).label_image(objects("person", "chair", "person"))
-    again = _Numbers(path).label_image(objects("chair", "person"))
+    first = LabelNumbers(path).label_image(objects("person", "chair", "person"))
+    again = LabelNumbers(path).label_image(objects("chair", "person"))
     table = {1: "person", 2: "chair", 3: "person"}
     assert [table[int(v)] for v in first[0, :4]] == ["person", "person", "chair", "person"], "the surest is on top"
     assert [table[int(v)] for v in again[0, :3]] == ["chair", "chair", "person"]

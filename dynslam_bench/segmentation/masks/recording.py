@@ -57,7 +57,7 @@ def record_masks(
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to record")
     _begin(folder, _origin(sequence, settings, segmenter.source))
-    numbers = _Numbers(folder / CLASSES_FILE)
+    numbers = LabelNumbers(folder / CLASSES_FILE)
     segmented = 0
     for index in range(len(sequence)):
         path = folder / f"{sequence.timestamps[index]:.6f}.png"
@@ -102,7 +102,7 @@ def _begin(folder: Path, origin: dict[str, object]) -> None:
     write_atomic(path, json.dumps(origin, indent=1))
 
 
-class _Numbers:
+class LabelNumbers:
     """The number of each object in the label images: one for the first person of a frame, one for the second, ...
 
     Args:
