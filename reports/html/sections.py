@@ -8,6 +8,7 @@ from ..figures import leaderboard as figures
 from ..figures.style import colours, safe
 from ..model.board import Board
 from ..model.common import common_errors, representatives
+from ..model.crew import Crew
 from ..model.missing import missing_commands, missing_note
 from ..model.published import is_excerpt, least_length_s, reported_for
 from ..model.rows import Loaded
@@ -87,7 +88,7 @@ def add_speed(draft: Draft, board: Board) -> None:
     draft.add(section)
 
 
-def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None) -> None:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     if not board.sequences:
         return
@@ -109,7 +110,7 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
         )
     table_of_errors = sequence_tables.per_sequence(board, protocol, published)
     section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
-    common, frames = common_errors(board, protocol, loaded)
+    common, frames = common_errors(board, protocol, loaded, crew)
     section.blocks += draft.titled(fairness_tables.common_frames_table(board, common, frames))
     if protocol.trajectory == "online":
         section.blocks += draft.titled(sequence_tables.final_errors(board, protocol))

@@ -8,16 +8,20 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .bounds import bounds_of
+from .ids import SyntheticId
 from .kernels import motion as motion_kernels
 from .kernels import raycast as kernels
 from .kernels import sensors
 from .scenes.parts import QUAD, ROUND_CONE
 from .scenes.scene import Scene, Snapshot
-from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
+from .scenes.textures import Atlas
+from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
 
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
@@ -54,16 +58,23 @@ class Renderer:
 
     def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
         self.settings = settings
-        self.scene = Scene(sequence, settings)
-        self.atlas = self.scene.atlas()
+        self.scene = Scene(sequence.world(), sequence.instance, settings)
         self.threads = threads or default_threads()
         self._pool: ThreadPoolExecutor | None = None
         self._pool_process = 0
         text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
         text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
-        self._density = self._texel_density()
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+
+    @cached_property
+    def atlas(self) -> Atlas:
+        """The textures; drawn when the first frame is coloured."""
+        return self.scene.atlas()
+
+    def prepare(self) -> None:
+        """Draw the textures now: once, before several threads render."""
+        self._density  # noqa: B018
 
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
@@ -151,17 +162,9 @@ class Renderer:
         scene = self.scene
         world = (scene.corners * scene.scale[:, None, :]) @ np.swapaxes(snap.rotation, 1, 2) + snap.origin[:, None, :]
         points = (world - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
-        z = points[:, :, 2]
-        nearest = z.min(axis=1)
-        seen = z.max(axis=1) > 0.05
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = points[:, :, 0] / z * CAMERA.fx + CAMERA.cx
-            v = points[:, :, 1] / z * CAMERA.fy + CAMERA.cy
+        nearest, low_u, low_v, high_u, high_v = bounds_of(points)
         tiles_x, tiles_y = -(-CAMERA.width // kernels.TILE), -(-CAMERA.height // kernels.TILE)
-        crossing = nearest <= 0.05
-        low_u, high_u = np.where(crossing, 0, u.min(1) - 2), np.where(crossing, CAMERA.width, u.max(1) + 2)
-        low_v, high_v = np.where(crossing, 0, v.min(1) - 2), np.where(crossing, CAMERA.height, v.max(1) + 2)
-        seen &= (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
+        seen = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
         boxes = np.stack(
             [
                 np.clip(low_u, 0, CAMERA.width - 1),
@@ -236,7 +239,8 @@ class Renderer:
         facets[:, :, 4] = self._density
         return facets
 
-    def _texel_density(self) -> NDArray[np.float64]:
+    @cached_property
+    def _density(self) -> NDArray[np.float64]:
         """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
         scene = self.scene
         repeats = np.abs(scene.uv[:, :, :2])
@@ -261,7 +265,7 @@ class Renderer:
 
     def _glare(self, snap: Snapshot, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the room's back wall, brightening and fading."""
-        window = np.array([self.scene.plan.left_x * 0.55, self.scene.plan.back_y, 2.15])
+        window = np.array(self.scene.world.window)
         x, y, z = (window - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
         if z <= 0.1:
             return np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
