@@ -124,7 +124,7 @@ def _drafted(
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
     sections.add_failures(draft, board)
-    sections.add_provenance(draft, board, again)
+    sections.add_provenance(draft, board, loaded, again)
     return draft
 
 

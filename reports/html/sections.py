@@ -135,7 +135,7 @@ def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Proto
             for key, run in chosen.items()
         ]
         if tracks:
-            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} trackers")))
+            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
             section.blocks.append(
                 Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks)
             )
@@ -156,7 +156,7 @@ def add_repeatability(draft: Draft, board: Board) -> None:
     section = Section("repeatability", "Repeatability", "Repeatability")
     figure = figures.repeat_figure(board)
     if figure is not None:
-        caption = "One point a run: its error over the median of the same tracker on the same sequence."
+        caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
         section.blocks.append(draft.figure("repeat", figure, caption))
     section.blocks.append(draft.table(table))
     draft.add(section)
@@ -190,7 +190,7 @@ def add_failures(draft: Draft, board: Board) -> None:
     draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
 
 
-def add_provenance(draft: Draft, board: Board, again: str) -> None:
+def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> None:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
     section = Section("provenance", "Machines, versions, commands", "Reproduce")
     section.blocks.append(draft.table(run_tables.machines(board)))
@@ -198,6 +198,10 @@ def add_provenance(draft: Draft, board: Board, again: str) -> None:
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
+    if loaded.unreadable:
+        section.blocks.append(
+            Block(kind="list", title="Left out: no valid record", entries=loaded.unreadable, folded=True)
+        )
     notes = [
         f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]
