@@ -202,7 +202,7 @@ PROTOCOLS: dict[str, Protocol] = {
             only_for="bonn/",
             rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f")),
         ),
-        # as WildGS-SLAM and DROID-W score their last trajectory: each image with the nearest true pose, aligned with scale
+        # as WildGS-SLAM and DROID-W score their last trajectory: images with the nearest true pose, aligned with scale
         Protocol(id="droid-w/v1", max_dt=0.08, one_to_one=False, alignment="sim3", trajectory="final"),
         Protocol(
             id="droid-w/v1-bonn",
