@@ -161,7 +161,10 @@ def _facts(run: LoadedRun, rpe: Sequence[RPESpec]) -> list[list[str | float | No
         ("ATE, lost frames held", None if row.score_m is None else 1000 * row.score_m, "mm"),
         ("ATE of the tracked frames", _scaled(row.metrics.get("ate_rmse_m"), 1000), "mm"),
         ("ATE of the final trajectory", _scaled(row.final_ate_m, 1000), "mm"),
-        *((f"RPE over {s.describe()}", _scaled(row.metrics.get(f"rpe_{s.key}_trans_rmse_m"), 1000), "mm") for s in rpe),
+        *(
+            (f"RPE over {s.describe()}", _scaled(row.metrics.get(s.metric("trans")), 1000), "mm/s" if s.rate else "mm")
+            for s in rpe
+        ),
         ("coverage", 100 * row.coverage, "%"),
         ("frame time", row.frame_ms, "ms"),
         ("real time", row.real_time_factor, "×"),

@@ -11,6 +11,7 @@ from ..model.common import common_errors, representatives
 from ..model.crew import Crew
 from ..model.missing import missing_commands, missing_note
 from ..model.published import is_excerpt, least_length_s, reported_for
+from ..model.records import records_for
 from ..model.rows import Loaded
 from ..model.statistics import FEWEST, power_note
 from ..tables import fairness as fairness_tables
@@ -98,7 +99,8 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded, c
     parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frames})
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
-    published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)
+    whole = [name for name in board.sequences if name not in parts]
+    published = reported_for(whole, protocol) + records_for(whole, protocol)
     beside = {cell.sequence for cell in published}
     unsure = sorted(
         {row.sequence for row in board.rows if board.sequence(row) in beside and not least_length_s(row.sequence)}
