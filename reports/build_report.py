@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,6 +20,7 @@ from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
 from .model.board import Board, On, make_board
+from .model.crew import Crew, helpers_for
 from .model.report_data import REPORT_FILE, ReportData
 from .model.rows import Loaded, OnProgress, load_runs, open_stores, unheard
 from .tables.latex import to_latex
@@ -85,15 +87,18 @@ def build_report(
     protocol = get_protocol(protocol)
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
-    loaded = load_runs(stores, protocol, on_progress)
-    board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
-    again = command or _command([store.root for store in stores], output, board)
-    explored = write_explore(
-        board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
-        progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
-    )  # fmt: skip
-    on_progress(0, None, "putting the tables and figures together")
-    draft = _drafted(board, protocol, loaded, explored, again)
+    count = helpers_for(sum(len(store.ids()) for store in stores))
+    setup = {"protocol": protocol.model_dump_json(), "output": str(output), "picture_seconds": picture_seconds}
+    with Crew(count, setup) if count else nullcontext() as crew:
+        loaded = load_runs(stores, protocol, on_progress, crew)
+        board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
+        again = command or _command([store.root for store in stores], output, board)
+        explored = write_explore(
+            board, loaded, protocol, output, title=title, picture_seconds=picture_seconds, crew=crew,
+            progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
+        )  # fmt: skip
+        on_progress(0, None, "putting the tables and figures together")
+        draft = _drafted(board, protocol, loaded, explored, again, crew)
     data = ReportData(
         title=title,
         protocol=protocol.describe(),
@@ -105,19 +110,21 @@ def build_report(
     return _write(draft, board, output, data)
 
 
-def _drafted(board: Board, protocol: Protocol, loaded: Loaded, explored: Explored, again: str) -> Draft:
+def _drafted(
+    board: Board, protocol: Protocol, loaded: Loaded, explored: Explored, again: str, crew: Crew | None
+) -> Draft:
     """The sections of the page in their order."""
     draft = Draft()
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
-    sections.add_errors(draft, board, protocol, loaded)
+    sections.add_errors(draft, board, protocol, loaded, crew)
     add_paper(draft, board, protocol)
     sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
     sections.add_failures(draft, board)
-    sections.add_provenance(draft, board, again)
+    sections.add_provenance(draft, board, loaded, again)
     return draft
 
 

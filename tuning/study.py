@@ -101,7 +101,7 @@ class Tuner:
         self.space = search_space(
             self.tracker.settings, spec.space, {block.sequence for block in spec.blocks(*spec.tune)}
         )
-        self.base = flatten(defaults)
+        self.defaults, self.base = defaults, flatten(defaults)
         if spec.race == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(
                 f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
@@ -180,6 +180,31 @@ class Tuner:
             threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
             data_root=self.spec.data_root, cancelled=self._interrupted.is_set,
         )  # fmt: skip
+
+    def evaluate_beside(
+        self, configurations: Sequence[Mapping[str, Any]], blocks: Sequence[Block], *, jobs: int = 1
+    ) -> list[dict[Block, Outcome] | BlockFailedError]:
+        """Run several configurations block by block, without the stage cache, so that their times can be compared.
+
+        Whatever else the machine does at a time then slows all of them alike.
+
+        Returns:
+            For each configuration its outcomes, or why its first failing run failed; it runs on no further block then.
+        """
+        outcomes: list[dict[Block, Outcome]] = [{} for _ in configurations]
+        failed: dict[int, BlockFailedError] = {}
+
+        def one(number: int, block: Block) -> None:
+            if number not in failed:
+                try:
+                    outcomes[number].update(self.evaluate(configurations[number], [block], cache=False))
+                except BlockFailedError as error:
+                    failed.setdefault(number, error)
+
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-beside") as pool, self._ending_all():
+            for future in [pool.submit(one, number, block) for block in blocks for number in range(len(outcomes))]:
+                future.result()
+        return [failed.get(number, found) for number, found in enumerate(outcomes)]
 
     def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
         """The overrides that a trial ran with."""

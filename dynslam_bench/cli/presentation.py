@@ -10,7 +10,7 @@ import typer
 
 from .groups import DefaultGroup
 from .options import AsJson, DataRoot, Jobs, ProtocolId, Results
-from .output import SOME_RUNS_FAILED, progress, write, write_json, write_report_table, write_table
+from .output import SOME_RUNS_FAILED, progress, wrapped, write, write_json, write_report_table, write_table
 from .panels import REPORT, START
 
 if TYPE_CHECKING:
@@ -174,18 +174,21 @@ def audit_paper(
 
 def demo(
     results: Results = Path("results"),
-    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 300,
+    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 150,
     jobs: Jobs = 2,
     trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
-    from .demo import run_demo
+    from .demo import run_demo, study_frames
+    from .demo_story import estimate
 
+    write(estimate(frames, study_frames(frames), trials, jobs), now=True)
     outcome = run_demo(results, frames=frames, jobs=jobs, trials=trials)
     write()
     write(outcome.leaderboard)
     write()
-    write(f"study: {outcome.conclusion}")
+    for line in (*outcome.story, f"The study: {outcome.conclusion}"):
+        write(wrapped(line))
     write()
     write(f"report: {outcome.report}")
     write(f"study:  {outcome.study}")

@@ -234,11 +234,15 @@ def conclude(tuner: Tuner, jobs: int = 1) -> StudySummary:
 
 def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bool) -> None:
     """Conclusion, chosen settings and where everything lies."""
+    from dynslam_bench.tuning.seen import seen_note
+
     preset = tuner.folder / "best.toml"
     if as_json:
         write_json({"summary": summary, "page": page, "preset": preset})
         return
     write(summary.conclusion)
+    if caution := seen_note(summary.seen):
+        write(caution)
     write()
     if summary.chosen is not None:
         write_table(("setting", "value"), list(summary.candidates[0].params.items()))

@@ -60,7 +60,7 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
             entry = entries.get(name)
             if entry is None:
                 rendered = dataset.spec.id == "synthetic"
-                tags = ("high-dynamic" if "walking" in name else "low-dynamic",) if rendered else ()
+                tags = parse_synthetic_id(name).tags if rendered else ()
                 split = parse_synthetic_id(name).split if rendered else ""
                 size = "rendered" if rendered else ""
                 title, licence = dataset.spec.summary or dataset.spec.id, dataset.spec.license

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.evaluation.evaluate import pose_errors
 from dynslam_bench.evaluation.protocol import Protocol, RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -69,12 +70,10 @@ def read_frames(run: LoadedRun, exact: Mapping[int, float]) -> RunFrames:
     if not path.is_file() or not path.stat().st_size:
         return RunFrames({}, np.zeros(0), "")
     try:
-        table = pd.read_csv(path, usecols=_is_shown)
-    except (ValueError, OSError) as error:
-        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} is damaged: {error}")
+        table = _read(path, _is_shown)
+    except RunError as error:
+        return RunFrames({}, np.zeros(0), "", str(error))
     columns = {str(name): table[name].to_numpy() for name in table}
-    if not len(table) or not _NEEDED <= set(columns):
-        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} holds no frames")
     if exact:
         share = np.array([exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()])
         return RunFrames(columns, share, "exact masks")
@@ -89,15 +88,33 @@ def _is_shown(name: str) -> bool:
     return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
 
 
+def _read(path: Path, wanted: Callable[[str], bool]) -> pd.DataFrame:
+    """Columns of a ``frames.csv``: numbers, and the state in words.
+
+    Raises:
+        RunError: It holds no frames, or something else than numbers.
+    """
+    kinds: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
+    try:
+        table = pd.read_csv(path, usecols=wanted, dtype=kinds)
+    except (ValueError, OverflowError, OSError) as error:
+        raise RunError(f"{CSV_FILE} is damaged: {error}") from error
+    needed = [name for name in _NEEDED if wanted(name)]
+    if not len(table) or not set(needed) <= set(table):
+        raise RunError(f"{CSV_FILE} holds no frames")
+    if not np.isfinite(table.get("timestamp", 0.0)).all():
+        raise RunError(f"{CSV_FILE} is damaged: not every frame has a stamp")
+    return table
+
+
 def exact_share(path: Path, offset: int) -> dict[int, float]:
     """Frame (before the offset) to its exact share of dynamic pixels, of a ``frames.csv`` that knows it; else empty."""
-    if not path.is_file():
+    try:
+        table = _read(path, {"index", "dynamic_share"}.__contains__)
+    except RunError:  # the page of that run says so
         return {}
-    with path.open() as file:
-        if "dynamic_share" not in file.readline().rstrip("\n").split(","):
-            return {}
-    table = pd.read_csv(path, usecols=["index", "dynamic_share"]).dropna()
-    return {int(index) + offset: float(share) for index, share in table.itertuples(index=False)}
+    known = table.dropna() if "dynamic_share" in table else table.iloc[:0]
+    return {index + offset: share for index, share in known.itertuples(index=False)}
 
 
 def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from ..figures import leaderboard as figures
 from ..figures.style import colours, safe
 from ..model.board import Board
 from ..model.common import common_errors, representatives
+from ..model.crew import Crew
 from ..model.missing import missing_commands, missing_note
 from ..model.published import is_excerpt, least_length_s, reported_for
 from ..model.records import records_for
@@ -88,7 +89,7 @@ def add_speed(draft: Draft, board: Board) -> None:
     draft.add(section)
 
 
-def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None) -> None:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     if not board.sequences:
         return
@@ -111,7 +112,7 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
         )
     table_of_errors = sequence_tables.per_sequence(board, protocol, published)
     section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
-    common, frames = common_errors(board, protocol, loaded)
+    common, frames = common_errors(board, protocol, loaded, crew)
     section.blocks += draft.titled(fairness_tables.common_frames_table(board, common, frames))
     if protocol.trajectory == "online":
         section.blocks += draft.titled(sequence_tables.final_errors(board, protocol))
@@ -136,7 +137,7 @@ def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Proto
             for key, run in chosen.items()
         ]
         if tracks:
-            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} trackers")))
+            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
             section.blocks.append(
                 Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks)
             )
@@ -157,7 +158,7 @@ def add_repeatability(draft: Draft, board: Board) -> None:
     section = Section("repeatability", "Repeatability", "Repeatability")
     figure = figures.repeat_figure(board)
     if figure is not None:
-        caption = "One point a run: its error over the median of the same tracker on the same sequence."
+        caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
         section.blocks.append(draft.figure("repeat", figure, caption))
     section.blocks.append(draft.table(table))
     draft.add(section)
@@ -191,7 +192,7 @@ def add_failures(draft: Draft, board: Board) -> None:
     draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
 
 
-def add_provenance(draft: Draft, board: Board, again: str) -> None:
+def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> None:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
     section = Section("provenance", "Machines, versions, commands", "Reproduce")
     section.blocks.append(draft.table(run_tables.machines(board)))
@@ -199,6 +200,10 @@ def add_provenance(draft: Draft, board: Board, again: str) -> None:
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
+    if loaded.unreadable:
+        section.blocks.append(
+            Block(kind="list", title="Left out: no valid record", entries=loaded.unreadable, folded=True)
+        )
     notes = [
         f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]

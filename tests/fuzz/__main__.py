@@ -10,20 +10,23 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Iterator
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
+
+import cv2
+import torch
 
 from .campaign import attack
 from .readers import TARGETS
 from .target import Target
 
 
-def _all(targets: list[Target], jobs: int, seconds: float, seed: int, findings: Path) -> list[dict[str, Any]]:
+def _all(targets: list[Target], jobs: int, seconds: float, seed: int, findings: Path) -> Iterator[dict[str, Any]]:
     """Each reader in a process of its own: its peak of memory is its own, and a crash of native code is a finding."""
     findings.mkdir(parents=True, exist_ok=True)
     running: dict[int, tuple[Target, Path, Any]] = {}
-    found: list[dict[str, Any]] = []
     waiting = list(targets)
     while waiting or running:
         while waiting and len(running) < jobs:
@@ -38,16 +41,17 @@ def _all(targets: list[Target], jobs: int, seconds: float, seed: int, findings: 
             target, said, child = running.pop(sentinel)  # type: ignore[arg-type]
             child.join()
             if child.exitcode == 0:
-                found.append(json.loads(said.read_text()))
+                yield json.loads(said.read_text())
                 said.unlink()
             else:
                 what = [f"its process ended with {child.exitcode} (seed {seed})"]
-                found.append(dict(reader=target.name, inputs=0, refused=0, seen=[], lines=[], findings=what))
-    return found
+                yield dict(reader=target.name, inputs=0, refused=0, seen=[], lines=[], findings=what)
 
 
 def _job(target: Target, seconds: float, seed: int, findings: Path, said: Path) -> None:
     logging.disable(logging.CRITICAL)
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libpng and libjpeg tell what they think of every file
     result = attack(target, seconds=seconds, seed=seed)
     for finding in result.findings:
@@ -79,49 +83,48 @@ def main() -> int:
     chosen = [target for target in TARGETS if not options.reader or target.name in options.reader]
     seconds = 60 * options.minutes * options.jobs / len(chosen)
     began = time.monotonic()
-    found = _all(chosen, options.jobs, seconds, options.seed, options.findings)
-    rows = _add(options.record, found, time.monotonic() - began)
-    for row in rows:
+    rows = []
+    for found in _all(chosen, options.jobs, seconds, options.seed, options.findings):
+        ended = time.monotonic()
+        row = _add(options.record, found, ended - began)  # at once: a campaign that is ended early is not lost
+        began = ended
+        rows.append(row)
         sys.stdout.write(
             f"{row['reader']:32s} {row['inputs']:9d} inputs  {100 * row['coverage']:5.1f} % of {row['n_lines']} lines  "
             f"{'; '.join(row['findings'])}\n"
         )
+        sys.stdout.flush()
     sys.stdout.write(f"{sum(row['inputs'] for row in rows)} inputs, {len(rows)} readers\n")
-    return int(any(each["findings"] for each in found))
+    return int(any(row["findings"] for row in rows))
 
 
-def _add(record: Path | None, found: list[dict[str, Any]], seconds: float) -> list[dict[str, Any]]:
-    """The figures of this and, where a record is named, of all campaigns before it.
+def _add(record: Path | None, found: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """A reader's figures of this and, where a record is named, of all campaigns before it.
 
     Findings of earlier campaigns are not repeated: they are tests by now.
     """
-    rows = []
     before: dict[str, Any] = {}
     if record is not None and record.is_file():
         before = json.loads(record.read_text())
-    old = {row["reader"]: row for row in before.get("readers", [])}
-    for each in found:
-        share = len(each["seen"]) / max(len(each["lines"]), 1)
-        missed = sorted(
-            f"{Path(name).name}:{line}" for name, line in set(map(tuple, each["lines"])) - set(map(tuple, each["seen"]))
-        )
-        earlier = old.get(each["reader"], {})
-        rows.append(
-            {
-                "reader": each["reader"],
-                "inputs": each["inputs"] + earlier.get("inputs", 0),
-                "refused": each["refused"] + earlier.get("refused", 0),
-                "coverage": round(max(share, earlier.get("coverage", 0.0)), 4),
-                "n_lines": len(each["lines"]),
-                "missed": missed,
-                "findings": each["findings"],
-            }
-        )
+    readers = {row["reader"]: row for row in before.get("readers", [])}
+    earlier = readers.get(found["reader"], {})
+    share = len(found["seen"]) / max(len(found["lines"]), 1)
+    missed = set(map(tuple, found["lines"])) - set(map(tuple, found["seen"]))
+    row = {
+        "reader": found["reader"],
+        "inputs": found["inputs"] + earlier.get("inputs", 0),
+        "refused": found["refused"] + earlier.get("refused", 0),
+        "coverage": round(max(share, earlier.get("coverage", 0.0)), 4),
+        "n_lines": len(found["lines"]),
+        "missed": sorted(f"{Path(name).name}:{line}" for name, line in missed),
+        "findings": found["findings"],
+    }
     if record is not None:
-        kept = [row for row in before.get("readers", []) if row["reader"] not in {each["reader"] for each in rows}]
-        total = {"seconds": round(before.get("seconds", 0) + seconds), "readers": [*kept, *rows]}
-        record.write_text(json.dumps({"inputs": sum(r["inputs"] for r in total["readers"]), **total}, indent=1) + "\n")
-    return rows
+        readers[found["reader"]] = row
+        inputs = sum(each["inputs"] for each in readers.values())
+        total = {"inputs": inputs, "seconds": round(before.get("seconds", 0) + seconds), "readers": [*readers.values()]}
+        record.write_text(json.dumps(total, indent=1) + "\n")
+    return row
 
 
 if __name__ == "__main__":

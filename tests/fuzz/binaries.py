@@ -64,7 +64,13 @@ def _odd_headers() -> list[bytes]:
 
 
 def _depths() -> list[bytes]:
-    return _encoded(".png", ".tiff", ".pgm", image=np.arange(192, dtype=np.uint16).reshape(12, 16) * 90) + _colours()
+    deep = np.arange(192, dtype=np.uint16).reshape(12, 16) * 90
+    return [*_encoded(".png", ".tiff", ".pgm", image=deep), *_encoded(".png", image=deep[:4]), *_colours()]
+
+
+def _rendered() -> list[bytes]:
+    png = encode_png(np.full((12, 16, 3), 9, np.uint8))
+    return [png, png[:-6], png[:-12], png[:30] + b"x" + png[31:], png + b"x", b"1.0 rgb/1.png\n"]
 
 
 def _read_colour(data: bytes | None, folder: Path) -> None:
@@ -75,7 +81,9 @@ def _read_colour(data: bytes | None, folder: Path) -> None:
 
 
 def _read_depth(data: bytes | None, folder: Path) -> None:
-    image = reader.read_depth(at(folder, "1.png", data), 5000.0, size=(16, 12), mismatch="but the camera is 16x12")
+    path = at(folder, "1.png", data)
+    reader.read_depth(path, 5000.0)  # any size
+    image = reader.read_depth(path, 5000.0, size=(16, 12), mismatch="but the camera is 16x12")
     assert image.shape == (12, 16) and image.dtype == np.float32
 
 
@@ -92,7 +100,10 @@ def _read_mask(data: bytes | None, folder: Path) -> None:
 
 def _read_rendered(data: bytes | None, folder: Path) -> None:
     store = FrameStore(folder, CAMERA)
-    at(folder, "rgb/1.000000.png", data)
+    if data == b"":
+        (folder / "rgb" / "1.000000.png").mkdir(parents=True)
+    else:
+        at(folder, "rgb/1.000000.png", data)
     if data is not None and not data.startswith(b"\x89"):
         at(folder, "rgb.txt", data)
     image = store.read("rgb", 1.0)
@@ -113,16 +124,24 @@ def _tar(*members: tuple[str, bytes, bytes], form: int = tarfile.GNU_FORMAT) -> 
 def _archives() -> list[bytes]:
     plain = ("seq/", b"", tarfile.DIRTYPE), ("seq/rgb.txt", b"1 a\n" * 50, tarfile.REGTYPE)
     long = ("seq/" + "n" * 150 + "/" + "m" * 99, b"x", tarfile.REGTYPE)
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("seq/", "")
-        archive.writestr("seq/rgb.txt", "1 a\n" * 50)
+    link = ("seq/link", b"", tarfile.SYMTYPE)
+    packed = _zip("seq/rgb.txt")
     return [
-        gzip.compress(_tar(*plain), 1),
-        _tar(*plain, long),
-        _tar(*plain, long, form=tarfile.PAX_FORMAT),
-        buffer.getvalue(),
+        *(gzip.compress(_tar(*plain), 1), gzip.compress(_tar(*plain), 1)[:-20], _tar(*plain, long)),
+        *(_tar(*plain, long, form=tarfile.PAX_FORMAT), _tar(*plain, *plain), _tar(link), _tar(*plain, *plain[1:])),
+        *(packed, packed.replace(b"1 a", b"1 b", 1), _zip("../rgb.txt"), _zip("seq/rgb.txt", zipfile.ZIP_BZIP2)),
+        _zip("seq/link", attributes=0o120777 << 16),
     ]
+
+
+def _zip(name: str, method: int = zipfile.ZIP_STORED, attributes: int = 0) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        archive.writestr("seq/", "")
+        entry = zipfile.ZipInfo(name)
+        entry.compress_type, entry.external_attr = method, attributes
+        archive.writestr(entry, "1 a\n" * 50)
+    return buffer.getvalue()
 
 
 def _tar_checked(data: bytes, random: Random) -> bytes:
@@ -150,7 +169,7 @@ def _tar_checked(data: bytes, random: Random) -> bytes:
 def _extract(data: bytes | None, folder: Path) -> None:
     target = folder / "out"
     target.mkdir()
-    sums = archives.extract(at(folder, "archive.tgz", data or b""), target)
+    sums = archives.extract(at(folder, "archive.tgz", data or b""), target, lambda progress: None)
     assert all((target / name).resolve().is_relative_to(target.resolve()) for name in sums)
     assert not any(path.is_symlink() for path in target.rglob("*"))
 
@@ -266,7 +285,7 @@ TARGETS = [
     Target(
         "rendered frame",
         _read_rendered,
-        lambda: [encode_png(np.full((12, 16, 3), 9, np.uint8)), b"1.0 rgb/1.png\n"],
+        _rendered,
         (FrameStore.read, FrameStore._bytes, FrameStore._listed, is_intact_png),
         mutate_png,
     ),
@@ -279,7 +298,10 @@ TARGETS = [
         _restored,
     ),
     Target(
-        "ONNX header", lambda data, folder: onnx.read_header(at(folder, "net.onnx", data)), lambda: [_onnx()], (onnx,)
+        "ONNX header",
+        lambda data, folder: str(onnx.read_header(at(folder, "net.onnx", data))),
+        lambda: [_onnx(), b"\x80" * 20],
+        (onnx,),
     ),
     Target(
         "prepared images", _read_prepared, lambda: [_images_npy(), _images_npy() + b"x"], (PreparedImages.__init__,)

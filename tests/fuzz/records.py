@@ -69,10 +69,11 @@ def _read_run(data: bytes | None, folder: Path) -> None:
 def _read_list(data: bytes | None, folder: Path) -> None:
     """A damaged index of the runs is made again; whatever it says, the runs are those that lie there."""
     store = _store(folder, _stored(f"runs/{RUN}/run.json"))
+    at(store.runs / ("0" * 16), "run.json", b"{")
     at(store.root / "metrics" / get_protocol("tum-rgbd/v1").digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
     at(store.root / "index", f"{get_protocol('tum-rgbd/v1').digest()}.json", data)
     rows, unreadable = run_list.list_runs(store)
-    assert [row["run"] for row in rows] == [RUN] and not unreadable
+    assert [row["run"] for row in rows] == [RUN] and len(unreadable) == 1
 
 
 @cache
@@ -95,7 +96,10 @@ def _read_metrics(data: bytes | None, folder: Path) -> None:
 def _read_part(data: bytes | None, folder: Path) -> None:
     """Stamps and trajectory of a stored run; what is wrong with them is the reason why there are no errors."""
     store = _store(folder, _stored(f"runs/{RUN}/run.json"))
-    at(store.root / "sequences" / "8a65f345d9b34895", "timestamps.txt", data)
+    part = store.root / "sequences" / "8a65f345d9b34895"
+    at(part, "timestamps.txt", data)
+    if data is None:
+        at(part, "groundtruth.txt", None)
     at(store.runs / RUN, "trajectory_final.txt", data)
     store.score(store.read(RUN), again=True)
 
@@ -111,12 +115,33 @@ def _log_seeds() -> list[bytes]:
     made = rows.read_csv(FIXTURE / "runs" / RUN / "frames.csv")
     pose = [0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0]
     lines = [json.dumps({**vars(row), "pose": pose}) + "\n" for row in made]
-    return ["".join(lines).encode(), lines[0].encode(), "".join(lines).encode()[:-30]]
+    odd = ({"pose": pose[:6]}, {"stats": {"a": "x"}}, {"state": "asleep"}, {"timestamp": "nan"}, {"x": 1})
+    one = json.loads(lines[0])
+    return [
+        *("".join(lines).encode(), lines[0].encode(), "".join(lines).encode()[:-30], lines[0].encode() * 2, b"[]\n"),
+        *(json.dumps(one | each).encode() + b"\n" for each in odd),
+    ]
 
 
 def _packed_seeds() -> list[bytes]:
     store = RunStore(FIXTURE)
-    return [packing.pack(store, store.read(RUN))]
+    packed = packing.pack(store, store.read(RUN))
+    lying = bytearray(packed)
+    start = lying.index(b"PK\x01\x02") + 24  # the size that the first file claims
+    lying[start : start + 4] = b"\xfe\xff\xff\xff"
+    squeezed = io.BytesIO()
+    with zipfile.ZipFile(squeezed, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr(f"runs/{RUN}/run.json", "{}")
+    return [packed, bytes(lying), squeezed.getvalue(), _renamed(packed, "0" * 16), _renamed(packed, "zz")]
+
+
+def _renamed(packed: bytes, run: str) -> bytes:
+    """The same archive under another run's name."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(packed)) as old, zipfile.ZipFile(buffer, "w") as new:
+        for name in old.namelist():
+            new.writestr(name.replace(RUN, run), old.read(name))
+    return buffer.getvalue()
 
 
 def _repacked(data: bytes, random: Random) -> bytes:
@@ -139,15 +164,24 @@ def _repacked(data: bytes, random: Random) -> bytes:
 
 
 def _read_study(data: bytes | None, folder: Path) -> None:
-    study = folder / "results" / "studies" / "small"
-    at(study, "journal.log", _stored("studies/small/journal.log"))
-    at(study, "study.json", data)
-    Study.open(study)
+    """As it is stored, or as somebody wrote it; ``other`` is a study whose journal holds another one."""
+    results = folder / "results"
+    for name in ("small", "other"):
+        at(results / "studies" / name, "journal.log", _stored("studies/small/journal.log"))
+    if data is None or data.lstrip().startswith(b"{"):
+        at(results / "studies" / "small", "study.json", data)
+        opened = Study.open(results / "studies" / "small")
+    else:
+        opened = Study.open(at(folder, "study.toml", data), results)
+    Study.open(opened.spec, results)
 
 
 def _study_seeds() -> list[bytes]:
-    stored = _stored("studies/small/study.json")
-    return [stored, stored.replace(b'"small"', b'"other"'), stored.replace(b'"storage": ""', b'"storage": "redis://h"')]
+    stored, text = _stored("studies/small/study.json"), (FIXTURE.parent / "small.toml").read_bytes()
+    return [
+        *(stored, stored.replace(b'"small"', b'"other"'), stored.replace(b'"storage": ""', b'"storage": "redis://h"')),
+        *(text, text + b'\nname = "gone"\n', b'name = "gone"\n' + text),
+    ]
 
 
 def _read_journal(data: bytes | None, folder: Path) -> None:
@@ -187,9 +221,8 @@ def _receipt_seeds() -> list[bytes]:
 
 def _state_seeds() -> list[bytes]:
     """What such a state is made of, without the package that makes it."""
-    return [
-        pickle.dumps({"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}, protocol) for protocol in (4, 5)
-    ]
+    state = {"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}
+    return [*(pickle.dumps(state, protocol) for protocol in (4, 5)), pickle.dumps(print), b"(lr\xff\xff\xff\x7f."]
 
 
 TARGETS = [

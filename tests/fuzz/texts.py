@@ -62,6 +62,12 @@ _DEPTH = cv2.imencode(".png", np.full((8, 8), 5000, np.uint16))[1].tobytes()
 _PNG = cv2.imencode(".png", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
 
 
+class FewSettings(core_settings.Settings):
+    """As large as it takes to have a group: the settings of a whole system take a thousand times as long."""
+
+    tracking: TrackingSettings = TrackingSettings()
+
+
 def _text_of(data: bytes | None) -> str:
     return (data or b"").decode("utf-8", "surrogateescape")
 
@@ -71,7 +77,9 @@ def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], ob
 
 
 def _read_kitti(data: bytes | None, folder: Path) -> None:
-    kitti_file.read_kitti(at(folder, "poses.txt", data))
+    """With the frame rate, or with stamps: a part of the inputs each."""
+    times = at(folder, "times.txt", b"0\n0.1\n") if len(data or b"") % 2 else None
+    kitti_file.read_kitti(at(folder, "poses.txt", data), times)
 
 
 def _read_folder(data: bytes | None, folder: Path) -> None:
@@ -121,7 +129,11 @@ def _read_answer(text: str) -> None:
 
 def _override(text: str) -> None:
     assigned = core_settings.parse_assignments(text.split("\n"))
-    core_settings.apply_overrides(TrackingSettings(), assigned)
+    core_settings.apply_overrides(FewSettings(), assigned)
+
+
+def _read_settings(data: bytes | None, folder: Path) -> None:
+    core_settings.apply_overrides(FewSettings(), options.read_settings(at(folder, "s.toml", data)))
 
 
 def _harmless(text: str) -> None:
@@ -131,6 +143,14 @@ def _harmless(text: str) -> None:
     assert "\n" not in _text(text)
     if harmless.is_inside(text):
         assert (Path("/root/x") / text).resolve().is_relative_to("/root/x")
+
+
+def _study_texts() -> list[bytes]:
+    """Studies; one with an unknown key, one of the old form, one whose sequence can be no path."""
+    small = (FIXTURE.parent / "small.toml").read_bytes()
+    far = b'tracker = "never-move"\ntune = ["/' + b"a" * 5000 + b'"]\n'
+    return [small, (ROOT / "docs/studies/thresholds.toml").read_bytes(), b"bogus = 1\n" + small, far,
+            b'pruner = "median"\nobjectives = ["ate", "speed"]\n' + far]  # fmt: skip
 
 
 def _ids(text: str) -> None:
@@ -159,8 +179,11 @@ TARGETS = [
     Target(
         "KITTI trajectory",
         _read_kitti,
-        lambda: [b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3\n"],
-        (tum_file.read_table,),
+        lambda: [
+            *(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3" + b"\n" * ends for ends in (1, 2)),
+            *(b"# none\n\n", b"1 0 0 0 0 1 0 0 0 0 1 x\n", b"1 2 3\n", b"2 0 0 0 0 2 0 0 0 0 2 0\n"),
+        ],
+        (tum_file.read_table, kitti_file.read_kitti),
     ),
     Target(
         "list of images",
@@ -189,25 +212,38 @@ TARGETS = [
     Target(
         "camera",
         lambda data, folder: cameras.read_camera(at(folder, "camera.toml", data)).camera(),
-        lambda: [CAMERA, b'name = "tum-fr1"\n'],
-        (cameras.read_camera, cameras.known_camera, toml.read_toml, toml.parse_toml),
+        lambda: [CAMERA, b'name = "tum-fr1"\n', b'name = "x"\n', b"width = 640\n", b"fps = " + b"[" * 5000],
+        (cameras.read_camera, cameras.CameraFile.camera, cameras.known_camera, toml.read_toml, toml.parse_toml),
+        uncovered="what follows a RecursionError: the tracing of lines ends with it",
     ),
     Target(
         "settings file",
-        lambda data, folder: options.read_settings(at(folder, "s.toml", data)),
-        lambda: [b"[settings]\nfeatures.count = 500\n[settings.epipolar]\nthreshold_px = 1.5\n", b"a.b = 1\n"],
-        (options.read_settings, options._flatten),
+        _read_settings,
+        lambda: [
+            b"[settings]\n[settings.tracking]\nradius_px = 15\n",
+            *(b"a.b = 1\n", b"settings = 3\n", b'tracking.radius_px = "' + b"a" * 300 + b'"\n'),
+            *(b"tracking.radius_px = 0x" + b"f" * 5000 + b"\n",),
+        ],
+        (options.read_settings, options._flatten, core_settings._explain, core_settings._shown),
     ),
     Target(
         "--set",
         _of_text(_override),
-        lambda: [b"radius_px=15\nlocal_map=all", b"x=1", b"radius_px=[1]", b"radius_px=" + b"9" * 4999, b"radius_px"],
+        lambda: [
+            b"tracking.radius_px=15\ntracking.local_map=all",
+            *(b"x=1", b"tracking=1", b"tracking.radius_px.x=1", b"a.b.c=1", b"tracking.x=1"),
+            *(
+                b"tracking.radius_px=[1]",
+                b"tracking.radius_px=" + b"9" * 4999,
+                b"tracking.radius_px",
+            ),
+        ],
         (
             core_settings.apply_overrides,
             core_settings.parse_assignments,
+            core_settings._walk,
             core_settings._parse,
             core_settings._explain,
-            core_settings._shown,
         ),
     ),
     Target(
@@ -222,8 +258,8 @@ TARGETS = [
     ),
     Target(
         "study",
-        lambda data, folder: study_file.read_study(at(folder, "s.toml", data)),
-        lambda: [(FIXTURE.parent / "small.toml").read_bytes(), (ROOT / "docs/studies/thresholds.toml").read_bytes()],
+        lambda data, folder: study_file.read_study(at(folder, "s.toml", data), len),
+        _study_texts,
         (study_file.read_study, study_file.make_spec),
     ),
     Target(
@@ -273,6 +309,7 @@ TARGETS = [
                 {"T_world_cam": [2] * 16},
                 {"trajectory": [[1, 0, 0, 0, 0, 0, 0, 9]]},
                 {"trajectory": [[1, 0, 0, 0, 0, 0, 0, 1]] * 2},
+                *({"trajectory": "x"}, {"T_world_cam": "x"}, {"stats": []}, {"state": 3}, {"dynamic_mask": "x"}),
             )
         ],
         (answers, program.parse_answer),

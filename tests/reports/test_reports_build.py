@@ -3,12 +3,14 @@
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 from reports_fake_store import add_run, truth_of
 from reports_rows import rows_of
 
+import dynslam_bench.reports
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
@@ -347,3 +349,14 @@ def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     assert len(t) < 420
     assert {long[0], long[4999], long[5000], long[-1]} <= set(t.tolist())
     assert np.isnan(v[:, 0]).sum() == 1
+
+
+def test_every_template_is_used():
+    """A script that no page takes any more is deleted, not shipped."""
+    room = Path(dynslam_bench.reports.__file__).parent
+    named = " ".join(
+        path.read_text(encoding="utf-8") for pattern in ("**/*.py", "**/*.j2") for path in room.glob(pattern)
+    )
+    templates = [path.name for path in (room / "html" / "templates").iterdir() if path.is_file()]
+    assert len(templates) > 10
+    assert [name for name in templates if not re.search(rf'["\']{re.escape(name)}["\']', named)] == []

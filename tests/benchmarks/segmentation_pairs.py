@@ -1,12 +1,12 @@
-"""What segmenting fewer frames costs: pose error and time of keyframe-only segmentation against every frame.
+"""Two ways to make masks, in pairs of runs: pose error, frames segmented, time of the whole tracker.
 
-    python tests/benchmarks/segmentation_schedule.py [--sequences ID ...] [--tracker mask-rcnn] [--source embedded]
+    python tests/benchmarks/segmentation_pairs.py schedule|oracle [--sequences ID ...] [--tracker mask-rcnn]
         [--set segmentation.max_carry=5 ...] [--offsets 0 10 20]
 
-Each sequence runs twice in turn from each start offset: with `segmentation.schedule=every`, and with `keyframes` plus
-what --set says. Printed per sequence, as means over the offsets: ATE RMSE (SE(3)-aligned, online / final), share of
-frames segmented, milliseconds of CPU and of wall time a frame of the whole tracker; last the geometric-mean ATE ratio.
-One thread.
+`schedule`: the embedded network on every frame against keyframes only (plus what --set says); `oracle`: the exact masks
+against the embedded network's. Each sequence runs both ways in turn from each start offset. Printed per sequence, as
+means over the offsets: ATE RMSE (SE(3)-aligned, online / final; lost frames as `hold` counts them), coverage, share of
+frames segmented, milliseconds of CPU and of wall time a frame; last the geometric-mean ATE ratio. One thread.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import argparse
 import os
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -34,6 +34,15 @@ from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 
 TWINS = ("walking_xyz", "walking_static", "walking_halfsphere", "walking_rpy")
 DEFAULT = [f"synthetic/{name}@{instance}?frames=200" for instance in (100, 101) for name in TWINS]
+"""Held out: on instances 0-99 the embedded network was trained."""
+EMBEDDED = {"segmentation.source": "embedded"}
+PAIRS: dict[str, dict[str, dict[str, object]]] = {
+    "schedule": {
+        "every": EMBEDDED | {"segmentation.schedule": "every"},
+        "keyframes": EMBEDDED | {"segmentation.schedule": "keyframes"},
+    },
+    "oracle": {"oracle": {"segmentation.source": "oracle"}, "embedded": EMBEDDED},
+}
 
 
 @dataclass
@@ -42,6 +51,7 @@ class Measured:
 
     online: float
     final: float
+    coverage: float
     segmented: float
     cpu_ms: float
     wall_ms: float
@@ -64,39 +74,40 @@ def measure(tracker_id: str, sequence_id: str, offset: int, settings: dict) -> M
         if result.state == "ok":
             stamps.append(frame.timestamp)
             poses.append(result.T_world_cam)
-    protocol = get_protocol("tum-rgbd/v1")
+    protocol = get_protocol("tum-rgbd/v1").model_copy(update={"lost_frames": "hold"})
     errors = [
         evaluate(part, sequence.ground_truth, protocol, input_timestamps=sequence.timestamps).metrics["ate_rmse_m"]
         for part in (Trajectory(np.array(stamps), np.array(poses)), tracker.finalize())
     ]
     frames = len(sequence)
-    return Measured(*errors, segmented / frames, 1e3 * cpu / frames, 1e3 * wall / frames)
+    return Measured(*errors, len(stamps) / frames, segmented / frames, 1e3 * cpu / frames, 1e3 * wall / frames)
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pair", choices=PAIRS)
     parser.add_argument("--sequences", nargs="+", default=DEFAULT)
     parser.add_argument("--tracker", default="mask-rcnn")
-    parser.add_argument("--source", default="embedded")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", dest="changes")
     parser.add_argument("--offsets", type=int, nargs="+", default=[0])
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    every = {"segmentation.source": options.source, "segmentation.schedule": "every"}
-    sparse = every | {"segmentation.schedule": "keyframes"} | parse_assignments(options.changes)
-    print("| sequence | ATE every, mm | ATE keyframes, mm | ratio | segmented | CPU ms | wall ms |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    (first, usual), (second, other) = PAIRS[options.pair].items()
+    ways = (usual, other | parse_assignments(options.changes))
+    print(f"| sequence | ATE {first}, mm | ATE {second}, mm | ratio | coverage | segmented | CPU ms | wall ms |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     ratios = []
     for name in options.sequences:
-        runs = [[measure(options.tracker, name, offset, s) for s in (every, sparse)] for offset in options.offsets]
-        table = np.array([[[r.online, r.final, r.segmented, r.cpu_ms, r.wall_ms] for r in pair] for pair in runs])
+        runs = [[astuple(measure(options.tracker, name, offset, way)) for way in ways] for offset in options.offsets]
+        table = np.array(runs)
         ratios.extend(np.log(table[:, 1, :2] / table[:, 0, :2]))
-        a, b = table.mean(axis=0)
+        a, b = (Measured(*row) for row in table.mean(axis=0))
         print(
-            f"| {name} | {1e3 * a[0]:.2f} / {1e3 * a[1]:.2f} | {1e3 * b[0]:.2f} / {1e3 * b[1]:.2f} "
-            f"| {b[0] / a[0]:.2f} / {b[1] / a[1]:.2f} | {b[2]:.0%} "
-            f"| {a[3]:.1f} -> {b[3]:.1f} | {a[4]:.1f} -> {b[4]:.1f} |",
+            f"| {name} | {1e3 * a.online:.2f} / {1e3 * a.final:.2f} | {1e3 * b.online:.2f} / {1e3 * b.final:.2f} "
+            f"| {b.online / a.online:.2f} / {b.final / a.final:.2f} | {a.coverage:.0%} -> {b.coverage:.0%} "
+            f"| {a.segmented:.0%} -> {b.segmented:.0%} | {a.cpu_ms:.1f} -> {b.cpu_ms:.1f} "
+            f"| {a.wall_ms:.1f} -> {b.wall_ms:.1f} |",
             flush=True,
         )
     online, final = np.exp(np.mean(ratios, axis=0))
