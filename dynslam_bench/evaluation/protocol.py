@@ -60,7 +60,7 @@ class RPESpec(_Frozen):
         return "random" if self.pairs == "tum-random" else f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
 
     def unit_of(self, part: str) -> str:
-        """Unit of the error as metrics name it: ``m``, ``deg``, ``m_per_s`` or ``deg_per_s``."""
+        """Unit of the error as metrics name it: m, deg, m_per_s or deg_per_s."""
         return f"{'m' if part == 'trans' else 'deg'}{'_per_s' if self.rate else ''}"
 
     def metric(self, part: str) -> str:
