@@ -198,7 +198,7 @@ def _is_number(text: str) -> bool:
 
 def _hint(found: int) -> str:
     if found == 12:
-        return "12 values a line are KITTI's format"
+        return "12 values a line are KITTI's format: give their stamps with --timestamps FILE"
     if found == 2:
         return "this looks like a list of images"
     return ""

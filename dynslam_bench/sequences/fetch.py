@@ -158,7 +158,7 @@ def fetch(
     expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
     how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
-    parts = []
+    parts: list[Part] = []
     for address in (url or entry.url, *entry.more_urls):
         archive = find_data_root(data_root) / ".downloads" / _archive_name(address, entry)
         try:

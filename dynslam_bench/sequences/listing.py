@@ -63,8 +63,8 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
                 tags = parse_synthetic_id(name).tags if rendered else ()
                 split = parse_synthetic_id(name).split if rendered else ""
                 size = "rendered" if rendered else ""
-                about = {"license": dataset.spec.license, "dataset": dataset.spec.summary or dataset.spec.id}
-                found.append(Summary(name, True, size, tags, split, **about))
+                title, licence = dataset.spec.summary or dataset.spec.id, dataset.spec.license
+                found.append(Summary(name, True, size, tags, split, license=licence, dataset=title))
                 continue
             layout = "verified" if entry.verified else "not verified"
             found.append(

@@ -156,9 +156,12 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     """The numbers to choose from: of the online and of the final trajectory."""
     found = [
         ("ate", "ATE", "m", "ate_rmse_m"),
-        *(("rpe", f"RPE over {spec.describe()}", "m", f"rpe_{spec.key}_trans_rmse_m") for spec in protocol.rpe),
         *(
-            ("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg")
+            ("rpe", f"RPE over {spec.describe()}", "m/s" if spec.rate else "m", spec.metric("trans"))
+            for spec in protocol.rpe
+        ),
+        *(
+            ("rotation", f"RPE over {spec.describe()}, rotation", "deg/s" if spec.rate else "deg", spec.metric("rot"))
             for spec in protocol.rpe
         ),
         ("rotation", "absolute rotation", "deg", "ape_rot_rmse_deg"),

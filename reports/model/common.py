@@ -12,6 +12,7 @@ from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.association import match
 from dynslam_bench.evaluation.error_statistics import statistics
 from dynslam_bench.evaluation.frames import common_frames
+from dynslam_bench.evaluation.prepare import compared
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 
@@ -75,6 +76,7 @@ def _ate(estimate: Trajectory, truth: Trajectory, protocol: Protocol) -> float:
     Raises:
         EvaluationError: Fewer than two poses have ground truth.
     """
+    estimate, truth = compared(estimate, truth, protocol)
     association = match(estimate, truth, protocol)
     if len(association) < 2:
         raise EvaluationError("only one pose has ground truth")

@@ -157,12 +157,12 @@ def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
     """Imports of older versions name no camera: they belong to the one column of the same frames, if there is one."""
     columns: dict[str, set[str]] = {}
     for run in runs:
-        columns.setdefault(run.record.sequence.part, set()).add(run.row.column_id)
+        if not run.row.imported:
+            columns.setdefault(run.record.sequence.part, set()).add(run.row.column_id)
     for run in runs:
         part = run.record.sequence.part
-        others = columns[part] - {part}
-        if run.row.imported and run.row.block == part and len(others) == 1:
-            run.row.block = next(iter(others))
+        if run.row.imported and run.row.block == part and len(columns.get(part, ())) == 1:
+            (run.row.block,) = columns[part]
 
 
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:

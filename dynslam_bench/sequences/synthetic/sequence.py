@@ -21,6 +21,7 @@ from .ids import SyntheticId
 from .renderer import Rendered, Renderer, default_threads
 from .scenes.scene import Scene
 from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
+from .views import row_times
 
 START_S = 1000.0
 """Stamp of the first frame in seconds."""
@@ -161,6 +162,14 @@ class SyntheticSequence:
         """
         i = range(len(self))[index]
         return self.renderer.flow(i, i + 1 if other is None else range(len(self))[other])
+
+    def row_poses(self, index: int) -> NDArray[np.float64]:
+        """Exact camera-to-world poses ``[H, 4, 4]`` of all rows of a frame; all the same under a global shutter.
+
+        The frame's own pose (`ground_truth`) is that of the middle of the image.
+        """
+        times = row_times(range(len(self))[index], self.scene.world.optics.readout_s)
+        return self.scene.poses(times)
 
     def exact_depth(self, index: int) -> NDArray[np.float64]:
         """Exact z-depth float64 ``[H, W]`` in metres at the pixel centres, 0 where nothing is hit."""
