@@ -14,6 +14,7 @@ from dynslam_bench.cli.app import expand_lists
 from dynslam_bench.geometry.kitti_file import write_kitti
 from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared"
@@ -88,7 +89,7 @@ def test_sequences_list(cli):
         f"tum/fr3/walking_{motion}" for motion in ("static", "xyz", "halfsphere", "rpy")
     ]
     _, out, _ = cli("sequences", "list", "--here", "--json")
-    assert [each["id"].split("/")[0] for each in json.loads(out)] == ["synthetic"] * 8
+    assert [each["id"].split("/")[0] for each in json.loads(out)] == ["synthetic"] * len(SYNTHETIC_IDS)
 
 
 def test_sequences_are_listed_by_data_set(cli):
