@@ -210,7 +210,7 @@ class _Lines:
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            complain(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far")
+            complain(f"{self.label}{':' * bool(self.text)}{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 
