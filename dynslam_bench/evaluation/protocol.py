@@ -6,6 +6,7 @@ stored with its protocol's digest, and tables refuse to mix digests.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -94,7 +95,7 @@ class Protocol(_Frozen):
 
     def digest(self) -> str:
         """Twelve hexadecimal digits that stand for every field; stored with every metric."""
-        return digest(self)
+        return _digest(self)
 
     def describe(self) -> str:
         """One line for captions: everything that the numbers depend on."""
@@ -144,6 +145,12 @@ PROTOCOLS: dict[str, Protocol] = {
         ),
     )
 }
+
+
+@lru_cache(maxsize=64)
+def _digest(protocol: Protocol) -> str:
+    """Taken once: lists of a hundred thousand runs ask for it as often."""
+    return digest(protocol)
 
 
 def get_protocol(name: str | Protocol) -> Protocol:
