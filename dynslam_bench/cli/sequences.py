@@ -10,7 +10,7 @@ import typer
 
 from . import completion
 from .options import AsJson, Camera, DataRoot
-from .output import VERIFICATION_FAILED, note, progress, write, write_fields, write_json, write_table
+from .output import VERIFICATION_FAILED, complain, note, progress, write, write_fields, write_json, write_table
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
 
@@ -41,11 +41,14 @@ def list_(
     if as_json:
         write_json([asdict(each) for each in found])
         return
-    columns = ("sequence", "here", "size", "tags", "split", "ground truth", "license")
+    columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum", "license")
     write_table(
         columns,
-        [(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.license) for each in found],
-        spare=("license", "ground truth", "split"),
+        [
+            (each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum, each.license)
+            for each in found
+        ],
+        spare=("license", "checksum", "ground truth", "split"),
     )
 
 
@@ -80,10 +83,12 @@ def fetch(
 ) -> None:
     """Download public sequences; a call that was cut short goes on where it stopped."""
     from dynslam_bench.core.download import Progress
+    from dynslam_bench.sequences.fetch import RECEIPT, Receipt, status
     from dynslam_bench.sequences.fetch import fetch as fetch_one
     from dynslam_bench.sequences.listing import expand
 
     for name in expand(names):
+        new = status(name, data_root=data_root).folder is None
         with progress(name, unit="bytes") as advance:
 
             def report(state: Progress, advance: Any = advance) -> None:
@@ -93,6 +98,11 @@ def fetch(
                 name, data_root=data_root, progress=report, checksum=checksum, keep_archive=keep_archive, url=url
             )
         write(str(place))
+        if new and not (receipt := Receipt.read(place / RECEIPT)).checked:
+            complain(
+                f"warning: no checksum of {name} was known; that of what came is {receipt.sha256}, "
+                "and the next fetch from there has to bring the same"
+            )
 
 
 @app.command()

@@ -16,6 +16,7 @@ from dynslam_bench.core.harmless import inside, is_inside
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import Record
 
+from . import first_use
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from .published.archives import extract
 from .published.cameras import find_camera
@@ -118,7 +119,8 @@ def fetch(
         name: Id or published folder name.
         data_root: Folder of the sequences.
         progress: Called with the stage and the bytes done.
-        checksum: False to accept an archive whose checksum differs from the catalogue's.
+        checksum: False to accept an archive whose checksum differs from the catalogue's or, where that knows none, from
+            that of the archive which this address gave before.
         keep_archive: True to keep the archive beside the sequence.
         url: A mirror, in place of the catalogue's address.
         attempts: Connections in a row that may fail without bringing a byte.
@@ -135,7 +137,8 @@ def fetch(
     if found.folder is not None:
         return found.folder
     entry, address = found.entry, url or found.entry.url
-    archive = find_data_root(data_root) / ".downloads" / _archive_name(address, entry)
+    root = find_data_root(data_root)
+    archive = root / ".downloads" / _archive_name(address, entry)
     expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
     how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
@@ -144,6 +147,8 @@ def fetch(
     except DownloadError as error:
         raise SequenceError(str(error.args[0]), error.hint) from error
     try:
+        if checksum and entry.sha256 is None:
+            first_use.compare(root, address, sha256)
         _extract(found, archive, sha256, address, expected is not None, progress)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -155,6 +160,8 @@ def fetch(
     except SequenceError:
         archive.unlink(missing_ok=True)  # the archive itself is at fault: the next call fetches it anew
         raise
+    if entry.sha256 is None:
+        first_use.remember(root, address, sha256)
     if not keep_archive:
         archive.unlink(missing_ok=True)
     return found.place
