@@ -306,6 +306,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         opened = self._open(sequence)
         if len(opened) < 2:
             raise SequenceError(f"'{opened.id}' has {len(opened)} frames here, an episode needs 2 or more")
+        self.protocol.check_sequence(opened.id)
         self.sequence = opened
         self._source = sequence
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -18,7 +19,9 @@ from .html.draft import Draft
 from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
+from .html.run_data import MOST_FRAMES
 from .model.board import Board, On, make_board
+from .model.crew import Crew, helpers_for
 from .model.report_data import REPORT_FILE, ReportData
 from .model.rows import Loaded, OnProgress, load_runs, open_stores, unheard
 from .tables.latex import to_latex
@@ -57,6 +60,7 @@ def build_report(
     on: On = "common",
     rank_seen: bool = False,
     picture_seconds: float = PICTURE_SECONDS,
+    most_frames: int = MOST_FRAMES,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = unheard,
@@ -74,6 +78,7 @@ def build_report(
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
+        most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -85,15 +90,20 @@ def build_report(
     protocol = get_protocol(protocol)
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
-    loaded = load_runs(stores, protocol, on_progress)
-    board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
-    again = command or _command([store.root for store in stores], output, board)
-    explored = write_explore(
-        board, loaded, protocol, output, title=title, picture_seconds=picture_seconds,
-        progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
-    )  # fmt: skip
-    on_progress(0, None, "putting the tables and figures together")
-    draft = _drafted(board, protocol, loaded, explored, again)
+    count = helpers_for(sum(len(store.ids()) for store in stores))
+    shown = {"picture_seconds": picture_seconds, "most_frames": most_frames}
+    setup = {"protocol": protocol.model_dump_json(), "output": str(output), **shown}
+    with Crew(count, setup) if count else nullcontext() as crew:
+        loaded = load_runs(stores, protocol, on_progress, crew)
+        board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
+        again = command or _command([store.root for store in stores], output, board)
+        explored = write_explore(
+            board, loaded, protocol, output, title=title, crew=crew,
+            picture_seconds=picture_seconds, most_frames=most_frames,
+            progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
+        )  # fmt: skip
+        on_progress(0, None, "putting the tables and figures together")
+        draft = _drafted(board, protocol, loaded, explored, again, crew)
     data = ReportData(
         title=title,
         protocol=protocol.describe(),
@@ -105,19 +115,21 @@ def build_report(
     return _write(draft, board, output, data)
 
 
-def _drafted(board: Board, protocol: Protocol, loaded: Loaded, explored: Explored, again: str) -> Draft:
+def _drafted(
+    board: Board, protocol: Protocol, loaded: Loaded, explored: Explored, again: str, crew: Crew | None
+) -> Draft:
     """The sections of the page in their order."""
     draft = Draft()
     sections.add_leaderboard(draft, board, protocol, loaded)
     sections.add_explore(draft, explored)
     sections.add_speed(draft, board)
-    sections.add_errors(draft, board, protocol, loaded)
+    sections.add_errors(draft, board, protocol, loaded, crew)
     add_paper(draft, board, protocol)
     sections.add_trajectories(draft, board, loaded, protocol)
     sections.add_repeatability(draft, board)
     sections.add_masks(draft, board)
     sections.add_failures(draft, board)
-    sections.add_provenance(draft, board, again)
+    sections.add_provenance(draft, board, loaded, again)
     return draft
 
 

@@ -18,6 +18,7 @@ from .importance import importances, inert_parameters
 from .objectives import ACCURACY, SPEED, Objective, Outcomes, together
 from .presets import write_presets
 from .ratio import Ratio, compared
+from .seen import splits_seen
 from .study import Tuner
 from .study_file import StudySpec
 from .summary import Candidate, StudySummary, choose, conclude
@@ -46,12 +47,17 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
     best = [trial for trial in best_trials(tuner.study, spec.top + 1) if trial.number > 0][: spec.top]
     if not best_trials(tuner.study, 1):
         raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
-    note(f"the default settings on {len(design.confirm)} blocks that no trial has seen")
-    default = tuner.evaluate(spec.space.fixed, design.confirm, jobs=jobs, cache=False) if best else {}
     candidates = []
-    for trial in best:
-        note(f"trial {trial.number} on the same blocks")
-        candidates.append(_confirmed(tuner, trial, default, len(best), jobs))
+    if best:
+        note(f"the default and {_named(best)} on {len(design.confirm)} blocks that no trial has seen")
+        default, *again = tuner.evaluate_beside(
+            [spec.space.fixed, *map(tuner.settings_of, best)], design.confirm, jobs=jobs
+        )
+        if isinstance(default, BlockFailedError):
+            raise default
+        candidates = [
+            _confirmed(tuner, trial, found, default, len(best)) for trial, found in zip(best, again, strict=True)
+        ]
     chosen = choose(candidates)
     picks = _picks(spec, candidates, chosen)
     for trial_number in dict.fromkeys(number for number in picks.values() if number is not None):
@@ -91,16 +97,21 @@ def _summary(
         recorded=[str(block) for block in design.recorded],
         tune=[str(block) for block in design.race],
         picks=picks,
+        seen=splits_seen(tuner.defaults, design),
     )
 
 
-def _confirmed(tuner: Tuner, trial: FrozenTrial, default: Outcomes, candidates: int, jobs: int) -> Candidate:
-    """A trial's settings on the blocks for the choice, without the stage cache, so that its times are its own."""
+def _named(trials: Sequence[FrozenTrial]) -> str:
+    return f"trial{'s' * (len(trials) > 1)} {' and '.join(str(trial.number) for trial in trials)}"
+
+
+def _confirmed(
+    tuner: Tuner, trial: FrozenTrial, again: Outcomes | BlockFailedError, default: Outcomes, candidates: int
+) -> Candidate:
+    """A trial's settings on the blocks for the choice, of several candidates."""
     candidate = Candidate(trial=trial.number, params=trial.params, values=list(trial.values))
-    try:
-        again = tuner.evaluate(tuner.settings_of(trial), tuner.design.confirm, jobs=jobs, cache=False)
-    except BlockFailedError as error:
-        return candidate.model_copy(update={"failed": str(error), "feasible": False})
+    if isinstance(again, BlockFailedError):
+        return candidate.model_copy(update={"failed": str(again), "feasible": False})
     found = {
         "confirm": compared(again, default, objective=together(tuner.objectives), candidates=candidates),
         "on_confirm": _beside(again, default),
@@ -114,18 +125,18 @@ def _confirmed(tuner: Tuner, trial: FrozenTrial, default: Outcomes, candidates: 
 
 def _judged(tuner: Tuner, chosen: Candidate, jobs: int) -> Candidate:
     """The choice on the held-out blocks and on recordings."""
-    settings = {**tuner.spec.space.fixed, **chosen.params}
-    found: dict[str, Any] = {}
-    try:
-        for split, blocks in (("held_out", tuner.design.held_out), ("recorded", tuner.design.recorded)):
-            if blocks:
-                tuned = tuner.evaluate(settings, blocks, jobs=jobs, cache=False)
-                default = tuner.evaluate(tuner.spec.space.fixed, blocks, jobs=jobs, cache=False)
-                after: Objective = ACCURACY if split == "recorded" else together(tuner.objectives)
-                found[split] = compared(tuned, default, objective=after)
-                found |= {"on_held_out": _beside(tuned, default)} if split == "held_out" else {}
-    except BlockFailedError as error:
-        return chosen.model_copy(update={"failed": str(error), "feasible": False})
+    fixed, found = tuner.spec.space.fixed, dict[str, Any]()
+    for split, blocks in (("held_out", tuner.design.held_out), ("recorded", tuner.design.recorded)):
+        if not blocks:
+            continue
+        default, tuned = tuner.evaluate_beside([fixed, {**fixed, **chosen.params}], blocks, jobs=jobs)
+        for each in (default, tuned):
+            if isinstance(each, BlockFailedError):
+                return chosen.model_copy(update={"failed": str(each), "feasible": False})
+        assert not isinstance(default, BlockFailedError) and not isinstance(tuned, BlockFailedError)
+        after: Objective = ACCURACY if split == "recorded" else together(tuner.objectives)
+        found[split] = compared(tuned, default, objective=after)
+        found |= {"on_held_out": _beside(tuned, default)} if split == "held_out" else {}
     return chosen.model_copy(update=found)
 
 

@@ -16,6 +16,7 @@ from dynslam_bench.core.records import write_atomic
 from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block as Piece
 from dynslam_bench.reports.html.page import Section, render
+from dynslam_bench.reports.model.row import SEEN
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 
 from .blocks import Block, scenes
@@ -23,6 +24,7 @@ from .importance import FEWEST_TRIALS, importances, inert_parameters
 from .preset import preset_text
 from .ratio import Ratio
 from .samplers import is_feasible
+from .seen import seen_note, splits_seen
 from .study import Tuner
 from .summary import Candidate, StudySummary, worth
 from .trials import errors_of
@@ -45,11 +47,12 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         update={"split_notes": list(tuner.design.notes)}
     )  # a stored one may be older than the check
     summary = summary.model_copy(update={"inert": _inert(tuner), "importances": _importances(tuner)})
+    summary = summary.model_copy(update={"seen": splits_seen(tuner.defaults, tuner.design)})
     tables = [_candidates(summary), _trials(tuner, summary)]
     figures = _figures(tuner, summary)
     result = [Piece("table", table=tables[0]), *_shown(figures, "ratios")]
     sections = [
-        Section("result", "What the study found", "Result", [summary.verdict], result),
+        Section("result", "What the study found", "Result", _found(summary), result),
         Section("preset", "The chosen settings", "Settings", _picks(summary), _preset(tuner, summary)),
         Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
@@ -78,6 +81,10 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     path = tuner.folder / "index.html"
     write_atomic(path, html)
     return path
+
+
+def _found(summary: StudySummary) -> list[str]:
+    return [summary.verdict, *filter(None, [seen_note(summary.seen)])]
 
 
 def _size(blocks: Sequence[Block]) -> str:
@@ -291,19 +298,28 @@ def _candidates(summary: StudySummary) -> Table:
         "Ratios to the default settings on the same blocks: the median of a scene's starts, the mean over scenes "
         "(trimmed from ten on), and the 95 % interval over scenes. On blocks that no trial had seen the one with the "
         "smallest upper bound is chosen, where that lies below 1, and else the default; held-out blocks and recordings "
-        f"only judge the choice. Frame times without the stage cache.{_apart(summary)}"
+        f"only judge the choice. Frame times without the stage cache.{_cautions(summary)}"
     )
     optimistic = "the trial's own value, optimistic: it was selected for it"
     one_sided = "one-sided upper bound for the choice; allows for the number of candidates"
-    columns = [Column("trial"), Column("in the race", meaning=optimistic), *numbers("unseen blocks")]
-    columns += [Column("upper bound", meaning=one_sided), *numbers("held-out", "recorded", "frame ms")]
+    race, confirm, held_out = _marked(
+        summary, ("in the race", "tune"), ("unseen blocks", "confirm"), ("held-out", "held_out")
+    )
+    columns = [Column("trial"), Column(race, meaning=optimistic), *numbers(confirm)]
+    columns += [Column("upper bound", meaning=one_sided), *numbers(held_out, "recorded", "frame ms")]
     columns += [Column("constraints hold", numeric=False)]
     return Table("candidates", "The best trials, judged again", caption, columns, rows)
 
 
-def _apart(summary: StudySummary) -> str:
-    """A warning for every table of a study whose splits are not apart."""
-    return f" The splits are NOT apart: {'; '.join(summary.split_notes)}." if summary.split_notes else ""
+def _cautions(summary: StudySummary) -> str:
+    """What every table of a study has to say whose splits are not apart, or whose masks knew the scenes."""
+    apart = f"The splits are NOT apart: {'; '.join(summary.split_notes)}." if summary.split_notes else ""
+    return "".join(f" {text}" for text in (apart, seen_note(summary.seen)) if text)
+
+
+def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
+    """Headings of columns, with `SEEN` behind those of a split whose scenes the network behind the masks knew."""
+    return [f"{heading} {SEEN}" if split in summary.seen else heading for heading, split in headings]
 
 
 def _trials(tuner: Tuner, summary: StudySummary) -> Table:
@@ -322,10 +338,10 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
                 *(_value(trial.params.get(name)) for name in names),
             ]
         )
-    headings = [f"ratio of {each.what}" for each in tuner.objectives]
+    headings = _marked(summary, *((f"ratio of {each.what}", "tune") for each in tuner.objectives))
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings)]
     columns += numbers("coverage", "fps", *names)
-    caption = f"Reasons of dropped (pruned) and failed trials stand behind their state.{_apart(summary)}"
+    caption = f"Reasons of dropped (pruned) and failed trials stand behind their state.{_cautions(summary)}"
     return Table("trials", "All trials", caption, columns, rows)
 
 

@@ -9,6 +9,7 @@ from dynslam_bench.core.reading import read_text
 from dynslam_bench.core.records import write_atomic
 
 from .preset import preset_text
+from .seen import seen_note
 from .storage import study_folder
 from .study import Tuner
 from .study_file import StudySpec
@@ -21,10 +22,11 @@ def write_presets(tuner: Tuner, summary: StudySummary) -> None:
     spec = tuner.spec
     for name, number in summary.picks.items():
         candidate = next((each for each in summary.candidates if each.trial == number), None)
+        found = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
         text = preset_text(
             {} if candidate is None else candidate.params,
             spec.tracker,
-            summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes),
+            " ".join(filter(None, (found, seen_note(summary.seen)))),
             fixed=spec.space.fixed,
             tuned_on=[*summary.tune, *summary.confirm],
             judged_on=[*summary.held_out, *summary.recorded] if candidate is not None else (),

@@ -20,6 +20,7 @@ from dynslam_bench.core.settings import (
 )
 from dynslam_bench.core.steering import why_unused
 
+from .seen import source_of_masks
 from .study_file import SpaceSpec
 
 
@@ -122,8 +123,6 @@ def _why_dead(parameter: Parameter, settings: Settings, tuned: set[str]) -> str:
 
 def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
     """The settings with the source of masks that ``auto`` stands for on rendered sequences."""
-    segmentation = getattr(settings, "segmentation", None)
-    rendered = bool(sequences) and all(name.startswith("synthetic/") for name in sequences)
-    if rendered and getattr(segmentation, "source", "") == "auto":
-        return apply_overrides(settings, {"segmentation.source": "embedded"})
+    if hasattr(settings, "segmentation"):
+        return apply_overrides(settings, {"segmentation.source": source_of_masks(settings, sequences)})
     return settings

@@ -101,6 +101,7 @@ class StudySummary(Record):
         recorded: Recordings that it was checked on.
         picks: Presets of the study by name, and the trial of each; None where the default is the pick.
         split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
+        seen: Splits with scenes that the network behind the masks was trained on, see `seen.seen_note`.
     """
 
     name: str
@@ -119,6 +120,7 @@ class StudySummary(Record):
     recorded: list[str] = Field(default_factory=list)
     picks: dict[str, int | None] = Field(default_factory=dict)
     split_notes: list[str] = Field(default_factory=list)
+    seen: list[str] = Field(default_factory=list)
 
     @model_validator(mode="before")
     @classmethod

@@ -15,6 +15,7 @@ from dynslam_bench.core.harmless import printable
 
 from . import (
     caches,
+    doctor,
     environments,
     evaluating,
     imports,
@@ -51,6 +52,7 @@ imports.add(app)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 app.add_typer(caches.app, name="cache", rich_help_panel=CARE)
 environments.add(app)
+doctor.add(app)
 
 
 def _version(asked: bool) -> None:

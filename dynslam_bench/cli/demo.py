@@ -6,23 +6,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .demo_story import tell
 from .output import aligned, note, progress
 from .running import make_runs
 from .studies import hush_optuna, run_trials
 
 if TYPE_CHECKING:
+    from dynslam_bench.reports.model.board import Board
     from dynslam_bench.runs import RunStore
 
 DEFAULT_PROTOCOL = "tum-rgbd/v1"
 STUDIED = (
-    "features.n_features",
     "flow.budget",
     "flow.population",
+    "flow.sweeps",
+    "flow.neighbours",
     "flow.refinement_iterations",
-    "backend.bundle_adjustment.iterations",
-    "backend.bundle_adjustment.observations",
 )
-"""What the demo's study tunes: settings that take time."""
+"""What the demo's study tunes: how long the flow searches. Behind masks of people it decides few poses."""
+STUDY_FRAMES = 0.25
+"""Frames of a block of the study, as a share of the runs' frames; `FEWEST_FRAMES` at least."""
+FEWEST_FRAMES = 20
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,16 @@ class DemoOutcome:
 
     Attributes:
         leaderboard: Ranking and errors by sequence, as text.
+        story: What that shows, in sentences.
         report: The HTML page.
+        conclusion: Of the study.
+        study: Its page.
         runs: How many runs there are.
         failed: How many of them failed.
     """
 
     leaderboard: str
+    story: list[str]
     report: Path
     conclusion: str
     study: Path
@@ -44,12 +52,12 @@ class DemoOutcome:
     failed: int
 
 
-def run_demo(results: Path | str = "results", *, frames: int = 300, jobs: int = 2, trials: int = 6) -> DemoOutcome:
+def run_demo(results: Path | str = "results", *, frames: int = 150, jobs: int = 2, trials: int = 6) -> DemoOutcome:
     """Render walking and sitting people, run the suite ``demo`` on them, report it, and tune `emfoa-oft`.
 
     Args:
         results: Results folder; the report is ``report/index.html`` in it, the study lies in ``study``.
-        frames: Frames of each sequence; the study takes an eighth of them.
+        frames: Frames of each sequence; blocks of the study have a quarter of them.
         jobs: Runs at a time.
         trials: Trials of the study.
 
@@ -70,9 +78,17 @@ def run_demo(results: Path | str = "results", *, frames: int = 300, jobs: int = 
     records = make_runs(specs, store, jobs=jobs)
     note("making the report")
     paths = build_report(store, store.root / "report", title="Demo: walking and sitting people, rendered")
-    summary, page = tune_a_little(store.root / "study", frames=max(20, frames // 8), jobs=jobs, trials=trials)
+    summary, page = tune_a_little(store.root / "study", frames=study_frames(frames), jobs=jobs, trials=trials)
     failed = sum(record.failed for record in records)
-    return DemoOutcome(leaderboard_text(store), paths.html, summary, page, len(records), failed)
+    board = demo_board(store)
+    return DemoOutcome(
+        leaderboard_text(board), tell(board.rows, records), paths.html, summary, page, len(records), failed
+    )
+
+
+def study_frames(frames: int) -> int:
+    """Frames of a block of the study beside runs of so many frames."""
+    return max(FEWEST_FRAMES, int(STUDY_FRAMES * frames))
 
 
 def tune_a_little(results: Path, *, frames: int, jobs: int, trials: int) -> tuple[str, Path]:
@@ -118,19 +134,25 @@ def render(sequences: set[str]) -> None:
             render_synthetic(name, find_data_root(None), progress=advance)
 
 
-def leaderboard_text(store: RunStore, protocol: str = DEFAULT_PROTOCOL) -> str:
-    """The leaderboard and the errors by sequence of a store, as aligned text."""
+def demo_board(store: RunStore) -> Board:
+    """The leaderboard of a store under the default protocol."""
     from dynslam_bench.evaluation import get_protocol
     from dynslam_bench.reports.model.board import make_board
     from dynslam_bench.reports.model.rows import load_runs
+
+    return make_board([run.row for run in load_runs([store], get_protocol(DEFAULT_PROTOCOL)).runs])
+
+
+def leaderboard_text(board: Board) -> str:
+    """The leaderboard and the errors by sequence, as aligned text without the captions of the page."""
+    from dynslam_bench.evaluation import get_protocol
     from dynslam_bench.reports.tables.leaderboard import leaderboard
     from dynslam_bench.reports.tables.sequences import per_sequence
 
-    chosen = get_protocol(protocol)
-    board = make_board([run.row for run in load_runs([store], chosen).runs])
+    chosen = get_protocol(DEFAULT_PROTOCOL)
     parts = []
     for table in (leaderboard(board, chosen), per_sequence(board, chosen)):
         rows = [[column.name for column in table.columns]]
         rows += [[f"{cell.text} {cell.small}".strip() for cell in row] for row in table.rows]
-        parts.append(f"{table.title}\n{aligned(rows)}\n{table.caption}")
-    return "\n\n".join(parts)
+        parts.append(f"{table.title}\n{aligned(rows)}")
+    return "\n\n".join([*parts, f"Protocol: {chosen.describe()}"])

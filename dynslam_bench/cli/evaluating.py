@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from .options import AsJson, ProtocolId
+from .options import AsJson, ProtocolId, Timestamps
 from .output import write, write_json, write_table
 from .panels import MEASURE
 
 protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
-Estimate = Annotated[Path, typer.Argument(help="Trajectory file in TUM format.")]
-GroundTruth = Annotated[Path, typer.Argument(help="Ground-truth file in TUM format.")]
+Estimate = Annotated[Path, typer.Argument(help="Trajectory file in TUM format, or in KITTI's with --timestamps.")]
+GroundTruth = Annotated[Path, typer.Argument(help="Ground-truth file in either format.")]
 
 
 def add(app: typer.Typer) -> None:
@@ -27,12 +27,13 @@ def evaluate(
     estimate: Estimate,
     ground_truth: GroundTruth,
     protocol: ProtocolId = "tum-rgbd/v1",
+    timestamps: Timestamps = None,
     as_json: AsJson = False,
 ) -> None:
     """Evaluate a trajectory file against a ground-truth file."""
     from dynslam_bench.evaluation import evaluate_files
 
-    result = evaluate_files(estimate, ground_truth, protocol)
+    result = evaluate_files(estimate, ground_truth, protocol, timestamps=timestamps)
     if as_json:
         write_json(result)
         return
@@ -55,12 +56,15 @@ def list_(as_json: AsJson = False) -> None:
 
 
 @protocols.command()
-def compare(estimate: Estimate, ground_truth: GroundTruth, as_json: AsJson = False) -> None:
+def compare(
+    estimate: Estimate, ground_truth: GroundTruth, timestamps: Timestamps = None, as_json: AsJson = False
+) -> None:
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation import compare_protocols
-    from dynslam_bench.geometry.tum_file import read_tum
+    from dynslam_bench.geometry.trajectory_file import load_trajectory
 
-    rows = compare_protocols(read_tum(estimate), read_tum(ground_truth))
+    loaded = [load_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth)]
+    rows = compare_protocols(loaded[0], loaded[1], of_file=True)
     if as_json:
         write_json([asdict(row) for row in rows])
         return

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .options import AsJson, Camera, DataRoot, Frames, ProtocolId, Results, Stride
+from .options import AsJson, Camera, DataRoot, Frames, ProtocolId, Results, Stride, Timestamps
 from .panels import MEASURE
 from .run_rows import show_runs
 
@@ -18,7 +18,7 @@ def add(app: typer.Typer) -> None:
 
 
 def import_(
-    trajectory: Annotated[Path, typer.Argument(help="Trajectory file in TUM format.")],
+    trajectory: Annotated[Path, typer.Argument(help="Trajectory file in TUM format, or in KITTI's with --timestamps.")],
     tracker: Annotated[str, typer.Option(help="Name of the system that made it.")],
     sequence: Annotated[str, typer.Option(help="Id or folder of the sequence that it was made on.")],
     label: Annotated[str, typer.Option(help="Name for tables.")] = "",
@@ -32,6 +32,7 @@ def import_(
     frames: Frames = None,
     stride: Stride = 1,
     protocol: ProtocolId = "tum-rgbd/v1",
+    timestamps: Timestamps = None,
     as_json: AsJson = False,
 ) -> None:
     """Put a trajectory from elsewhere beside our own runs."""
@@ -50,5 +51,6 @@ def import_(
         stride=stride,
         data_root=data_root,
         camera=camera,
+        timestamps=timestamps,
     )
     show_runs([record], store, protocol, as_json=as_json)

@@ -75,6 +75,12 @@ SettingsFile = Annotated[
         "--settings", help="TOML file of settings, e.g. a preset that `tune best` wrote.", rich_help_panel=SETTINGS
     ),
 ]
+Timestamps = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--timestamps", metavar="FILE", help="Stamps of a trajectory in KITTI's format: a times.txt, or rgb.txt."
+    ),
+]
 ProtocolId = Annotated[
     str,
     typer.Option(

@@ -141,8 +141,12 @@ def write_report_table(table: Table) -> None:
     cells = [[" ".join(filter(None, (cell.text, cell.small, cell.tag))) for cell in row] for row in table.rows]
     write_table([column.key for column in table.columns], cells)
     write()
-    for line in textwrap.wrap(table.caption, min(_terminal_width(), 120) if sys.stdout.isatty() else 120):
-        write(line)
+    write(wrapped(table.caption))
+
+
+def wrapped(text: str, most: int = 120) -> str:
+    """Text in lines as wide as the terminal, `most` characters at most; that many where there is none."""
+    return "\n".join(textwrap.wrap(text, min(_terminal_width(), most) if sys.stdout.isatty() else most))
 
 
 def _terminal_width() -> int:
@@ -204,7 +208,7 @@ class _Lines:
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            complain(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far")
+            complain(f"{self.label}{':' * bool(self.text)}{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 

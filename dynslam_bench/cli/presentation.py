@@ -10,7 +10,7 @@ import typer
 
 from .groups import DefaultGroup
 from .options import AsJson, DataRoot, Jobs, ProtocolId, Results
-from .output import SOME_RUNS_FAILED, progress, write, write_json, write_report_table, write_table
+from .output import SOME_RUNS_FAILED, progress, wrapped, write, write_json, write_report_table, write_table
 from .panels import REPORT, START
 
 if TYPE_CHECKING:
@@ -98,6 +98,8 @@ def publish(
         typer.Option(help="Folder of a study with its page, as `tune report` names it."),
     ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
+    remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",
+    picture_seconds: Annotated[float, typer.Option(min=0, help="Time for drawing pictures of frames.")] = 60,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -105,7 +107,10 @@ def publish(
     from dynslam_bench.reports import publish as publish_site
 
     with progress("site") as advance:
-        site = publish_site(results, output, study=study, title=title, protocol=protocol, on_progress=advance)
+        site = publish_site(
+            results, output, study=study, title=title, note=remark, picture_seconds=picture_seconds,
+            protocol=protocol, on_progress=advance,
+        )  # fmt: skip
     if as_json:
         write_json({"index": site.index, "files": site.files, "size_mb": site.size_mb})
     else:
@@ -174,18 +179,21 @@ def audit_paper(
 
 def demo(
     results: Results = Path("results"),
-    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 300,
+    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 150,
     jobs: Jobs = 2,
     trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
-    from .demo import run_demo
+    from .demo import run_demo, study_frames
+    from .demo_story import estimate
 
+    write(estimate(frames, study_frames(frames), trials, jobs), now=True)
     outcome = run_demo(results, frames=frames, jobs=jobs, trials=trials)
     write()
     write(outcome.leaderboard)
     write()
-    write(f"study: {outcome.conclusion}")
+    for line in (*outcome.story, f"The study: {outcome.conclusion}"):
+        write(wrapped(line))
     write()
     write(f"report: {outcome.report}")
     write(f"study:  {outcome.study}")

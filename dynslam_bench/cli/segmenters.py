@@ -1,4 +1,4 @@
-"""``segmenter train|evaluate``."""
+"""``segmenter train|evaluate|record``."""
 
 from __future__ import annotations
 
@@ -7,10 +7,21 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from .options import AsJson, Assignments, Device, SettingsFile, Threads, gather_settings
+from . import completion
+from .options import (
+    AsJson,
+    Assignments,
+    Camera,
+    DataRoot,
+    Device,
+    Frames,
+    SettingsFile,
+    Threads,
+    gather_settings,
+)
 from .output import progress, write, write_fields, write_json, write_table
 
-app = typer.Typer(help="Train and measure segmentation networks.", no_args_is_help=True)
+app = typer.Typer(help="Train and measure segmentation networks, record their masks.", no_args_is_help=True)
 
 
 @app.command()
@@ -97,3 +108,29 @@ def evaluate(
         write()
         columns = sorted({key for quality in classes.values() for key in quality})
         write_table(("class", *columns), [(name, *(row.get(key) for key in columns)) for name, row in classes.items()])
+
+
+@app.command()
+def record(
+    sequence: Annotated[str, typer.Argument(help="Id or path.", autocompletion=completion.sequences)],
+    output: Annotated[Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")],
+    source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
+    assignments: Assignments = None,
+    frames: Frames = None,
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    device: Device = "auto",
+    threads: Threads = 1,
+) -> None:
+    """Write a segmenter's masks of a sequence as PNG files; a call that was interrupted goes on."""
+    from dynslam_bench.core.settings import apply_overrides
+    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.segmentation.masks.recording import record_masks
+    from dynslam_bench.segmentation.settings import SegmentationSettings
+    from dynslam_bench.sequences.catalogue import open_sequence
+
+    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})})
+    opened = open_sequence(sequence, data_root=data_root, camera=camera, frames=frames)
+    with progress(f"masks of {opened.id}") as advance:
+        made = record_masks(opened, output, settings, device=resolve_device(device), threads=threads, progress=advance)
+    write(f"{made} of {len(opened)} frames segmented now; use them with --set segmentation.source=recorded:{output}")

@@ -1,16 +1,21 @@
-"""``sequences list|info|fetch|verify|render``."""
+"""``sequences list|info|fetch|verify|unpack|render``."""
 
 from __future__ import annotations
 
 import fnmatch
 from dataclasses import asdict
-from typing import Annotated, Any, Optional
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from . import completion
 from .options import AsJson, Camera, DataRoot
 from .output import VERIFICATION_FAILED, complain, note, progress, write, write_fields, write_json, write_table
+
+if TYPE_CHECKING:
+    from dynslam_bench.sequences.listing import Summary
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
 
@@ -40,16 +45,31 @@ def list_(
     ]
     if as_json:
         write_json([asdict(each) for each in found])
-        return
-    columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum", "license")
+    elif not found:
+        asked = [f"'{pattern}'", *([f"with the tag {tag}"] if tag else []), *(["on this machine"] if here else [])]
+        write(f"no sequence matches {' '.join(asked)}; all {len(everything)}: dynslam-bench sequences list")
+    for title, group in groupby([] if as_json else found, key=lambda each: each.dataset):
+        _write_group(title, list(group))
+
+
+def _write_group(title: str, found: list[Summary]) -> None:
+    """A data set's sequences under a line of what holds for all of them."""
+    layout = found[0].layout
+    about = [f"licence {found[0].license}", f"layout: {layout} on the publisher's files" if layout else ""]
+    about.append(f"by hand: {found[0].by_hand}" if found[0].by_hand else "")
+    write(f"{title} ({'; '.join(filter(None, about))})")
     write_table(
-        columns,
+        ("sequence", "here", "size", "tags", "split", "ground truth", "checksum", "license", "verified"),
         [
-            (each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum, each.license)
+            (
+                *(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum),
+                *(each.license, each.layout),
+            )
             for each in found
         ],
-        spare=("license", "checksum", "ground truth", "split"),
+        spare=("license", "verified", "checksum", "ground truth", "split"),
     )
+    write("")
 
 
 @app.command()
@@ -135,6 +155,28 @@ def verify(
                 write(f"  {fault}")
     if not all(report.ok for report in reports):
         raise typer.Exit(VERIFICATION_FAILED)
+
+
+@app.command()
+def unpack(
+    bag: Annotated[Path, typer.Argument(help="A ROS 1 .bag, a ROS 2 folder, an .mcap or .db3 file.")],
+    folder: Annotated[Path, typer.Argument(help="The folder to make, in TUM layout.")],
+    colour: Annotated[Optional[str], typer.Option(help="Topic of the colour images.")] = None,  # noqa: UP045
+    depth: Annotated[Optional[str], typer.Option(help="Topic of registered depth images.")] = None,  # noqa: UP045
+    truth: Annotated[Optional[str], typer.Option(help="Topic of the camera's true poses, or none.")] = None,  # noqa: UP045
+    as_json: AsJson = False,
+) -> None:
+    """Unpack a ROS bag or MCAP file into a folder that is a sequence."""
+    from dynslam_bench.sequences.bags import unpack_bag
+
+    found = unpack_bag(bag, folder, colour=colour, depth=depth, truth=truth)
+    if as_json:
+        write_json({**asdict(found), "folder": str(found.folder)})
+        return
+    for line in found.notes:
+        note(line)
+    poses = f", poses from {found.truth}" if found.truth else ", no ground truth"
+    write(f"{found.folder}: {found.frames} frames from {found.colour} and {found.depth}{poses}")
 
 
 @app.command()

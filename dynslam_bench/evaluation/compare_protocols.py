@@ -8,6 +8,7 @@ from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .evaluate import evaluate
+from .prepare import truth_of_file
 from .protocol import PROTOCOLS, Alignment, Protocol, RPESpec
 
 
@@ -18,10 +19,10 @@ class ComparisonRow:
     Attributes:
         metric: ``ATE`` or ``RPE``, each an RMSE of translations.
         label: What sets the row apart, e.g. ``SE(3)-aligned``.
-        rmse_m: The error in metres; None where it is not defined.
+        rmse_m: The error in metres, of a rate in m/s; None where it is not defined.
         pairs: Poses or pairs of poses that it is taken over.
         protocol: One-line description of the whole protocol.
-        note: Why the number is missing; empty otherwise.
+        note: Why the number is missing, or for what it holds only; empty otherwise.
     """
 
     metric: str
@@ -32,19 +33,23 @@ class ComparisonRow:
     note: str = ""
 
 
-def compare_protocols(estimate: Trajectory, ground_truth: Trajectory) -> list[ComparisonRow]:
+def compare_protocols(estimate: Trajectory, ground_truth: Trajectory, *, of_file: bool = False) -> list[ComparisonRow]:
     """ATE under every alignment and RPE under every habit of the field, of one and the same trajectory.
 
     Args:
         estimate: Estimated camera-to-world poses.
         ground_truth: True poses.
+        of_file: Whether they are as a ground-truth file has them, rather than a sequence: it matters for Bonn's.
 
     Raises:
         EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
     """
     evaluate(estimate, ground_truth, "tum-rgbd/v1")
-    rows = [_row("ATE", label, estimate, ground_truth, protocol) for label, protocol in _absolute()]
-    rows += [_row("RPE", label, estimate, ground_truth, protocol) for label, protocol in _relative()]
+    rows = []
+    for metric, protocols in (("ATE", _absolute()), ("RPE", _relative())):
+        for label, protocol in protocols:
+            truth = truth_of_file(ground_truth, protocol) if of_file else ground_truth
+            rows.append(_row(metric, label, estimate, truth, protocol))
     return rows
 
 
@@ -61,7 +66,15 @@ def _absolute() -> list[tuple[str, Protocol]]:
         (label, base.model_copy(update={"id": f"tum-rgbd/{mode}", "alignment": mode})) for label, mode in alignments
     ]
     evo = PROTOCOLS["evo-default"].model_copy(update={"id": "evo -a", "alignment": "se3", "rpe": ()})
-    return [*rows, ("evo_ape -a", evo), ("VSLAM-LAB", PROTOCOLS["vslam-lab"])]
+    return [
+        *rows,
+        ("evo_ape -a", evo),
+        ("VSLAM-LAB", PROTOCOLS["vslam-lab"]),
+        ("WildGS-SLAM, DROID-W", PROTOCOLS["droid-w/v1"]),
+        ("MonST3R (90 frames)", PROTOCOLS["tum-dynamics-90/v1"].model_copy(update={"rpe": ()})),
+        ("at Bonn's camera, SE(3)", PROTOCOLS["bonn-camera/v1"].model_copy(update={"rpe": ()})),
+        ("DROID-W on Bonn", PROTOCOLS["droid-w/v1-bonn"]),
+    ]
 
 
 def _relative() -> list[tuple[str, Protocol]]:
@@ -73,6 +86,8 @@ def _relative() -> list[tuple[str, Protocol]]:
     return [
         ("TUM, 1 frame, fixed delta", variant(tum, "tum-rgbd/1f", RPESpec(delta=1, unit="f"))),
         ("TUM, 1 s, fixed delta", variant(tum, "tum-rgbd/1s", RPESpec(delta=1, unit="s"))),
+        ("TUM, 1 s, as a rate (m/s)", PROTOCOLS["tum-rgbd/v1-rate"]),
+        ("MonST3R (90 frames), 1 frame", PROTOCOLS["tum-dynamics-90/v1"]),
         ("TUM's default, random pairs", PROTOCOLS["tum-rgbd/v1-random-pairs"]),
         ("evo_rpe, 1 frame", evo),
         ("evo_rpe, 30 frames", variant(evo, "evo 30f", RPESpec(delta=30, unit="f", pairs="consecutive"))),
@@ -86,8 +101,9 @@ def _row(metric: str, label: str, estimate: Trajectory, ground_truth: Trajectory
     except EvaluationError as error:
         return ComparisonRow(metric, label, None, 0, protocol.describe(), str(error))
     if metric == "ATE":
-        return ComparisonRow(metric, label, result.metrics["ate_rmse_m"], result.n_pairs, protocol.describe())
+        note = f"means something for {protocol.only_for}* only" if protocol.only_for else ""
+        return ComparisonRow(metric, label, result.metrics["ate_rmse_m"], result.n_pairs, protocol.describe(), note)
     key = protocol.rpe[0].key
-    rmse = result.metrics.get(f"rpe_{key}_trans_rmse_m")
+    rmse = result.metrics.get(protocol.rpe[0].metric("trans"))
     note = "" if rmse is not None else f"the trajectory has no pair {protocol.rpe[0].describe()} apart"
     return ComparisonRow(metric, label, rmse, result.n_pairs_rpe[key], protocol.describe(), note)

@@ -11,18 +11,18 @@ from pydantic import field_validator
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import load_tum
+from dynslam_bench.geometry.trajectory_file import load_trajectory
 
 from . import frames
 from .alignment import Similarity, align
 from .ape import absolute_errors
 from .association import Association, match
 from .conditioning import RELIABLE_DEG
-from .error_statistics import named, statistics
+from .error_statistics import named
 from .never_move import never_move
+from .prepare import apply_policy, compared, truth_of_file
 from .protocol import Alignment, Protocol, get_protocol
-from .rpe import RelativeErrors, evo_relative_errors, tum_relative_errors
-from .segments import segment_errors
+from .relative import relative_metrics, segment_metrics
 
 SCHEMA_VERSION = 1
 
@@ -143,21 +143,21 @@ def evaluate(
     if input_timestamps is not None:
         n_input = len(np.asarray(input_timestamps).reshape(-1))
         n_tracked = int(frames.tracked_frames(estimate, input_timestamps).sum())
-    estimate = _apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
+    estimate = apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
+    estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     association = _associate(estimate, ground_truth, protocol, diagnostics)
-    matched = estimate.T_world_cam[association.estimate]
-    truth = ground_truth.T_world_cam[association.ground_truth]
+    matched, truth = estimate.T_world_cam[association.estimate], ground_truth.T_world_cam[association.ground_truth]
     similarity = _align(matched, truth, protocol, diagnostics)
     aligned = similarity.apply(matched)
     translation, rotation = absolute_errors(aligned, truth)
     metrics = {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
-    relative, counts = _relative_metrics(estimate, ground_truth, association, aligned, similarity, protocol)
+    relative, counts = relative_metrics(estimate, ground_truth, association, aligned, similarity, protocol)
     for key, count in counts.items():
         if not count:
             diagnostics.append(f"no pair of poses for the relative error over {key}; it is left out")
     metrics.update(relative)
     if protocol.segments_m:
-        metrics.update(_segment_metrics(aligned, truth, protocol, diagnostics))
+        metrics.update(segment_metrics(aligned, truth, protocol, diagnostics))
     metrics["never_move_ate_rmse_m"] = _never_move(ground_truth, association, protocol, input_timestamps)
     return Evaluation(
         protocol_id=protocol.id,
@@ -176,18 +176,33 @@ def evaluate(
 
 
 def evaluate_files(
-    estimate: str | Path, ground_truth: str | Path, protocol: Protocol | str = "tum-rgbd/v1"
+    estimate: str | Path,
+    ground_truth: str | Path,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    timestamps: str | Path | None = None,
 ) -> Evaluation:
-    """Evaluate a trajectory file against a ground-truth file, both in TUM format.
+    """Evaluate a trajectory file against a ground-truth file, each in TUM's format or, with stamps, in KITTI's.
 
     What the files held in disorder (skipped, sorted and replaced lines) is added to the diagnostics.
+
+    Args:
+        estimate: The trajectory.
+        ground_truth: The truth, as its publisher wrote it.
+        protocol: How to evaluate.
+        timestamps: A file whose lines begin with the stamps of the poses in KITTI's format, in seconds.
 
     Raises:
         TrajectoryError: A file cannot be read.
         EvaluationError: As `evaluate`.
     """
-    loaded = {"estimate": load_tum(estimate), "ground truth": load_tum(ground_truth)}
-    result = evaluate(loaded["estimate"].trajectory, loaded["ground truth"].trajectory, protocol)
+    protocol = get_protocol(protocol)
+    loaded = {
+        "estimate": load_trajectory(estimate, timestamps),
+        "ground truth": load_trajectory(ground_truth, timestamps),
+    }
+    truth = truth_of_file(loaded["ground truth"].trajectory, protocol)
+    result = evaluate(loaded["estimate"].trajectory, truth, protocol)
     notes = [f"{name}: {note}" for name, file in loaded.items() for note in file.notes.describe()]
     return result.model_copy(update={"diagnostics": notes + result.diagnostics})
 
@@ -205,6 +220,7 @@ def pose_errors(
         EvaluationError: Nothing can be associated.
     """
     protocol = get_protocol(protocol)
+    estimate, ground_truth = compared(estimate, ground_truth, protocol)
     association = match(estimate, ground_truth, protocol)
     matched = estimate.T_world_cam[association.estimate]
     truth = ground_truth.T_world_cam[association.ground_truth]
@@ -278,80 +294,11 @@ def _unreliable(similarity: Similarity, truth: np.ndarray) -> str:
     )
 
 
-def _apply_policy(
-    estimate: Trajectory,
-    protocol: Protocol,
-    input_timestamps: ArrayLike | None,
-    n_input: int | None,
-    n_tracked: int | None,
-    diagnostics: list[str],
-) -> Trajectory:
-    if input_timestamps is None or n_input is None or n_tracked is None:
-        if protocol.lost_frames != "exclude":
-            raise EvaluationError(
-                f"protocol {protocol.id} ({protocol.lost_frames}) needs the stamps of the input frames",
-                "pass input_timestamps, or use a protocol that excludes lost frames",
-            )
-        return estimate
-    lost = n_input - n_tracked
-    if not lost:
-        return estimate
-    percent = f"coverage {100 * n_tracked / n_input:.1f} %"
-    if protocol.lost_frames == "fail":
-        raise EvaluationError(f"{lost} of {n_input} frames were lost ({percent}), {protocol.id} allows none")
-    if protocol.lost_frames == "hold":
-        diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and held at the last tracked pose")
-        return frames.hold(estimate, input_timestamps)
-    diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and take no part")
-    return estimate
-
-
-def _relative_metrics(
-    estimate: Trajectory,
-    ground_truth: Trajectory,
-    association: Association,
-    aligned: np.ndarray,
-    similarity: Similarity,
-    protocol: Protocol,
-) -> tuple[dict[str, float], dict[str, int]]:
-    metrics: dict[str, float] = {}
-    counts: dict[str, int] = {}
-    for spec in protocol.rpe:
-        errors: RelativeErrors
-        if spec.pairs in ("tum-fixed", "tum-random"):
-            errors = tum_relative_errors(estimate, ground_truth, spec, scale=similarity.scale)
-        else:
-            errors = evo_relative_errors(
-                estimate.timestamps[association.estimate],
-                aligned,
-                ground_truth.T_world_cam[association.ground_truth],
-                spec,
-            )
-        counts[spec.key] = len(errors.pairs)
-        metrics.update(named(f"rpe_{spec.key}_trans", errors.translation_m, "m"))
-        metrics.update(named(f"rpe_{spec.key}_rot", errors.rotation_deg, "deg"))
-    return metrics, counts
-
-
-def _segment_metrics(
-    aligned: np.ndarray, truth: np.ndarray, protocol: Protocol, diagnostics: list[str]
-) -> dict[str, float]:
-    translation, rotation = segment_errors(aligned, truth, protocol.segments_m)
-    if not len(translation):
-        length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
-        diagnostics.append(f"the path of {length:.1f} m is shorter than a segment of {min(protocol.segments_m):g} m")
-        return {}
-    return {
-        "kitti_trans_percent": statistics(translation)["mean"],
-        "kitti_rot_deg_per_m": statistics(rotation)["mean"],
-    }
-
-
 def _never_move(
     ground_truth: Trajectory, association: Association, protocol: Protocol, input_timestamps: ArrayLike | None
 ) -> float:
     """What not moving scores under the protocol's alignment, over the input frames where they are known."""
-    if input_timestamps is None:
+    if input_timestamps is None or protocol.thins:
         selected = ground_truth.select(np.unique(association.ground_truth))
         errors = never_move(selected)
     else:

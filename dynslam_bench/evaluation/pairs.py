@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,7 +68,16 @@ def closest(values: Array, targets: Array) -> Index:
     Args:
         values: Ascending ``[N]``, at least one.
         targets: ``[M]``.
+
+    Returns:
+        ``[M]``; nobody may write into it: all runs on one sequence share what is found for their stamps.
     """
+    return _closest(np.asarray(values, np.float64).tobytes(), np.asarray(targets, np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)
+def _closest(value_bytes: bytes, target_bytes: bytes) -> Index:
+    values, targets = np.frombuffer(value_bytes), np.frombuffer(target_bytes)
     low = np.zeros(len(targets), dtype=np.intp)
     high = np.full(len(targets), len(values), dtype=np.intp)
     best = np.zeros(len(targets), dtype=np.intp)
@@ -83,6 +94,7 @@ def closest(values: Array, targets: Array) -> Index:
         high = np.where(active & above, middle, high)
         low = np.where(active & ~above, middle + 1, low)
         active &= ~exact & (low < high)
+    best.flags.writeable = False
     return best
 
 

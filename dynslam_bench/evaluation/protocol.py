@@ -17,6 +17,7 @@ from dynslam_bench.core.records import digest
 Alignment = Literal["none", "origin", "se3", "sim3", "yaw"]
 DeltaUnit = Literal["f", "s", "m", "rad", "deg"]
 PairMode = Literal["tum-fixed", "tum-random", "consecutive", "all"]
+Truth = Literal["as-is", "bonn-camera", "bonn-droid-w"]
 
 _UNIT_NAMES = {"f": "frame", "s": "s", "m": "m", "rad": "rad", "deg": "deg"}
 
@@ -36,6 +37,7 @@ class RPESpec(_Frozen):
             square root of that). ``consecutive`` and ``all``: evo's non-overlapping and overlapping pairs.
         tolerance: Relative tolerance of `delta` in mode ``all`` (evo's is 0.1).
         max_pairs: At most so many pairs in the two TUM modes, a seeded sample of them; 0 for all.
+        rate: Whether each error is divided by the time between its two poses: m/s and degrees/s.
     """
 
     delta: float = Field(default=1.0, gt=0)
@@ -43,17 +45,28 @@ class RPESpec(_Frozen):
     pairs: PairMode = "tum-fixed"
     tolerance: float = Field(default=0.1, ge=0)
     max_pairs: int = Field(default=10000, ge=0)
+    rate: bool = False
 
     @model_validator(mode="after")
     def _whole_frames(self) -> RPESpec:
         if self.unit == "f" and self.delta != round(self.delta):
             raise ValueError(f"a delta in frames is a whole number, got {self.delta:g}")
+        if self.rate and self.unit != "s":
+            raise ValueError(f"a rate is taken over seconds, not over '{self.unit}'")
         return self
 
     @property
     def key(self) -> str:
         """Part of the metrics' names: ``1s`` in ``rpe_1s_trans_rmse_m``, or ``random``."""
-        return "random" if self.pairs == "tum-random" else f"{self.delta:g}{self.unit}"
+        return "random" if self.pairs == "tum-random" else f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
+
+    def unit_of(self, part: str) -> str:
+        """Unit of the error as metrics name it: m, deg, m_per_s or deg_per_s."""
+        return f"{'m' if part == 'trans' else 'deg'}{'_per_s' if self.rate else ''}"
+
+    def metric(self, part: str) -> str:
+        """Name of the metric, e.g. ``rpe_1s_trans_rmse_m``."""
+        return f"rpe_{self.key}_{part}_rmse_{self.unit_of(part)}"
 
     def describe(self) -> str:
         """For example ``1 s (TUM pairs)``."""
@@ -61,7 +74,7 @@ class RPESpec(_Frozen):
             return f"{self.max_pairs} random pairs" if self.max_pairs else "all pairs"
         plural = "s" if self.unit == "f" and self.delta != 1 else ""
         kind = {"tum-fixed": "TUM pairs", "consecutive": "consecutive pairs", "all": "all pairs"}[self.pairs]
-        return f"{self.delta:g} {_UNIT_NAMES[self.unit]}{plural} ({kind})"
+        return f"{self.delta:g} {_UNIT_NAMES[self.unit]}{plural} ({kind}{', as a rate' if self.rate else ''})"
 
 
 class Protocol(_Frozen):
@@ -81,6 +94,11 @@ class Protocol(_Frozen):
         trajectory: Whether the online or the final trajectory of a run is evaluated.
         lost_frames: ``exclude``: frames without a tracked pose take no part. ``hold``: the camera counts as not having
             moved since the last tracked frame. ``fail``: any lost frame makes the evaluation an error.
+        truth: ``as-is``; ``bonn-camera``: Bonn's positions moved from the markers to the camera (18.6 mm);
+            ``bonn-droid-w``: Bonn's poses as WildGS-SLAM and DROID-W correct them, which makes them 5.6 % smaller.
+        every: Only every so many of the frames that have a true pose are compared.
+        most_frames: At most so many of those, the first ones; 0 for all.
+        only_for: Beginning of the ids of the sequences that it holds for; empty for all.
     """
 
     id: str
@@ -92,10 +110,31 @@ class Protocol(_Frozen):
     segments_m: tuple[float, ...] = ()
     trajectory: Literal["online", "final"] = "online"
     lost_frames: Literal["exclude", "hold", "fail"] = "exclude"
+    truth: Truth = "as-is"
+    every: int = Field(default=1, ge=1)
+    most_frames: int = Field(default=0, ge=0)
+    only_for: str = ""
 
     def digest(self) -> str:
-        """Twelve hexadecimal digits that stand for every field; stored with every metric."""
+        """Twelve hexadecimal digits that stand for every field; stored with every metric.
+
+        What came after the first protocols counts where it is used only: digests that are stored stay what they were.
+        """
         return _digest(self)
+
+    @property
+    def thins(self) -> bool:
+        """Whether only some of the frames are compared."""
+        return self.every > 1 or self.most_frames > 0
+
+    def check_sequence(self, sequence: str) -> None:
+        """Refuse a sequence that the protocol does not hold for.
+
+        Raises:
+            EvaluationError: It is one.
+        """
+        if not sequence.startswith(self.only_for):
+            raise EvaluationError(f"protocol {self.id} holds for {self.only_for}* only, not for '{sequence}'")
 
     def describe(self) -> str:
         """One line for captions: everything that the numbers depend on."""
@@ -111,11 +150,17 @@ class Protocol(_Frozen):
             "hold": "lost frames held at the last pose",
             "fail": "no lost frame allowed",
         }
+        truths = {
+            "bonn-camera": "Bonn's truth moved to the camera",
+            "bonn-droid-w": "Bonn's truth as DROID-W corrects it",
+        }
         parts = [
             alignment[self.alignment],
             f"|dt| {'<' if self.strict else '<='} {self.max_dt:g} s {'one-to-one' if self.one_to_one else 'nearest'}",
             *(["RPE over " + " and ".join(spec.describe() for spec in self.rpe)] if self.rpe else []),
             *(["segments of " + ", ".join(f"{s:g}" for s in self.segments_m) + " m"] if self.segments_m else []),
+            *([truths[self.truth]] if self.truth != "as-is" else []),
+            *([f"every {self.every} matched frames, at most {self.most_frames or 'all'}"] if self.thins else []),
             f"{self.trajectory} trajectory",
             lost[self.lost_frames],
         ]
@@ -143,6 +188,34 @@ PROTOCOLS: dict[str, Protocol] = {
             rpe=(RPESpec(delta=1, unit="f", pairs="all"),),
             segments_m=(100, 200, 300, 400, 500, 600, 700, 800),
         ),
+        # drift in m/s, as several papers state it
+        Protocol(id="tum-rgbd/v1-rate", rpe=(RPESpec(delta=1, unit="s", rate=True),)),
+        Protocol(
+            id="bonn-camera/v1",
+            truth="bonn-camera",
+            only_for="bonn/",
+            rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f")),
+        ),
+        # as WildGS-SLAM and DROID-W score their last trajectory: images with the nearest true pose, aligned with scale
+        Protocol(id="droid-w/v1", max_dt=0.08, one_to_one=False, alignment="sim3", trajectory="final"),
+        Protocol(
+            id="droid-w/v1-bonn",
+            max_dt=0.08,
+            one_to_one=False,
+            alignment="sim3",
+            trajectory="final",
+            truth="bonn-droid-w",
+            only_for="bonn/",
+        ),
+        # MonST3R's: every third matched frame, the first 90 of them
+        Protocol(
+            id="tum-dynamics-90/v1",
+            alignment="sim3",
+            every=3,
+            most_frames=90,
+            trajectory="final",
+            rpe=(RPESpec(delta=1, unit="f", pairs="all"),),
+        ),
     )
 }
 
@@ -150,7 +223,14 @@ PROTOCOLS: dict[str, Protocol] = {
 @lru_cache(maxsize=64)
 def _digest(protocol: Protocol) -> str:
     """Taken once: lists of a hundred thousand runs ask for it as often."""
-    return digest(protocol)
+    fields = protocol.model_dump(mode="json")
+    for name in ("truth", "every", "most_frames", "only_for"):
+        if fields[name] == type(protocol).model_fields[name].default:
+            del fields[name]
+    for spec in fields["rpe"]:
+        if not spec["rate"]:
+            del spec["rate"]
+    return digest(fields)
 
 
 def get_protocol(name: str | Protocol) -> Protocol:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.core.files import write_atomic
@@ -19,13 +20,20 @@ from .tum_file import read_table
 _MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 
 
-def read_kitti(path: str | Path, times: str | Path | None = None, *, fps: float = 10.0) -> Trajectory:
+def read_kitti(
+    path: str | Path,
+    times: str | Path | NDArray[np.float64] | None = None,
+    *,
+    fps: float = 10.0,
+    described: str = "",
+) -> Trajectory:
     """Read a KITTI pose file.
 
     Args:
         path: The poses.
-        times: Stamps in seconds, one a line; None for ``i / fps``.
+        times: Stamps in seconds ``[N]``, or a file of them, one a line; None for ``i / fps``.
         fps: Frame rate in Hz where there is no `times` (KITTI's is 10).
+        described: Where stamps that are no file come from, for messages.
 
     Returns:
         Camera-to-world poses; rotations are made orthonormal exactly (files hold about seven digits).
@@ -48,9 +56,10 @@ def read_kitti(path: str | Path, times: str | Path | None = None, *, fps: float 
             raise TrajectoryError(f"the frame rate is {fps!r}, not a positive number of Hz")
         stamps = np.arange(len(poses)) / fps
     else:
-        stamps = read_table(Path(times), 1, "timestamp")[:, 0]
+        named = described or (str(times) if isinstance(times, (str, Path)) else "the list")
+        stamps = read_table(Path(times), 1, "timestamp")[:, 0] if isinstance(times, (str, Path)) else times
         if len(stamps) != len(poses):
-            raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(stamps)} stamps")
+            raise TrajectoryError(f"{path} has {len(poses)} poses but {named} has {len(stamps)} stamps")
     return Trajectory(stamps, poses)
 
 

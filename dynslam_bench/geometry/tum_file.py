@@ -7,7 +7,9 @@ lines with one stamp the last holds. Whatever is not taken as it stands is count
 
 from __future__ import annotations
 
+import io
 from array import array
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.reading import RECORD_BYTES, read_lines
 
 from . import se3
 from .trajectory import Trajectory
@@ -150,6 +152,9 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     Raises:
         TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
     """
+    whole = _plain_table(path, columns)
+    if whole is not None:
+        return whole
     values = array("d")
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if number > MOST_LINES:
@@ -171,6 +176,18 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
 
 
+def _plain_table(path: Path, columns: int) -> NDArray[np.float64] | None:
+    """The numbers of a file of a usual size and without any fault, read at once; None for every other one."""
+    with suppress(OSError, ValueError):  # whatever it is, reading line by line says it
+        if 0 < path.stat().st_size <= RECORD_BYTES:
+            text = path.read_text(encoding="utf-8-sig").replace(",", " ")
+            if any(line.strip().partition("#")[0] for line in text.splitlines()):  # numpy warns of a table of nothing
+                found = np.loadtxt(io.StringIO(text), ndmin=2)
+                if found.shape[1] == columns:
+                    return found
+    return None
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -181,7 +198,7 @@ def _is_number(text: str) -> bool:
 
 def _hint(found: int) -> str:
     if found == 12:
-        return "12 values a line are KITTI's format"
+        return "12 values a line are KITTI's format: give their stamps with --timestamps FILE"
     if found == 2:
         return "this looks like a list of images"
     return ""

@@ -47,7 +47,13 @@ def resolve_source(
             return "oracle"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    available = ["onnx:PATH", "recorded:DIR", "weights:PATH", f"coco (downloads {COCO.megabytes} MB from {COCO.url})"]
+    available = [
+        f"coco (the surest; downloads {COCO.megabytes} MB from {COCO.url}, about a second a frame on two cores)",
+        "onnx:PATH (your export, e.g. of YOLO-seg; about 0.1 s a frame)",
+        "recorded:DIR",
+        "weights:PATH",
+        "embedded (0.02 s a frame, knows rendered people only: on recorded ones hardly better than nothing)",
+    ]
     if masks is not None:
         available.insert(0, "oracle (the sequence's exact masks)")
     if optional:

@@ -11,9 +11,9 @@ from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.geometry.camera import Camera
 
-from .published.cameras import MARKER_TO_CAMERA, find_camera
+from .published.cameras import MARKER_TO_CAMERA, chosen_camera, find_camera
 from .published.datasets import DATASETS
-from .published.entries import CatalogueEntry, by_folder, catalogue, entry_of
+from .published.entries import CatalogueEntry, by_folder, catalogue, entry_of, public_datasets
 from .settings import PreprocessingSettings
 from .synthetic import open_synthetic
 from .view import SequenceView
@@ -49,7 +49,7 @@ def open_sequence(
 
     Args:
         name: An id (``tum/fr3/walking_xyz``, ``bonn/crowd``, ``synthetic/walking_xyz@0?frames=150``), a published
-            folder name (``rgbd_dataset_freiburg3_walking_xyz``) or the path of a folder in TUM layout.
+            folder name (``rgbd_dataset_freiburg3_walking_xyz``) or the path of a folder of a layout that is read.
         data_root: Folder of the sequences; default ``DYNSLAM_BENCH_DATA``, else the user's cache folder.
         camera: In place of what the catalogue or the folder says: ``tum-fr1``, ``tum-fr2``, ``tum-fr3``, ``bonn`` or a
             ``camera.toml``.
@@ -92,7 +92,7 @@ def open_public(sequence_id: str, *, data_root: Path, **how: Any) -> Sequence:
     if folder is None:
         raise SequenceError(
             f"sequence '{entry.id}' ({entry.size_text()}, {entry.url}) is not at {entry.folders(data_root)[0]}",
-            f"fetch it with: dynslam-bench sequences fetch {entry.id}",
+            entry.how_to_get(),
         )
     return open_folder(folder, entry=entry, **how)
 
@@ -117,7 +117,7 @@ def open_folder(
     camera: str | Path | Camera | None = None,
     settings: PreprocessingSettings | None = None,
 ) -> Sequence:
-    """Open a folder in TUM layout.
+    """Open a folder of one of the layouts that are read (`LAYOUTS`).
 
     Args:
         folder: The folder.
@@ -128,19 +128,26 @@ def open_folder(
     Raises:
         SequenceError: It cannot be opened, or its camera is not known.
     """
-    from .readers.tum import Description, TumSequence
+    from .readers.layouts import find_layout, layout_of
+    from .readers.recorded import Description, RecordedSequence
 
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
-    intrinsics, fps = find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
+    layout = find_layout(folder) if entry is None else layout_of(entry.layout)
+    chosen = chosen_camera(folder, camera)
+    stated = None if chosen is None else chosen[1]
+    contents = layout.read(folder, stated or (None if entry is None else entry.fps))
+    otherwise = None if entry is None else entry.camera
+    intrinsics, fps = chosen or find_camera(folder, told=contents.camera, otherwise=otherwise)
     body = MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera)
     if entry is None:
-        description = Description(f"folder/{folder.resolve().name}", intrinsics, fps, R_body_cam=body)
+        description = Description(f"folder/{folder.resolve().name}", intrinsics, fps or contents.fps, R_body_cam=body)
     else:
         about = (entry.license, entry.citation, frozenset(entry.tags), entry.split)
         description = Description(entry.id, intrinsics, fps or entry.fps, *about, body)
-    return TumSequence(
+    return RecordedSequence(
         folder,
+        contents,
         description,
         max_time_difference_s=settings.max_time_difference_s,
         any_depth_size=settings.width is not None,
@@ -150,20 +157,27 @@ def open_folder(
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
+    from .readers.layouts import is_bag
+
     path = Path(name).expanduser()
     entry = None if _is_path(name) else entry_of(name)
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
     prefix = name.partition("/")[0]
     datasets = {found.spec.id: found.spec for found in DATASETS.all()}
-    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in ("tum", "bonn"):
+    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public_datasets():
         if camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
         return cast("Sequence", load_object(datasets[prefix].entry_point)(name, data_root=data_root))
+    if is_bag(path):
+        raise SequenceError(f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER")
     if path.is_dir():
         return open_folder(path, camera=camera, settings=settings)
     if _is_path(name):
-        raise SequenceError(f"there is no sequence folder {path.absolute()}", "a path names a folder in TUM layout")
+        raise SequenceError(
+            f"there is no sequence folder {path.absolute()}",
+            "a path names a folder, see docs/sequences.md",
+        )
     known = [*sequence_ids(), *by_folder()]
     raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, known))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_se
 from .published.archives import extract
 from .published.cameras import find_camera
 from .readers.diagnostics import Dropped
+from .readers.layouts import TUM, find_layout, layout_of
 
 RECEIPT = "fetched.json"
 MANIFEST = "manifest.sha256"
@@ -72,6 +74,21 @@ class Verification:
     def ok(self) -> bool:
         """Whether no fault was found."""
         return not self.faults
+
+
+@dataclass(frozen=True)
+class Part:
+    """An archive that was downloaded.
+
+    Attributes:
+        address: Where it came from.
+        archive: The file.
+        sha256: Its checksum.
+    """
+
+    address: str
+    archive: Path
+    sha256: str
 
 
 @dataclass(frozen=True)
@@ -131,54 +148,69 @@ def fetch(
         The sequence's folder.
 
     Raises:
-        SequenceError: Unknown id, or the download or the archive is faulty; the message says what was found.
+        SequenceError: Unknown id, or one that has to be got by hand, or the download or the archive is faulty; the
+            message says what was found.
     """
     found = status(name, data_root=data_root)
     if found.folder is not None:
         return found.folder
-    entry, address = found.entry, url or found.entry.url
-    root = find_data_root(data_root)
-    archive = root / ".downloads" / _archive_name(address, entry)
+    entry = found.entry
+    if entry.by_hand:
+        raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
     expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
     how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
-    try:
-        sha256 = download(address, archive, sha256=expected, **how)
-    except DownloadError as error:
-        raise SequenceError(str(error.args[0]), error.hint) from error
-    try:
-        if checksum and entry.sha256 is None:
-            first_use.compare(root, address, sha256)
-        _extract(found, archive, sha256, address, expected is not None, progress)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise SequenceError(f"cannot extract {archive.name} into {found.place.parent}: {error.strerror}") from error
-        raise SequenceError(
-            f"no room to extract {archive.name} ({archive.stat().st_size / 1e9:.2f} GB) into {found.place.parent}",
-            "make room and run the same command again, the archive is kept",
-        ) from error
-    except SequenceError:
-        archive.unlink(missing_ok=True)  # the archive itself is at fault: the next call fetches it anew
-        raise
-    if entry.sha256 is None:
-        first_use.remember(root, address, sha256)
+    parts: list[Part] = []
+    root = find_data_root(data_root)
+    for address in (url or entry.url, *entry.more_urls):
+        archive = root / ".downloads" / _archive_name(address, entry)
+        try:
+            sha256 = download(address, archive, sha256=expected if not parts else None, **how)
+        except DownloadError as error:
+            raise SequenceError(str(error.args[0]), error.hint) from error
+        parts.append(Part(address, archive, sha256))
+    unstated = [part for part in parts if part is not parts[0] or entry.sha256 is None]
+    for part in unstated if checksum else ():
+        first_use.compare(root, part.address, part.archive, part.sha256)
+    _take(found, parts, expected is not None, progress)
+    for part in unstated:
+        first_use.remember(root, part.address, part.sha256)
     if not keep_archive:
-        archive.unlink(missing_ok=True)
+        for part in parts:
+            part.archive.unlink(missing_ok=True)
     return found.place
 
 
-def _extract(found: Status, archive: Path, sha256: str, address: str, checked: bool, progress: Report | None) -> None:
-    """Unpack an archive, note where it is from and what is in it, and let the sequence appear if it can be opened."""
+def _take(found: Status, parts: list[Part], checked: bool, progress: Report | None) -> None:
+    """Let the sequence appear; an archive that is at fault goes, so that the next call fetches it anew."""
+    first = parts[0].archive
+    try:
+        _extract(found, parts, checked, progress)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise SequenceError(f"cannot extract {first.name} into {found.place.parent}: {error.strerror}") from error
+        raise SequenceError(
+            f"no room to extract {first.name} ({first.stat().st_size / 1e9:.2f} GB) into {found.place.parent}",
+            "make room and run the same command again, the archive is kept",
+        ) from error
+    except SequenceError:
+        for part in parts:
+            part.archive.unlink(missing_ok=True)
+        raise
+
+
+def _extract(found: Status, parts: list[Part], checked: bool, progress: Report | None) -> None:
+    """Unpack archives, note where they are from and what is in them; the sequence appears if it can be opened."""
     with atomic_folder(found.place) as work:
-        sums = extract(archive, work, progress)
-        top = _top(work, found.entry, archive)
+        sums = _unpack(parts, work, progress)
+        top = _top(work, found.entry, parts[0].archive)
         prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
         inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
         receipt = Receipt(
             id=found.entry.id,
-            url=address,
-            sha256=sha256,
-            size_bytes=archive.stat().st_size,
+            url=parts[0].address,
+            sha256=parts[0].sha256,
+            size_bytes=parts[0].archive.stat().st_size,
             checked=checked,
             files=len(inside),
         )
@@ -187,6 +219,23 @@ def _extract(found: Status, archive: Path, sha256: str, address: str, checked: b
         open_folder(top, entry=found.entry)
         if top != work:
             _lift(top, work)
+
+
+def _unpack(parts: list[Part], work: Path, progress: Report | None) -> dict[str, str]:
+    """Unpack archives over one another; SHA-256 of each file by its path. What two of them hold has to be the same."""
+    sums = extract(parts[0].archive, work, progress)
+    for part in parts[1:]:
+        beside = work / ".part"
+        beside.mkdir()
+        for name, value in extract(part.archive, beside, progress).items():
+            if name in sums and sums[name] != value:
+                raise SequenceError(f"{part.archive.name} holds another {name} than the first archive, refused")
+            if name not in sums:
+                (work / name).parent.mkdir(parents=True, exist_ok=True)
+                (beside / name).rename(work / name)
+                sums[name] = value
+        shutil.rmtree(beside)
+    return sums
 
 
 def verify(
@@ -212,7 +261,8 @@ def verify(
     if folder is None or not folder.is_dir():
         open_sequence(name, data_root=data_root)  # says what is missing
         raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
-    find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
+    if (find_layout(folder) if entry is None else layout_of(entry.layout)) is TUM:
+        find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
     try:
         sequence = open_folder(folder, entry=entry, camera=camera)
     except DynslamError as error:
@@ -255,10 +305,12 @@ def _archive_name(address: str, entry: CatalogueEntry) -> str:
 def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:
     """The folder inside the extracted archive that is the sequence."""
     candidates = [work / entry.folder, work, *sorted(path for path in work.iterdir() if path.is_dir())]
+    layout = layout_of(entry.layout)
     for candidate in candidates:
-        if (candidate / "rgb.txt").is_file():
+        if layout.fits(candidate):
             return candidate
-    raise SequenceError(f"{archive.name} holds no rgb.txt", "it is not a sequence in TUM layout")
+    what = " and ".join(layout.marks)
+    raise SequenceError(f"{archive.name} holds no {what}", f"it is not a sequence in the layout {layout.name}")
 
 
 def _lift(top: Path, work: Path) -> None:

@@ -11,12 +11,13 @@ from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.reading import read_text
 
 
-def compare(root: Path, address: str, sha256: str) -> None:
-    """Refuse an archive that is not what its address gave before.
+def compare(root: Path, address: str, archive: Path, sha256: str) -> None:
+    """Refuse an archive that is not what its address gave before; it is deleted then.
 
     Args:
         root: The data root.
         address: Where the archive came from.
+        archive: The archive.
         sha256: Its checksum.
 
     Raises:
@@ -27,6 +28,7 @@ def compare(root: Path, address: str, sha256: str) -> None:
         return
     first = read_text(path, kind=SequenceError).split()[0:1]
     if first != [sha256]:
+        archive.unlink(missing_ok=True)  # the next call fetches it anew
         raise SequenceError(
             f"{without_passwords(address)} has the checksum {sha256}, but gave {first[0] if first else 'none'} before",
             f"somebody has changed it; --no-checksum takes it all the same, and {path} says what came first",

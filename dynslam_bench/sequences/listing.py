@@ -32,6 +32,10 @@ class Summary:
         ground_truth: Whether the ground truth is public.
         license: Licence of the data.
         url: Where the archive lies.
+        dataset: Name of the data set.
+        layout: How its files were known when the reader was written: ``verified``, ``not verified`` on the publisher's
+            files, or empty where there are none.
+        by_hand: Why this program cannot fetch it; empty where it can.
         checksum: Whether its checksum is known before it is fetched; None for what is rendered.
     """
 
@@ -43,6 +47,9 @@ class Summary:
     ground_truth: bool = True
     license: str = ""
     url: str = ""
+    dataset: str = ""
+    layout: str = ""
+    by_hand: str = ""
     checksum: bool | None = None
 
 
@@ -58,15 +65,17 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
             entry = entries.get(name)
             if entry is None:
                 rendered = dataset.spec.id == "synthetic"
-                tags = ("high-dynamic" if "walking" in name else "low-dynamic",) if rendered else ()
+                tags = parse_synthetic_id(name).tags if rendered else ()
                 split = parse_synthetic_id(name).split if rendered else ""
                 size = "rendered" if rendered else ""
-                found.append(Summary(name, True, size, tags, split, license=dataset.spec.license))
+                title, licence = dataset.spec.summary or dataset.spec.id, dataset.spec.license
+                found.append(Summary(name, True, size, tags, split, license=licence, dataset=title))
                 continue
+            layout = "verified" if entry.verified else "not verified"
             found.append(
                 Summary(
                     name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
-                    entry.license, entry.url, entry.sha256 is not None,
+                    entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
                 )
             )  # fmt: skip
     return found
@@ -91,11 +100,13 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
             "size_bytes": entry.size_bytes, "sha256": entry.sha256, "license": entry.license,
             "checksum": KNOWN if entry.sha256 else FIRST_USE,
             "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
-            "ground_truth": "public" if entry.ground_truth else "not public", "camera": repr(entry.intrinsics()),
+            "ground_truth": "public" if entry.ground_truth else "not public",
+            "camera": repr(entry.intrinsics() or "as its files or its layout state"),
+            "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
             "remark": entry.remark,
         }  # fmt: skip
         if entry.find(root) is None:
-            return facts | {"here": False, "fetch": f"dynslam-bench sequences fetch {entry.id}"}
+            return facts | {"here": False, "fetch": entry.how_to_get()}
     sequence = open_sequence(name, data_root=data_root, camera=camera)
     truth = sequence.ground_truth
     dropped, folder = getattr(sequence, "dropped", None), getattr(sequence, "folder", None)

@@ -60,8 +60,10 @@ class TrackingSettings(Settings):
     min_inliers: int = tunable(
         25, low=10, high=60, limits=(6, 1000), meaning="fewer inliers after the last optimisation mean lost"
     )
-    local_map: Literal["all", "covisible"] = tunable(
-        "all", meaning="search all map points in view, or only those of covisible keyframes"
+    local_map: Literal["all", "covisible"] = Field(
+        "all",
+        description="search all map points in view, or only those of covisible keyframes; not tunable: up to eighty "
+        "keyframes are taken, so that it changes nothing before the map is larger than a study's blocks make it",
     )
     close_factor: float = tunable(
         40.0,
@@ -222,12 +224,12 @@ class BundleAdjustmentSettings(Settings):
 class RelocalisationSettings(Settings):
     """Finding the pose again after tracking was lost."""
 
-    searched: int = tunable(
+    searched: int = Field(
         10,
-        low=3,
-        high=40,
-        limits=(1, 100000),
-        meaning="keyframes that are matched feature by feature: those that look most alike; bounds the time of a frame",
+        ge=1,
+        le=100000,
+        description="keyframes that are matched feature by feature: those that look most alike; bounds the time of a "
+        "frame. Not tunable: no short run was seen to come out otherwise with three or with forty",
     )
     candidates: int = tunable(
         5, low=1, high=20, limits=(1, 1000), meaning="keyframes with the most descriptor matches that PnP is tried on"

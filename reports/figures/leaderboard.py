@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -125,7 +126,7 @@ def _speed_layout(points: Sequence[tuple[float, Interval]]) -> dict[str, Any]:
 
 
 def repeat_figure(board: Board) -> Figure | None:
-    """Every run's ATE over its cell's median; None where no cell has several runs."""
+    """The ATE of every run that succeeded over their median in its cell; None where no cell has several."""
     palette = colours(board)
     traces: list[dict[str, Any]] = []
     everything = [0.9, 1.1]
@@ -134,12 +135,11 @@ def repeat_figure(board: Board) -> Figure | None:
         notes: list[str] = []
         for sequence in board.sequences:
             cell = board.cells[key].get(sequence)
-            if cell is None or len(cell.scores) < 2 or cell.median is None:
+            if cell is None or len(cell.succeeded) < 2:
                 continue
-            for row in cell.kept:
-                if row.score_m is not None:
-                    values.append(max(row.score_m, 1e-6) / max(cell.median, 1e-6))
-                    notes.append(f"{safe(sequence)}, {row.repeat}{f' ({row.ending})' if row.failed else ''}")
+            scores = [row.score_m or 0.0 for row in cell.succeeded]
+            values += [max(score, 1e-6) / max(median(scores), 1e-6) for score in scores]
+            notes += [f"{safe(sequence)}, {row.repeat}" for row in cell.succeeded]
         if values:
             everything += values
             traces.append(
@@ -181,19 +181,19 @@ def mask_figure(board: Board) -> Figure | None:
             row for row in board.runs(key) if row.mask_iou is not None and row.score_m is not None and not row.failed
         ]
         if rows:
-            everything += [max(float(row.score_m or 0.0), 1e-6) for row in rows]
+            everything += [1000 * max(float(row.score_m or 0.0), 1e-6) for row in rows]
             traces.append(
                 {
                     "type": "scatter",
                     "mode": "markers",
                     "name": wrapped(board.labels[key]),
                     "x": rounded([float(row.mask_iou or 0.0) for row in rows]),
-                    "y": rounded([max(float(row.score_m or 0.0), 1e-6) for row in rows]),
+                    "y": rounded([1000 * max(float(row.score_m or 0.0), 1e-6) for row in rows]),
                     "text": [
                         f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(row.segmentation)}" for row in rows
                     ],
                     "marker": {"size": 9, "opacity": 0.85, "color": palette[key]},
-                    "hovertemplate": "%{text}<br>IoU %{x:.3f}<br>ATE %{y:.4f} m<extra>%{fullData.name}</extra>",
+                    "hovertemplate": "%{text}<br>IoU %{x:.3f}<br>ATE %{y:.3g} mm<extra>%{fullData.name}</extra>",
                 }
             )
     if not traces:
@@ -201,7 +201,7 @@ def mask_figure(board: Board) -> Figure | None:
     layout = layout_of(
         height=max(420, 120 + 21 * len(traces)),
         xaxis=axis("overlap (IoU) of the dynamic mask with the exact one") | {"range": [-0.02, 1.02]},
-        yaxis=log_axis("ATE (m)", everything),
+        yaxis=log_axis("ATE (mm)", everything),
     )
     return {"data": traces, "layout": layout}
 

@@ -66,6 +66,11 @@ def log_axis(title: str, values: Sequence[float]) -> dict[str, Any]:
     steps = range(1, 10) if span < 0.9 else (1, 2, 5) if span < 3 else (1,)
     ticks = [m * 10.0**e for e in range(int(np.floor(low)), int(np.ceil(high)) + 1) for m in steps]
     shown = [tick for tick in ticks if low <= np.log10(tick) <= high]
+    if len(shown) < 3:  # less than an octave: round numbers at equal distances
+        width = 10**high - 10**low
+        step = 10.0 ** np.floor(np.log10(width)) / 2
+        step = next(factor * step for factor in (4, 2, 1, 0.4) if width >= 3 * factor * step)
+        shown = [float(step * k) for k in range(int(np.ceil(10**low / step)), int(10**high // step) + 1)]
     return axis(title, type="log") | {
         "range": [round(low, 4), round(high, 4)],
         "tickvals": [significant(tick) for tick in shown],

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
@@ -12,11 +15,12 @@ from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
 from ..model.common import representatives
-from ..model.rows import Loaded
-from .explore_data import FrameSums, explore_content
+from ..model.crew import JOB, Crew
+from ..model.rows import Loaded, LoadedRun
+from .explore_data import FrameSummary, FrameSums, explore_content, summarise
 from .page import render_run_page
 from .pictures import PictureBook
-from .run_data import exact_share, read_frames, run_content
+from .run_data import MOST_FRAMES, exact_share, read_frames, run_content
 from .side_files import write_side
 
 RUN_PAGE = "run.html"
@@ -41,6 +45,35 @@ class Explored:
     note: str
 
 
+@dataclass
+class Pages:
+    """What was written of some runs.
+
+    Attributes:
+        frames: Of each run what the exploring table needs of its frames.
+        pictured: Ids of the runs of which pictures are shown.
+        missing: Why some frames have none, with their number.
+    """
+
+    frames: list[FrameSummary] = field(default_factory=list)
+    pictured: set[str] = field(default_factory=set)
+    missing: Counter[str] = field(default_factory=Counter)
+
+    def answer(self) -> list[Any]:
+        """The same as a helper's answer."""
+        return [[astuple(each) for each in self.frames], sorted(self.pictured), self.missing]
+
+    @classmethod
+    def of(cls, answer: Sequence[Any]) -> Pages:
+        """What a helper has answered."""
+        frames, pictured, missing = answer
+        return cls([FrameSummary(*each) for each in frames], set(pictured), Counter(missing))
+
+    def note(self) -> str:
+        """Why some frames have no picture, in words; empty if all have them."""
+        return "; ".join(f"{count} frames: {reason}" for reason, count in self.missing.items())
+
+
 def write_explore(
     board: Board,
     loaded: Loaded,
@@ -49,7 +82,9 @@ def write_explore(
     *,
     title: str,
     picture_seconds: float = PICTURE_SECONDS,
+    most_frames: int = MOST_FRAMES,
     progress: Progress | None = None,
+    crew: Crew | None = None,
 ) -> Explored:
     """Write ``run.html``, ``data/`` and ``frames/`` of a report.
 
@@ -62,27 +97,84 @@ def write_explore(
         output: Folder of the report.
         title: Title of the report.
         picture_seconds: Time that opening sequences and drawing pictures may take.
+        most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
         progress: Told of the runs that are done, and of all.
+        crew: Helpers that write the pages; None to write them here.
 
     Raises:
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
-    book, sums = PictureBook(output, picture_seconds), FrameSums()
     shown = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
     shown |= {row.run_id for row in board.rows if row.failed}
     shares = _shares(loaded)
-    for done, run in enumerate(sorted(loaded.runs, key=lambda run: run.row.run_id not in shown)):
-        frames = read_frames(run, shares.get(run.row.column_id, {}))
-        write_side(output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth()))
-        if len(frames):
-            sums.add(run.row, frames.errors_m, frames.share, frames.share_source == "exact masks")
-        if run.row.run_id in shown:
-            book.add(run, frames)
+    runs = sorted(loaded.runs, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
+    done = 0
+
+    def told(count: int, _what: str) -> None:
+        nonlocal done
+        done += count
         if progress is not None:
-            progress(done + 1, len(loaded.runs))
-    write_side(output, "explore", explore_content(board, protocol, sums, book.runs))
+            progress(done, len(runs))
+
+    by_column = [list(group) for _, group in groupby(runs, lambda run: (run.row.run_id in shown, run.row.column_id))]
+    pieces = [group[at : at + JOB] for group in by_column for at in range(0, len(group), JOB)]
+    known = [shares.get(piece[0].row.column_id, {}) for piece in pieces]
+    if crew is None:
+        book = PictureBook(output, picture_seconds)
+        written = [
+            write_pages(piece, shown, share, protocol, book, most_frames, lambda: told(1, ""))
+            for piece, share in zip(pieces, known, strict=True)
+        ]
+    else:
+        jobs = [
+            {"runs": [run.as_job() for run in piece], "shown": [*shown], "share": share}
+            for piece, share in zip(pieces, known, strict=True)
+        ]
+        written = [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
+    sums, total = FrameSums(), Pages()
+    for piece, pages in zip(pieces, written, strict=True):
+        for run, frames in zip(piece, pages.frames, strict=True):
+            sums.add(run.row, frames)
+        total.pictured |= pages.pictured
+        total.missing += pages.missing
+    write_side(output, "explore", explore_content(board, protocol, sums, total.pictured))
     write_atomic(output / RUN_PAGE, render_run_page(title))
-    return Explored(len(loaded.runs), len(book.runs), book.note())
+    return Explored(len(runs), len(total.pictured), total.note())
+
+
+def write_pages(
+    runs: Sequence[LoadedRun],
+    shown: Collection[str],
+    share: Mapping[int, float],
+    protocol: Protocol,
+    book: PictureBook,
+    most_frames: int,
+    told: Callable[[], None],
+) -> Pages:
+    """Write the pages of some runs of one column.
+
+    Args:
+        runs: The runs.
+        shown: Ids of runs of which pictures are shown.
+        share: Exact share of dynamic pixels of the column's frames, without offset.
+        protocol: How errors are computed.
+        book: Draws the pictures.
+        most_frames: As in `write_explore`.
+        told: Called after every run.
+    """
+    pages = Pages()
+    for run in runs:
+        frames = read_frames(run, share)
+        write_side(
+            book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth(), most_frames)
+        )
+        exact = frames.share_source == "exact masks"
+        known = summarise(run.row, frames.errors_m, frames.share, exact) if len(frames) else FrameSummary([], [], [])
+        pages.frames.append(known)
+        if run.row.run_id in shown and book.add(run, frames, pages.missing):
+            pages.pictured.add(run.row.run_id)
+        told()
+    return pages
 
 
 def _shares(loaded: Loaded) -> dict[str, dict[int, float]]:

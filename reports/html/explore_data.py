@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,37 +25,59 @@ FEWEST_FRAMES = 5
 """Frames below which a bin shows nothing."""
 
 
+@dataclass(frozen=True)
+class FrameSummary:
+    """What the exploring part shows of the frames of one run.
+
+    Attributes:
+        quartiles_mm: The 5, 25, 50, 75 and 95 % quantiles of its frame-to-frame errors; empty where there are none.
+        shares: Share of dynamic pixels of frames, where exact masks tell it; only those compare trackers.
+        errors_m: Their frame-to-frame translational errors.
+    """
+
+    quartiles_mm: list[float | None]
+    shares: list[float]
+    errors_m: list[float]
+
+
+def summarise(row: RunRow, errors_m: Array, share: Array, exact: bool) -> FrameSummary:
+    """The frames of one run.
+
+    Args:
+        row: The run.
+        errors_m: Frame-to-frame translational errors ``[N]``, nan where there is none.
+        share: Share of dynamic pixels ``[N]``.
+        exact: Whether that is known from exact masks.
+    """
+    known = np.isfinite(errors_m)
+    if not known.any():
+        return FrameSummary([], [], [])
+    five = [significant(1000 * value, 4) for value in np.percentile(errors_m[known], [5, 25, 50, 75, 95]).tolist()]
+    both = known & np.isfinite(share) & (exact and not row.failed)
+    return FrameSummary(five, share[both].tolist(), errors_m[both].tolist())
+
+
 class FrameSums:
-    """What the exploring part shows of frames: quartiles of a run's errors, and errors by dynamic share."""
+    """What the exploring part shows of all frames: quartiles of the runs' errors, and errors by dynamic share."""
 
     def __init__(self) -> None:
         self.quartiles: dict[str, list[float | None]] = {}
-        self._shares: dict[str, list[Array]] = {}
-        self._errors: dict[str, list[Array]] = {}
+        self._shares: dict[str, list[float]] = {}
+        self._errors: dict[str, list[float]] = {}
 
-    def add(self, row: RunRow, errors_m: Array, share: Array, exact: bool) -> None:
-        """Take the frames of one run.
-
-        Args:
-            row: The run.
-            errors_m: Frame-to-frame translational errors ``[N]``, nan where there is none.
-            share: Share of dynamic pixels ``[N]``.
-            exact: Whether that is known from exact masks; only those are comparable between trackers.
-        """
-        known = np.isfinite(errors_m)
-        if known.any():
-            five = np.percentile(errors_m[known], [5, 25, 50, 75, 95])
-            self.quartiles[row.run_id] = [significant(1000 * float(value), 4) for value in five]
-        both = known & np.isfinite(share)
-        if exact and both.any() and not row.failed:
-            self._shares.setdefault(row.variant_key, []).append(share[both])
-            self._errors.setdefault(row.variant_key, []).append(errors_m[both])
+    def add(self, row: RunRow, frames: FrameSummary) -> None:
+        """Take the frames of one run."""
+        if frames.quartiles_mm:
+            self.quartiles[row.run_id] = frames.quartiles_mm
+        if frames.shares:
+            self._shares.setdefault(row.variant_key, []).extend(frames.shares)
+            self._errors.setdefault(row.variant_key, []).extend(frames.errors_m)
 
     def by_share(self, key: str) -> list[list[float | None]]:
         """Median error in mm and number of frames of each bin between `SHARE_EDGES`, of one tracker; empty for none."""
         if key not in self._shares:
             return []
-        share, error = np.concatenate(self._shares[key]), np.concatenate(self._errors[key])
+        share, error = np.array(self._shares[key]), np.array(self._errors[key])
         at = np.clip(np.searchsorted(SHARE_EDGES, share, side="right") - 1, 0, len(SHARE_EDGES) - 2)
         found: list[list[float | None]] = []
         for number in range(len(SHARE_EDGES) - 1):
@@ -133,9 +156,12 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     """The numbers to choose from: of the online and of the final trajectory."""
     found = [
         ("ate", "ATE", "m", "ate_rmse_m"),
-        *(("rpe", f"RPE over {spec.describe()}", "m", f"rpe_{spec.key}_trans_rmse_m") for spec in protocol.rpe),
         *(
-            ("rotation", f"RPE over {spec.describe()}, rotation", "deg", f"rpe_{spec.key}_rot_rmse_deg")
+            ("rpe", f"RPE over {spec.describe()}", "m/s" if spec.rate else "m", spec.metric("trans"))
+            for spec in protocol.rpe
+        ),
+        *(
+            ("rotation", f"RPE over {spec.describe()}, rotation", "deg/s" if spec.rate else "deg", spec.metric("rot"))
             for spec in protocol.rpe
         ),
         ("rotation", "absolute rotation", "deg", "ape_rot_rmse_deg"),

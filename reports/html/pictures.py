@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import time
+from collections import Counter
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,53 +40,52 @@ class PictureBook:
     Args:
         output: Folder of the report.
         seconds: Time that opening and drawing may take altogether.
-
-    Attributes:
-        runs: Runs that have pictures.
-        missing: Why some frames have none, with their number.
     """
 
     output: Path
     seconds: float
-    runs: set[str] = field(default_factory=set)
-    missing: dict[str, int] = field(default_factory=dict)
     _spent: float = 0.0
     _opened: dict[tuple[Any, ...], Sequence | str] = field(default_factory=dict)
 
-    def add(self, run: LoadedRun, frames: RunFrames) -> None:
-        """Draw the frames that a run shows and write what was seen on them as ``data/looks-<run id>.js``."""
+    def add(self, run: LoadedRun, frames: RunFrames, missing: Counter[str]) -> bool:
+        """Draw the frames that a run shows and write what was seen on them as ``data/looks-<run id>.js``.
+
+        Args:
+            run: The run.
+            frames: Its frames.
+            missing: Why some frames have no picture, which is counted there.
+
+        Returns:
+            Whether there is anything to see.
+        """
         if not len(frames):
-            return
+            return False
         try:
             size, shots = read_snapshots(run.store.folder(run.row.run_id))
         except DynslamError as error:
-            self._miss(str(error))
-            return
+            missing[str(error)] += 1
+            return False
         began = time.perf_counter()
         by_index = {shot.index: shot for shot in shots}
-        looks = [self._look(run, index, by_index.get(index), size) for index in _chosen(frames, sorted(by_index))]
+        chosen = _chosen(frames, sorted(by_index))
+        looks = [self._look(run, index, by_index.get(index), size, missing) for index in chosen]
         self._spent += time.perf_counter() - began
         known = [look for look in looks if look.get("image") or look.get("points")]
         if not known:
-            return
+            return False
         errors = dict(zip(frames.columns["index"].tolist(), (1000 * frames.errors_m).tolist(), strict=True))
         for look in known:
             look["error_mm"] = significant(errors.get(look["index"]))
         write_side(self.output, f"looks-{run.row.run_id}", {"looks": known, "stored": bool(shots)})
-        self.runs.add(run.row.run_id)
+        return True
 
-    def _miss(self, reason: str) -> None:
-        self.missing[reason] = self.missing.get(reason, 0) + 1
-
-    def note(self) -> str:
-        """Why some runs have no pictures; empty if all have them."""
-        return "; ".join(f"{count} frames: {reason}" for reason, count in self.missing.items())
-
-    def _look(self, run: LoadedRun, index: int, shot: Snapshot | None, size: tuple[int, int]) -> dict[str, Any]:
+    def _look(
+        self, run: LoadedRun, index: int, shot: Snapshot | None, size: tuple[int, int], missing: Counter[str]
+    ) -> dict[str, Any]:
         try:
             look: dict[str, Any] = {"index": index, "image": self._image(run, index)}
         except DynslamError as error:
-            self._miss(str(error))
+            missing[str(error)] += 1
             look = {"index": index}
         return look if shot is None else look | _seen(shot, size)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.evaluation.evaluate import pose_errors
 from dynslam_bench.evaluation.protocol import Protocol, RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -26,7 +27,7 @@ from .side_files import packed_rows
 Array = NDArray[np.float64]
 
 MOST_FRAMES = 400
-"""Frames of a run that its page shows; of longer ones every second, third, ..."""
+"""Frames of a run that its page shows unless something else is asked for."""
 _LOG_BYTES = 20_000
 _COUNTS = ("keypoints", "culled", "matches", "inliers")
 _STATS = {f"stat_{name}" for name in (*_COUNTS, "mask_fraction")}
@@ -69,12 +70,10 @@ def read_frames(run: LoadedRun, exact: Mapping[int, float]) -> RunFrames:
     if not path.is_file() or not path.stat().st_size:
         return RunFrames({}, np.zeros(0), "")
     try:
-        table = pd.read_csv(path, usecols=_is_shown)
-    except (ValueError, OSError) as error:
-        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} is damaged: {error}")
+        table = _read(path, _is_shown)
+    except RunError as error:
+        return RunFrames({}, np.zeros(0), "", str(error))
     columns = {str(name): table[name].to_numpy() for name in table}
-    if not len(table) or not _NEEDED <= set(columns):
-        return RunFrames({}, np.zeros(0), "", f"{CSV_FILE} holds no frames")
     if exact:
         share = np.array([exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()])
         return RunFrames(columns, share, "exact masks")
@@ -89,18 +88,38 @@ def _is_shown(name: str) -> bool:
     return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
 
 
+def _read(path: Path, wanted: Callable[[str], bool]) -> pd.DataFrame:
+    """Columns of a ``frames.csv``: numbers, and the state in words.
+
+    Raises:
+        RunError: It holds no frames, or something else than numbers.
+    """
+    kinds: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
+    try:
+        table = pd.read_csv(path, usecols=wanted, dtype=kinds)
+    except (ValueError, OverflowError, OSError) as error:
+        raise RunError(f"{CSV_FILE} is damaged: {error}") from error
+    needed = [name for name in _NEEDED if wanted(name)]
+    if not len(table) or not set(needed) <= set(table):
+        raise RunError(f"{CSV_FILE} holds no frames")
+    if not np.isfinite(table.get("timestamp", 0.0)).all():
+        raise RunError(f"{CSV_FILE} is damaged: not every frame has a stamp")
+    return table
+
+
 def exact_share(path: Path, offset: int) -> dict[int, float]:
     """Frame (before the offset) to its exact share of dynamic pixels, of a ``frames.csv`` that knows it; else empty."""
-    if not path.is_file():
+    try:
+        table = _read(path, {"index", "dynamic_share"}.__contains__)
+    except RunError:  # the page of that run says so
         return {}
-    with path.open() as file:
-        if "dynamic_share" not in file.readline().rstrip("\n").split(","):
-            return {}
-    table = pd.read_csv(path, usecols=["index", "dynamic_share"]).dropna()
-    return {int(index) + offset: float(share) for index, share in table.itertuples(index=False)}
+    known = table.dropna() if "dynamic_share" in table else table.iloc[:0]
+    return {index + offset: share for index, share in known.itertuples(index=False)}
 
 
-def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:
+def run_content(
+    run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None, most: int = MOST_FRAMES
+) -> dict[str, Any]:
     """Everything that the page of a run shows, as the page's script reads it.
 
     Args:
@@ -108,6 +127,7 @@ def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Tr
         frames: Its frames.
         protocol: How its errors are computed.
         truth: Ground truth of its part of the sequence.
+        most: Frames that are shown; of longer runs every second, third, ...
     """
     row, record = run.row, run.record
     return {
@@ -129,8 +149,8 @@ def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Tr
         "command": run_command(row),
         "asked": row.command,
         "log": _log(run),
-        "frames": _series(frames),
-        "track": _track(run, protocol, truth),
+        "frames": _series(frames, most),
+        "track": _track(run, protocol, truth, most),
     }
 
 
@@ -141,7 +161,10 @@ def _facts(run: LoadedRun, rpe: Sequence[RPESpec]) -> list[list[str | float | No
         ("ATE, lost frames held", None if row.score_m is None else 1000 * row.score_m, "mm"),
         ("ATE of the tracked frames", _scaled(row.metrics.get("ate_rmse_m"), 1000), "mm"),
         ("ATE of the final trajectory", _scaled(row.final_ate_m, 1000), "mm"),
-        *((f"RPE over {s.describe()}", _scaled(row.metrics.get(f"rpe_{s.key}_trans_rmse_m"), 1000), "mm") for s in rpe),
+        *(
+            (f"RPE over {s.describe()}", _scaled(row.metrics.get(s.metric("trans")), 1000), "mm/s" if s.rate else "mm")
+            for s in rpe
+        ),
         ("coverage", 100 * row.coverage, "%"),
         ("frame time", row.frame_ms, "ms"),
         ("real time", row.real_time_factor, "×"),
@@ -170,12 +193,12 @@ def _log(run: LoadedRun) -> str:
     return cut + text[-_LOG_BYTES:].decode(errors="replace")
 
 
-def _series(frames: RunFrames) -> dict[str, Any]:
+def _series(frames: RunFrames, most: int) -> dict[str, Any]:
     """The frames over time, thinned and packed."""
     columns = frames.columns
     if not columns:
         return {}
-    step = -(-len(frames) // MOST_FRAMES)
+    step = -(-len(frames) // most)
     stamps, start = columns["timestamp"], float(columns["timestamp"][0])
     stages = [name for name in columns if name.endswith("_s") and name not in ("total_s", "read_s")]
     counts = [name for name in _COUNTS if f"stat_{name}" in columns]
@@ -196,7 +219,7 @@ def _series(frames: RunFrames) -> dict[str, Any]:
     return found | {"share": share} if np.isfinite(frames.share).any() else found
 
 
-def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:
+def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None, most: int) -> dict[str, Any]:
     """The aligned track beside the true one; without ground truth the track alone; empty if nothing was tracked.
 
     Where the time between two poses exceeds twice the median interval, all series have a gap.
@@ -206,7 +229,7 @@ def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict
         if estimate is None or len(estimate) < 2:
             return {}
         if truth is None or not run.row.metrics:
-            return _packed_track(estimate, {"xyz": estimate.positions, "angles": _angles(estimate, estimate)})
+            return _packed_track(estimate, {"xyz": estimate.positions, "angles": _angles(estimate, estimate)}, most)
         aligned, true, series = pose_errors(estimate, truth, protocol)
     except DynslamError as error:
         return {"reason": str(error)}
@@ -218,15 +241,15 @@ def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict
         "angles": _angles(aligned, true),
         "true_angles": _angles(true, true),
     }
-    return _packed_track(aligned, columns) | {"alignment": protocol.alignment}
+    return _packed_track(aligned, columns, most) | {"alignment": protocol.alignment}
 
 
-def _packed_track(track: Trajectory, columns: Mapping[str, Array]) -> dict[str, Any]:
+def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) -> dict[str, Any]:
     """Series along a track ``[N]`` or ``[N, 3]``, thinned, broken at gaps and packed."""
     start = float(track.timestamps[0])
     widths = [1 if values.ndim == 1 else values.shape[1] for values in columns.values()]
     together = np.column_stack(list(columns.values()))
-    stamps, values = broken(track.timestamps - start, together, MOST_FRAMES)
+    stamps, values = broken(track.timestamps - start, together, most)
     t, *rows = packed_rows(np.vstack([stamps, values.T]))
     found: dict[str, Any] = {"start": start, "t": t}
     for name, width in zip(columns, widths, strict=True):

@@ -8,8 +8,10 @@ from ..figures import leaderboard as figures
 from ..figures.style import colours, safe
 from ..model.board import Board
 from ..model.common import common_errors, representatives
+from ..model.crew import Crew
 from ..model.missing import missing_commands, missing_note
 from ..model.published import is_excerpt, least_length_s, reported_for
+from ..model.records import records_for
 from ..model.rows import Loaded
 from ..model.statistics import FEWEST, power_note
 from ..tables import fairness as fairness_tables
@@ -87,7 +89,7 @@ def add_speed(draft: Draft, board: Board) -> None:
     draft.add(section)
 
 
-def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None) -> None:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     if not board.sequences:
         return
@@ -97,7 +99,8 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
     parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frames})
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
-    published = reported_for([name for name in board.sequences if name not in parts], protocol.alignment)
+    whole = [name for name in board.sequences if name not in parts]
+    published = reported_for(whole, protocol) + records_for(whole, protocol)
     beside = {cell.sequence for cell in published}
     unsure = sorted(
         {row.sequence for row in board.rows if board.sequence(row) in beside and not least_length_s(row.sequence)}
@@ -109,7 +112,7 @@ def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -
         )
     table_of_errors = sequence_tables.per_sequence(board, protocol, published)
     section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
-    common, frames = common_errors(board, protocol, loaded)
+    common, frames = common_errors(board, protocol, loaded, crew)
     section.blocks += draft.titled(fairness_tables.common_frames_table(board, common, frames))
     if protocol.trajectory == "online":
         section.blocks += draft.titled(sequence_tables.final_errors(board, protocol))
@@ -134,7 +137,7 @@ def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Proto
             for key, run in chosen.items()
         ]
         if tracks:
-            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} trackers")))
+            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
             section.blocks.append(
                 Block("tracks", summary=sequence, small=small, tracks=tracks, open=not section.blocks)
             )
@@ -155,7 +158,7 @@ def add_repeatability(draft: Draft, board: Board) -> None:
     section = Section("repeatability", "Repeatability", "Repeatability")
     figure = figures.repeat_figure(board)
     if figure is not None:
-        caption = "One point a run: its error over the median of the same tracker on the same sequence."
+        caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
         section.blocks.append(draft.figure("repeat", figure, caption))
     section.blocks.append(draft.table(table))
     draft.add(section)
@@ -189,7 +192,7 @@ def add_failures(draft: Draft, board: Board) -> None:
     draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
 
 
-def add_provenance(draft: Draft, board: Board, again: str) -> None:
+def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> None:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
     section = Section("provenance", "Machines, versions, commands", "Reproduce")
     section.blocks.append(draft.table(run_tables.machines(board)))
@@ -197,12 +200,16 @@ def add_provenance(draft: Draft, board: Board, again: str) -> None:
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
+    if loaded.unreadable:
+        section.blocks.append(
+            Block(kind="list", title="Left out: no valid record", entries=loaded.unreadable, folded=True)
+        )
     notes = [
         f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]
     if notes:
         shown = notes[:_MOST_NOTES]
         if len(notes) > len(shown):
-            shown.append(f"... and {len(notes) - len(shown)} more in report.json")
+            shown.append(f"... and {len(notes) - len(shown)} more on the pages of the runs")
         section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown, folded=True))
     draft.add(section)

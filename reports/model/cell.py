@@ -27,6 +27,11 @@ class Cell:
         return tuple(score for row in self.kept if (score := row.score_m) is not None)
 
     @property
+    def succeeded(self) -> tuple[RunRow, ...]:
+        """The runs that count, ended and have an error."""
+        return tuple(row for row in self.kept if not row.failed and row.score_m is not None)
+
+    @property
     def median(self) -> float | None:
         """Median error in metres; None without ground truth."""
         return median(self.scores) if self.scores else None
@@ -49,8 +54,7 @@ class Cell:
     @property
     def typical(self) -> RunRow:
         """The run that stands for the cell: the successful one with the (lower) median error, else its first."""
-        scored = [row for row in self.kept if not row.failed and row.score_m is not None]
-        ordered = sorted(scored, key=lambda row: row.score_m or 0.0)
+        ordered = sorted(self.succeeded, key=lambda row: row.score_m or 0.0)
         return ordered[(len(ordered) - 1) // 2] if ordered else self.rows[0]
 
     @property

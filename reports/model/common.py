@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import median
 
 import numpy as np
@@ -11,43 +12,62 @@ from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.association import match
 from dynslam_bench.evaluation.error_statistics import statistics
 from dynslam_bench.evaluation.frames import common_frames
+from dynslam_bench.evaluation.prepare import compared
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .board import Board
+from .crew import Crew, unheard_run
 from .rows import Loaded, LoadedRun
 
 
 def common_errors(
-    board: Board, protocol: Protocol, loaded: Loaded
+    board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None
 ) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
     """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are."""
+    runs = {name: successful(board, name, loaded) for name in board.sequences}
+    if crew is None:
+        answers = [common_of(found, protocol) for found in runs.values()]
+    else:
+        jobs = [{"runs": [run.as_job() for run in found]} for found in runs.values()]
+        answers = crew.work("common", jobs, unheard_run)
     errors: dict[tuple[str, str], float] = {}
     frames: dict[str, str] = {}
-    for sequence in board.sequences:
-        runs = successful(board, sequence, loaded)
-        pairs = [(run, run.trajectory(protocol.trajectory)) for run in runs]
-        held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
-        if len({run.row.variant_key for run, _ in held}) < 2:
+    for sequence, (found, count) in zip(runs, answers, strict=True):
+        if count is None:
             continue
-        reduced = common_frames([trajectory for _, trajectory in held])
-        total = max(run.row.n_frames for run, _ in held)
-        frames[sequence] = f"{len(reduced[0])} of {total}"
+        frames[sequence] = f"{count} of {max(loaded.by_id[run_id].row.n_frames for run_id in found)}"
         values: dict[str, list[float]] = {}
-        for (run, whole), trajectory in zip(held, reduced, strict=True):
-            if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # it is the error that is known
-                values.setdefault(run.row.variant_key, []).append(run.row.metrics["ate_rmse_m"])
-                continue
-            truth = run.ground_truth()
-            if truth is None:
-                continue
-            try:
-                error = _ate(trajectory, truth, protocol)
-            except DynslamError:
-                continue
-            values.setdefault(run.row.variant_key, []).append(error)
-        errors |= {(key, sequence): median(found) for key, found in values.items()}
+        for run_id, error in found.items():
+            if error is not None:
+                values.setdefault(loaded.by_id[run_id].row.variant_key, []).append(error)
+        errors |= {(key, sequence): median(some) for key, some in values.items()}
     return errors, frames
+
+
+def common_of(runs: Sequence[LoadedRun], protocol: Protocol) -> tuple[dict[str, float | None], int | None]:
+    """ATE of runs on one sequence on the frames that all of them tracked, by run, and how many those are.
+
+    Returns:
+        Of every run with a trajectory its error, None where it cannot be taken; nothing, and None, for the runs of a
+        single tracker.
+    """
+    pairs = [(run, run.trajectory(protocol.trajectory)) for run in runs]
+    held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
+    if len({run.row.variant_key for run, _ in held}) < 2:
+        return {}, None
+    reduced = common_frames([trajectory for _, trajectory in held])
+    errors: dict[str, float | None] = {}
+    for (run, whole), trajectory in zip(held, reduced, strict=True):
+        if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # it is the error that is known
+            errors[run.row.run_id] = run.row.metrics["ate_rmse_m"]
+            continue
+        truth = run.ground_truth()
+        try:
+            errors[run.row.run_id] = None if truth is None else _ate(trajectory, truth, protocol)
+        except DynslamError:
+            errors[run.row.run_id] = None
+    return errors, len(reduced[0])
 
 
 def _ate(estimate: Trajectory, truth: Trajectory, protocol: Protocol) -> float:
@@ -56,6 +76,7 @@ def _ate(estimate: Trajectory, truth: Trajectory, protocol: Protocol) -> float:
     Raises:
         EvaluationError: Fewer than two poses have ground truth.
     """
+    estimate, truth = compared(estimate, truth, protocol)
     association = match(estimate, truth, protocol)
     if len(association) < 2:
         raise EvaluationError("only one pose has ground truth")

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
+from dynslam_bench.evaluation.protocol import Protocol
+
 CLAIMED = "claimed by the paper"
 _FPS = 30.0
 _SITTING = {"static": 680, "xyz": 1219, "halfsphere": 1074, "rpy": 795}
@@ -43,6 +45,15 @@ class Published:
     alignment: str
     source: str
     remarks: str = ""
+
+    def scored_as(self, protocol: Protocol) -> bool:
+        """Whether it was scored as a protocol scores, as far as is known.
+
+        What is aligned by Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
+        """
+        scaled = self.alignment == "Sim(3)"
+        truth = "bonn-droid-w" if scaled and self.sequence.startswith("bonn/") else "as-is"
+        return scaled == (protocol.alignment == "sim3") and truth == protocol.truth
 
 
 @dataclass(frozen=True)
@@ -90,13 +101,13 @@ class ReportedCell:
 @cache
 def published() -> tuple[Published, ...]:
     """All published numbers."""
-    return tuple(Published(**(line | {"value": float(line["value"])})) for line in _lines("published.csv"))  # type: ignore[arg-type]
+    return tuple(Published(**(line | {"value": float(line["value"])})) for line in read_data("published.csv"))  # type: ignore[arg-type]
 
 
 @cache
 def claimed() -> tuple[Claimed, ...]:
     """Tables 1 to 3 of the paper, as printed."""
-    return tuple(_claimed(**line) for line in _lines("claimed.csv"))
+    return tuple(_claimed(**line) for line in read_data("claimed.csv"))
 
 
 def _claimed(*, table: str, value: str, **words: str) -> Claimed:
@@ -117,33 +128,36 @@ def is_excerpt(sequence: str, duration_s: float) -> bool:
     return duration_s < 0.9 * (least_length_s(sequence) or 0.0)
 
 
-def reported_for(sequences: Sequence[str], alignment: str = "se3") -> list[ReportedCell]:
+def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCell]:
     """The published ATEs of whole sequences.
 
     Args:
         sequences: Names of a report's whole sequences.
-        alignment: Alignment of the report's protocol; numbers known to be aligned otherwise are left out.
+        protocol: The report's protocol; numbers known to be aligned or scored otherwise are left out.
 
     Returns:
         One cell for every system, source and sequence, and those that the implemented paper claims, tagged so.
     """
-    if alignment not in ("se3", "sim3"):
+    alignment = protocol.alignment
+    if alignment not in ("se3", "sim3") or protocol.thins:
         return []
     wanted = set(sequences)
     from_papers = [
         ReportedCell(f"{p.system} ({p.source})", p.sequence, p.value, "; ".join(filter(None, (p.alignment, p.remarks))))
         for p in published()
-        if p.metric == "ate_rmse_m" and p.sequence in wanted and (p.alignment == "Sim(3)") == (alignment == "sim3")
+        if p.metric == "ate_rmse_m" and p.sequence in wanted and p.scored_as(protocol)
     ]
     remark = "contradicts itself and what the systems' authors published; see the audit"
     claims = [
         ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED)
         for c in claimed()
-        if c.kind == "value" and c.quantity == "ape_rmse" and c.sequence in wanted and alignment == "se3"
+        if c.kind == "value" and c.quantity == "ape_rmse" and c.sequence in wanted
+        if alignment == "se3" and protocol.truth == "as-is"
     ]
     return from_papers + claims
 
 
-def _lines(name: str) -> list[dict[str, str]]:
+def read_data(name: str) -> list[dict[str, str]]:
+    """The rows of a table of this package's data."""
     text = (files("dynslam_bench.reports.model") / "data" / name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from dynslam_bench.core.errors import DynslamError, ReportError
 from dynslam_bench.evaluation.protocol import Protocol
@@ -15,6 +16,7 @@ from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
 from dynslam_bench.segmentation.training_set import seen_in_training
 
+from .crew import JOB, Crew
 from .row import RunRow, Which
 from .row_values import (
     camera_words,
@@ -43,6 +45,10 @@ class LoadedRun:
     row: RunRow
     record: RunRecord
     store: RunStore
+
+    def as_job(self) -> dict[str, Any]:
+        """The run for a helper process, see `reports.worker`."""
+        return {"store": str(self.store.root), "row": self.row.model_dump(mode="json")}
 
     def trajectory(self, which: Which) -> Trajectory | None:
         """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
@@ -81,22 +87,32 @@ class Loaded:
         return {run.row.run_id: run for run in self.runs}
 
 
-def load_runs(sources: Sequence[RunStore], protocol: Protocol, on_progress: OnProgress = unheard) -> Loaded:
+def load_runs(
+    sources: Sequence[RunStore],
+    protocol: Protocol,
+    on_progress: OnProgress = unheard,
+    crew: Crew | None = None,
+) -> Loaded:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
+
+    Args:
+        sources: The stores.
+        protocol: How to evaluate.
+        on_progress: As in `build_report`.
+        crew: Helpers that score the runs; None to score them here.
 
     Raises:
         ReportError: There is no run at all.
     """
     loaded = Loaded()
-    found: list[LoadedRun] = []
+    kept: list[tuple[RunStore, RunRecord]] = []
     for store in sources:
         records, unreadable = store.all()
         loaded.unreadable += [f"{bad.path}: {bad.reason}" for bad in unreadable]
-        kept = [record for record in records if record.status != "stopped"]
-        for position, record in enumerate(kept):
-            on_progress(position, len(kept), f"scoring {record.tracker.id} on {record.sequence.id}")
-            found.append(LoadedRun(make_row(store, record, protocol), record, store))
+        kept += [(store, record) for record in records if record.status != "stopped"]
         loaded.stopped += sum(record.status == "stopped" for record in records)
+    rows = _rows(kept, protocol, on_progress, crew)
+    found = [LoadedRun(row, record, store) for row, (store, record) in zip(rows, kept, strict=True)]
     _join_old_imports(found)
     newest: dict[tuple[object, ...], LoadedRun] = {}
     for run in sorted(found, key=lambda run: run.row.started):
@@ -111,16 +127,42 @@ def load_runs(sources: Sequence[RunStore], protocol: Protocol, on_progress: OnPr
     return loaded
 
 
+def _rows(
+    runs: Sequence[tuple[RunStore, RunRecord]], protocol: Protocol, on_progress: OnProgress, crew: Crew | None
+) -> list[RunRow]:
+    """The rows of some runs, in their order."""
+    if crew is None:
+        rows = []
+        for position, (store, record) in enumerate(runs):
+            on_progress(position, len(runs), f"scoring {record.tracker.id} on {record.sequence.id}")
+            rows.append(make_row(store, record, protocol))
+        return rows
+    done = 0
+
+    def heard(count: int, what: str) -> None:
+        nonlocal done
+        on_progress(done, len(runs), what)
+        done += count
+
+    by_part = sorted(range(len(runs)), key=lambda at: runs[at][1].sequence.part)  # a helper reads few ground truths
+    pieces = [by_part[at : at + JOB] for at in range(0, len(runs), JOB)]
+    jobs = [{"runs": [(str(runs[at][0].root), runs[at][1].run_id) for at in piece]} for piece in pieces]
+    found = {}
+    for piece, answer in zip(pieces, crew.work("rows", jobs, heard), strict=True):
+        found |= dict(zip(piece, map(RunRow.model_validate, answer), strict=True))
+    return [found[at] for at in range(len(runs))]
+
+
 def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
     """Imports of older versions name no camera: they belong to the one column of the same frames, if there is one."""
     columns: dict[str, set[str]] = {}
     for run in runs:
-        columns.setdefault(run.record.sequence.part, set()).add(run.row.column_id)
+        if not run.row.imported:
+            columns.setdefault(run.record.sequence.part, set()).add(run.row.column_id)
     for run in runs:
         part = run.record.sequence.part
-        others = columns[part] - {part}
-        if run.row.imported and run.row.block == part and len(others) == 1:
-            run.row.block = next(iter(others))
+        if run.row.imported and run.row.block == part and len(columns.get(part, ())) == 1:
+            (run.row.block,) = columns[part]
 
 
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:

@@ -56,7 +56,7 @@ def repeatability(board: Board) -> Table | None:
     caption = (
         "How far the runs of one tracker on one sequence lie apart when only seed, start offset or sensor noise "
         "differ. Differences between trackers that are smaller than this are noise. Copies (several seeds, one result "
-        "to the last digit) are no repeats: they are counted as deterministic and take no part."
+        "to the last digit) are no repeats: they are counted as deterministic and take no part. Neither do failures."
     )
     return Table("repeatability", "Repeatability", caption, columns, rows)
 
@@ -64,8 +64,9 @@ def repeatability(board: Board) -> Table | None:
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
     """How far the runs of a tracker lie apart; empty if it has no cell with several."""
     cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
-    several = {name: cell.scores for name, cell in cells.items() if len(cell.scores) > 1}
-    copies = sum(cell.deterministic for cell in cells.values())
+    found = {name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in cells.items()}
+    several = {name: scores for name, scores in found.items() if len(scores) > 1}
+    copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())
     counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
     if not several:
         return [*counts, *[TableCell()] * 4] if copies else []

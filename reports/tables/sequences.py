@@ -54,7 +54,8 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         caption += (
             " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only, "
             "and lost frames are left out of most. Rows marked 'claimed by the paper' are the implemented paper's own, "
-            "which contradict themselves (see the audit)."
+            "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
+            "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
         )
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
     if any(row.seen_in_training for row in board.rows):
@@ -103,8 +104,8 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
     tables = []
     for spec in protocol.rpe:
         for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
-            metric = f"rpe_{spec.key}_{part}_rmse_{unit}"
-            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 else ""
+            metric = spec.metric(part)
+            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
             table = metric_table(
                 board,
                 lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]

@@ -42,7 +42,7 @@ from dynslam_bench.reports.model.published import published
 from dynslam_bench.reports.model.rows import LoadedRun, load_runs, open_stores
 from dynslam_bench.runs.frame_row import read_csv
 from dynslam_bench.runs.storage.scoring import DEFAULT_PROTOCOL
-from dynslam_bench.sequences.synthetic.settings import parse_synthetic_id
+from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
 
 FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"

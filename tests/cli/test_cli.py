@@ -11,7 +11,11 @@ import pytest
 from cli_errors import one_line
 
 from dynslam_bench.cli.app import expand_lists
+from dynslam_bench.geometry.kitti_file import write_kitti
+from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.catalogue import catalogue
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared"
@@ -79,12 +83,36 @@ def test_nothing_is_written_for_a_run_that_cannot_begin(cli, tmp_path):
 def test_sequences_list(cli):
     code, out, _ = cli("sequences", "list", "tum/fr3/walking*", "--tag", "high-dynamic")
     lines = out.splitlines()
-    assert code == 0 and lines[0].split()[:3] == ["sequence", "here", "size"]
-    assert [line.split()[0] for line in lines[1:5]] == [
+    assert code == 0
+    assert lines[0] == "TUM RGB-D benchmark (licence CC-BY-4.0; layout: verified on the publisher's files)"
+    assert lines[1].split()[:3] == ["sequence", "here", "size"]
+    assert [line.split()[0] for line in lines[2:6]] == [
         f"tum/fr3/walking_{motion}" for motion in ("static", "xyz", "halfsphere", "rpy")
     ]
     _, out, _ = cli("sequences", "list", "--here", "--json")
-    assert [each["id"].split("/")[0] for each in json.loads(out)] == ["synthetic"] * 8
+    assert [each["id"] for each in json.loads(out)] == list(SYNTHETIC_IDS)
+
+
+def test_sequences_are_listed_by_data_set(cli):
+    code, out, _ = cli("sequences", "list")
+    heads = [line for line in out.splitlines() if " (licence " in line]
+    titles = {entry.title for entry in catalogue().values()}
+    assert code == 0 and len(titles) == 8 and len(heads) == 9
+    assert titles < {head.partition(" (licence ")[0] for head in heads}
+    assert sum("layout: not verified on the publisher's files" in head for head in heads) == 6
+    assert sum("by hand: " in head for head in heads) == 3
+    _, out, _ = cli("sequences", "list", "openloris/*", "--json")
+    found = json.loads(out)
+    assert len(found) == 22 and {each["layout"] for each in found} == {"not verified"} and found[0]["by_hand"]
+
+
+def test_a_list_without_a_match_is_one_line_and_no_header(cli):
+    for options, words in (
+        (["bonn/*", "--here"], "no sequence matches 'bonn/*' on this machine; all "),
+        (["bonn/*", "--tag", "low-dynamic", "--here"], "'bonn/*' with the tag low-dynamic on this machine"),
+    ):
+        code, out, _ = cli("sequences", "list", *options)
+        assert code == 0 and words in out and len(out.splitlines()) == 1 and "size" not in out
 
 
 def test_sequences_info(cli, walk):
@@ -197,6 +225,18 @@ def test_import(cli, walk):
     code, out, _ = cli("import", walk / "groundtruth.txt", "--tracker", "theirs", "--sequence", walk, "--json")
     (row,) = json.loads(out)
     assert code == 0 and row["tracker"] == "theirs" and row["ate_rmse_m"] < 1e-6
+
+
+def test_kitti_trajectories_with_their_stamps(cli, walk, tmp_path):
+    truth = walk / "groundtruth.txt"
+    write_kitti(tmp_path / "kitti.txt", read_tum(truth))
+    code, out, _ = cli("eval", tmp_path / "kitti.txt", truth, "--timestamps", truth, "--json")
+    assert code == 0 and json.loads(out)["metrics"]["ate_rmse_m"] < 1e-6
+    options = ("--tracker", "theirs", "--sequence", walk, "--timestamps", truth, "--json")
+    code, out, _ = cli("import", tmp_path / "kitti.txt", *options)
+    assert code == 0 and json.loads(out)[0]["ate_rmse_m"] < 1e-6
+    code, _, err = cli("eval", tmp_path / "kitti.txt", truth)
+    assert code == 1 and "--timestamps FILE" in one_line(err)
 
 
 def test_envs(cli):

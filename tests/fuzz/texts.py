@@ -15,11 +15,14 @@ from dynslam_bench.core import address, harmless, reading, toml
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import kitti_file, tum_file
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.masks import recorded
 from dynslam_bench.segmentation.training import labelled_files as labels
 from dynslam_bench.sequences import catalogue, fetch
 from dynslam_bench.sequences.published import cameras
 from dynslam_bench.sequences.readers import lists, tum
+from dynslam_bench.sequences.readers import recorded as recorded_sequence
+from dynslam_bench.sequences.readers.recorded import Description
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.sequences.synthetic import settings as synthetic
 from dynslam_bench.slam.settings import TrackingSettings
@@ -55,6 +58,7 @@ COCO = {
         {"image_id": 1, "category_id": 1, "iscrowd": 1, "segmentation": []},
     ],
 }
+_DEPTH = cv2.imencode(".png", np.full((8, 8), 5000, np.uint16))[1].tobytes()
 _PNG = cv2.imencode(".png", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
 
 
@@ -81,12 +85,14 @@ def _read_kitti(data: bytes | None, folder: Path) -> None:
 def _read_folder(data: bytes | None, folder: Path) -> None:
     """A list names files: none of them may lie outside, whatever it says."""
     at(folder, "rgb.txt", data)
-    at(folder, "depth.txt", data)
-    for name in ("rgb/1.png", "rgb/2.png", "rgb/3.png"):
-        at(folder, name, _PNG)
-    colour, depth, _ = tum._list_images(folder, 30.0)
-    assert all((folder / file).resolve().is_relative_to(folder.resolve()) for file in (*colour.files, *depth.files))
-    tum._existing(folder, colour, "colour")
+    at(folder, "depth.txt", None if data is None else data.replace(b"rgb/", b"depth/"))
+    for name in ("1.png", "3.png", "4.png"):
+        at(folder, f"rgb/{name}", _PNG)
+        at(folder, f"depth/{name}", _DEPTH)
+    about = Description("fuzz", Camera(8, 8, 8.0, 8.0, 4.0, 4.0))
+    sequence = recorded_sequence.RecordedSequence(folder, tum.read(folder, 30.0), about)
+    files = (*sequence._colour, *sequence._depth)
+    assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
 
 
 def _read_manifest(data: bytes | None, folder: Path) -> None:
@@ -195,7 +201,7 @@ TARGETS = [
         "folder in TUM layout",
         _read_folder,
         lambda: [LIST, LIST.replace(b"rgb/2", b"../2")],
-        (tum._list_images, harmless.inside, harmless.is_inside),
+        (tum, recorded_sequence._existing, harmless.inside, harmless.is_inside),
     ),
     Target(
         "manifest of a fetch",

@@ -1,12 +1,16 @@
 """The audit of the paper's tables finds what is known of them, and passes tables that are right."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from dynslam_bench.evaluation.protocol import PROTOCOLS, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports import audit as audit_module
 from dynslam_bench.reports.audit import CHECKS, OURS, audit_paper
 from dynslam_bench.reports.model.published import Claimed, claimed, published, reported_for
+from dynslam_bench.reports.model.records import HOW, KINDS, records, records_for
 
 
 @pytest.fixture(scope="module")
@@ -175,12 +179,68 @@ def test_published_sequences_are_catalogued():
 
 def test_reported_rows_do_not_mix_alignments():
     sequences = ["tum/fr3/walking_xyz", "synthetic/walking_xyz"]
-    se3, sim3 = reported_for(sequences), reported_for(sequences, "sim3")
+    tum, droid_w = get_protocol("tum-rgbd/v1"), get_protocol("droid-w/v1")
+    se3, sim3 = reported_for(sequences, tum), reported_for(sequences, droid_w)
     assert se3
     assert sim3
     assert not {c.system for c in se3} & {c.system for c in sim3}
     claims = {c.system: c.value for c in se3 if c.tag == "claimed by the paper"}
     assert len(claims) == 7
     assert claims[OURS] == 0.2724
-    assert reported_for(sequences, "none") == []
-    assert reported_for(["tum/fr3/walking_xyz [0:100]"]) == []  # a part of a sequence is not what was published
+    assert reported_for(sequences, get_protocol("evo-default")) == []
+    assert reported_for(sequences, get_protocol("tum-dynamics-90/v1")) == []
+    assert reported_for(["tum/fr3/walking_xyz [0:100]"], tum) == []  # a part of a sequence is not what was published
+    bonn = reported_for(["bonn/crowd"], get_protocol("droid-w/v1-bonn"))
+    assert bonn and all("DROID-W" in cell.system for cell in bonn)
+    assert reported_for(["bonn/crowd"], droid_w) == []  # its truth is not Bonn's as those papers correct it
+    assert reported_for(["bonn/crowd"], get_protocol("bonn-camera/v1")) == []
+
+
+def test_records_say_whose_they_are_and_how_they_were_read():
+    catalogue = pytest.importorskip("dynslam_bench.sequences.catalogue")
+    assert len({(each.sequence, each.kind) for each in records()}) == len(records()) == 44
+    for each in records():
+        assert catalogue.entry_of(each.sequence).verified and 0.001 < each.value < 1.0
+        assert each.kind in KINDS and each.how in HOW and each.source and each.hardware and each.system
+        assert each.input in ("RGB", "RGB-D", "not stated") and each.alignment
+        assert each.protocol == "" or each.protocol in PROTOCOLS
+        assert each.protocol != "droid-w/v1-bonn" or each.sequence.startswith("bonn/")
+
+
+def test_records_agree_with_the_published_table_where_both_have_the_number():
+    table = {(p.system, p.sequence, p.value) for p in published() if p.metric == "ate_rmse_m"}
+    known = [each for each in records() if each.source in ("DROID-W, CVPR 2026", "YOLO-SLAM paper")]
+    names = {"DDN-SLAM": "DDN-SLAM RGB-D", "YOLO-SLAM, ACEFusion": "YOLO-SLAM"}
+    assert len(known) == 6
+    assert {(names.get(each.system, each.system), each.sequence, each.value) for each in known} <= table
+
+
+def test_records_stand_beside_their_own_protocol_only():
+    names = ["bonn/crowd", "tum/fr3/walking_xyz", "tum/fr3/walking_static"]
+    tum = {(cell.system, cell.sequence): cell for cell in records_for(names, get_protocol("tum-rgbd/v1"))}
+    assert set(tum) == {(KINDS["cpu"], name) for name in names}
+    cell = tum[KINDS["cpu"], "bonn/crowd"]
+    assert (cell.value, cell.tag) == (0.024, "record")
+    assert "NGD-SLAM; RGB-D; SE(3) or not stated; Ryzen 7 4800H, no GPU" in cell.source and "second-hand" in cell.source
+    assert [cell.value for cell in records_for(names, get_protocol("droid-w/v1"))] == [0.012]
+    assert [cell.value for cell in records_for(names, get_protocol("droid-w/v1-bonn"))] == [0.013]
+    assert records_for(names, get_protocol("bonn-camera/v1")) == []
+    assert records_for(["bonn/crowd [0:200]"], get_protocol("tum-rgbd/v1")) == []
+
+
+def test_the_page_of_records_is_the_data():
+    page = (Path(__file__).resolve().parents[2] / "docs" / "published.md").read_text(encoding="utf-8")
+    shown = [line for line in page.splitlines() if line.startswith("| `")]
+    assert len(shown) == len(records())
+    for each, line in zip(records(), shown, strict=True):
+        protocol = f"`{each.protocol}`" if each.protocol else "-"
+        cells = (
+            f"`{each.sequence}`",
+            f"{each.value:g}",
+            each.system,
+            each.input,
+            each.alignment,
+            protocol,
+            each.hardware,
+        )
+        assert line == "| " + " | ".join((*cells, each.source, each.how)) + " |"

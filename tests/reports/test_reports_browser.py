@@ -100,6 +100,20 @@ def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report
         assert len(figures) >= 4 and max(figures) <= width
 
 
+def test_no_word_of_a_figure_stands_outside_of_it(browser, report):
+    """Names of sequences below a narrow figure neither run out of it nor over its legend."""
+    for width in WIDTHS:
+        open_page(browser, report, "report", width)
+        outside = browser.run("""all('.chart svg').flatMap((drawing) => {
+          const box = drawing.getBoundingClientRect();
+          return [...drawing.querySelectorAll('text')].filter((text) => {
+            const own = text.getBoundingClientRect();
+            return own.left < box.left - 4 || own.right > box.right + 4 || own.bottom > box.bottom + 4;
+          }).map((text) => text.textContent);
+        })""")
+        assert outside == [], (width, outside)
+
+
 def test_the_leaderboard_fits_and_keeps_the_tracker_in_sight(browser, report):
     browser.open(report.html, 1400)
     assert browser.run("(({scrollWidth, clientWidth}) => scrollWidth - clientWidth)(leaderboard.parentElement)") <= 0

@@ -1,5 +1,7 @@
 """Finding sequences: ids, aliases, data roots, cameras, plug-ins, and errors that help."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from sequence_folders import make_folder
@@ -9,6 +11,7 @@ from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences import DATASETS, open_sequence, sequence_ids
 from dynslam_bench.sequences.catalogue import catalogue, entry_of
+from dynslam_bench.sequences.fetch import fetch
 from dynslam_bench.sequences.published.cameras import CAMERAS, read_camera, write_camera
 
 
@@ -27,20 +30,44 @@ def test_the_catalogue_is_complete_and_sound():
     tum = [entry for entry in entries.values() if entry.dataset == "tum"]
     assert len([entry for entry in tum if entry.ground_truth]) == 47
     assert len([entry for entry in tum if not entry.ground_truth]) == 33
-    assert len(entries) - len(tum) == 26
+    counts = Counter(entry.dataset for entry in entries.values())
+    assert counts == {
+        "tum": 80, "bonn": 26, "wild-slam": 10, "eth3d": 55, "icl": 4, "7scenes": 18, "shibuya": 7, "openloris": 22,
+    }  # fmt: skip
     for people in ("walking", "sitting"):
         for motion in ("xyz", "static", "halfsphere", "rpy"):
             assert f"tum/fr3/{people}_{motion}" in entries
     for name in ("fr2/pioneer_slam", "fr1/teddy", "fr3/teddy", "fr3/cabinet", "fr1/rpy", "fr1/360_validation"):
         assert f"tum/{name}" in entries
     assert not entries["tum/fr1/360_validation"].ground_truth
-    assert len({entry.url for entry in entries.values()}) == len(entries)
-    assert len({entry.folder for entry in entries.values()}) == len(entries)
+    fetched = [entry for entry in entries.values() if not entry.by_hand]
+    assert len({entry.url for entry in fetched}) == len(fetched)
+    assert len({(entry.dataset, entry.folder) for entry in entries.values()}) == len(entries)
     for key, entry in entries.items():
-        assert key == entry.id and entry.camera in CAMERAS and entry.tags and entry.license and entry.citation
-        assert entry.url.startswith("https://") and entry.url.split("/")[-1].split(".")[0] == entry.folder
+        assert key == entry.id and entry.tags and entry.license and entry.citation and entry.title
+        assert entry.camera in CAMERAS or (entry.camera == "" and entry.layout != "tum")
         assert (entry.split == "") == (not entry.ground_truth)
-        assert entry.camera == ("bonn" if entry.dataset == "bonn" else f"tum-{key.split('/')[1]}")
+        assert entry.verified == (entry.dataset in ("tum", "bonn"))
+        assert entry.verified or entry.remark.startswith("layout: not verified on the publisher's files")
+    assert all(url.startswith("https://") for entry in fetched for url in (entry.url, *entry.more_urls))
+    for entry in (entry for entry in fetched if entry.dataset in ("tum", "bonn")):
+        assert entry.url.split("/")[-1].split(".")[0] == entry.folder
+        assert entry.camera == ("bonn" if entry.dataset == "bonn" else f"tum-{entry.id.split('/')[1]}")
+
+
+def test_common_folder_names_name_no_sequence(tmp_path):
+    """A folder of one's own called crowd is not Wild-SLAM's."""
+    folder, *_ = make_folder(tmp_path / "crowd")
+    assert open_sequence(folder).id == "folder/crowd" and entry_of("crowd") is None
+    assert entry_of("living_room_traj0_frei_png").id == "icl/living_room_0"
+
+
+def test_what_has_to_be_got_by_hand_says_so(tmp_path):
+    with pytest.raises(SequenceError, match=r"is not at .*openloris/market1-1 \(get it by hand from https://lifelong"):
+        open_sequence("openloris/market1-1", data_root=tmp_path)
+    with pytest.raises(SequenceError, match=r"cannot be fetched by this program: one archive of all sequences"):
+        fetch("shibuya/standing01", data_root=tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ids_of_all_data_sets_are_listed():

@@ -6,10 +6,14 @@ import tarfile
 import zipfile
 
 import pytest
-from fetch_server import FOLDER, left_behind, tgz
+from fetch_server import FOLDER, Server, left_behind, tgz
+from published_folders import random_poses, write_eth3d
 
 from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.sequences import fetch as fetching
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.catalogue import entry_of
+from dynslam_bench.sequences.fetch import fetch, verify
 from dynslam_bench.sequences.published.archives import extract
 
 
@@ -39,6 +43,47 @@ def test_hostile_tar_files(get, server, folder, tmp_path, info, words):
     with pytest.raises(SequenceError, match=words):
         get()
     assert left_behind(tmp_path) == []
+
+
+@pytest.fixture
+def two_archives(tmp_path, monkeypatch):
+    """A sequence whose colour and depth lie in archives of their own, served as ETH3D publishes them."""
+    made = tmp_path / "cables_1"
+    write_eth3d(made, random_poses(0))
+    files = [path for path in made.rglob("*") if path.is_file()]
+    depth = [path for path in files if "depth" in path.parts or path.name == "associated.txt"]
+    servers = []
+    for part in ([path for path in files if path not in depth], depth):
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:
+            for path in part:
+                archive.write(path, f"cables_1/{path.relative_to(made).as_posix()}")
+            archive.writestr("cables_1/README", "the same in both")
+        servers.append(Server(buffer.getvalue()))
+    urls = [server.url.replace(".tgz", f"_{i}.zip") for i, server in enumerate(servers)]
+    entry = entry_of("eth3d/cables_1").model_copy(update={"more_urls": (urls[1],)})
+    monkeypatch.setattr(fetching, "entry_of", lambda name: entry)
+    yield servers, lambda: fetch("eth3d/cables_1", data_root=tmp_path / "root", url=urls[0], wait_s=0.0, timeout_s=5.0)
+    for server in servers:
+        server.close()
+
+
+def test_a_sequence_of_two_archives(two_archives, tmp_path):
+    place = two_archives[1]()
+    assert place == tmp_path / "root" / "eth3d" / "cables_1" and not (place / ".part").exists()
+    assert len(open_sequence("eth3d/cables_1", data_root=tmp_path / "root")) == 3
+    assert verify("eth3d/cables_1", data_root=tmp_path / "root").ok
+
+
+def test_two_archives_that_contradict_each_other_are_refused(two_archives, tmp_path):
+    servers, get = two_archives
+    buffer = io.BytesIO(servers[1].data)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.writestr("cables_1/rgb.txt", "1.0 rgb/0.png")
+    servers[1].data = buffer.getvalue()
+    with pytest.raises(SequenceError, match=r"holds another cables_1/rgb\.txt than the first archive, refused"):
+        get()
+    assert left_behind(tmp_path / "root") == []
 
 
 @pytest.mark.parametrize("kind", ["traversal", "link", "good"])

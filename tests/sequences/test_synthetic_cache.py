@@ -13,13 +13,13 @@ import pytest
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
+from dynslam_bench.sequences.synthetic import open_synthetic, parse_synthetic_id, render_synthetic
 from dynslam_bench.sequences.synthetic.frame_cache import encode_png, is_intact_png
 from dynslam_bench.sequences.synthetic.people.bodies import draw_person
 from dynslam_bench.sequences.synthetic.people.script import write_script
 from dynslam_bench.sequences.synthetic.scenes.plan import plan_room
 from dynslam_bench.sequences.synthetic.scenes.scene import Scene
-from dynslam_bench.sequences.synthetic.settings import RenderSettings, SyntheticId
+from dynslam_bench.sequences.synthetic.settings import RenderSettings
 
 HASHER = """
 import hashlib, sys
@@ -193,7 +193,9 @@ def test_tuning_and_held_out_instances_share_nothing() -> None:
 
 def test_textures_differ_between_instances() -> None:
     def hashes(instance: int) -> dict[str, str]:
-        atlas = Scene(SyntheticId("walking", "xyz", instance), RenderSettings()).atlas()
+        atlas = Scene(
+            parse_synthetic_id(f"synthetic/walking_xyz@{instance}").world(), instance, RenderSettings()
+        ).atlas()
         ends = [*atlas.level_offset[1:, 0], len(atlas.texels)]
         return {
             name: hashlib.sha256(atlas.texels[atlas.level_offset[i, 0] : ends[i]].tobytes()).hexdigest()

@@ -5,7 +5,7 @@ import pytest
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
-from dynslam_bench.sequences.synthetic import CAMERA, SYNTHETIC_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import CAMERA, TWIN_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
 
 CLEAN = RenderSettings(
@@ -134,7 +134,7 @@ def test_measured_depth_has_the_sensors_faults(walking) -> None:
     assert np.abs(disparity * 8 - np.rint(disparity * 8)).max() < 0.02
 
 
-@pytest.mark.parametrize("name", SYNTHETIC_IDS)
+@pytest.mark.parametrize("name", TWIN_IDS)
 def test_every_twin_is_a_sequence_with_plausible_motion(name: str) -> None:
     sequence = open_synthetic(name, None)
     assert isinstance(sequence, Sequence)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,23 +44,14 @@ MANY = {
     "backend.keyframes.view_share": 0.98,
 }
 """A keyframe nearly every frame."""
-FEW_KEYFRAMES = {
-    "backend.keyframes.tracked_share": 0.4,
-    "backend.keyframes.moved_share": 0.8,
-    "backend.keyframes.view_share": 0.5,
-}
 JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
 """F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES: dict[str, tuple[str, dict[str, object]]] = {
-    "backend.tracking.local_map": ("orb-slam2", MANY),
-    "backend.keyframes.max_gap": ("orb-slam2", FEW_KEYFRAMES),
     "backend.keyframes.redundant_share": ("orb-slam2", MANY),
     "backend.mapping.neighbours": ("orb-slam2", MANY),
     "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
     "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
-    **{f"backend.relocalisation.{name}": ("orb-slam2", MANY)
-       for name in ("searched", "candidates", "iterations", "max_distance")},
     "multiview.order": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
@@ -70,16 +62,16 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     **{f"epipolar.{name}": ("emfoa-oft-paper-sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
 }  # fmt: skip
 """Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
-UNSEEN = frozenset({
-    "backend.tracking.local_map", "backend.keyframes.max_gap", "epipolar.confidence", "free_space.max_age_s",
-    "correlation.largest", "moving_vote.corners", "class_rule.vote_share", "box_depth.max_cover",
-    "motion.threshold_share", "motion.memory", "multiview.max_parallax_deg",
-    "depth_ransac.max_draws", "guard.min_fraction", "backend.bundle_adjustment.window",
-    *(f"backend.relocalisation.{name}" for name in ("searched", "candidates", "iterations", "max_distance")),
+SHOWN_ALONE = frozenset({
+    "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
+    "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
+    "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
+    "backend.keyframes.max_gap", "backend.bundle_adjustment.window",
+    *(f"backend.relocalisation.{name}" for name in ("candidates", "iterations", "max_distance")),
 })  # fmt: skip
-"""Settings that have not been seen to change anything on these frames: nothing is proved of them here.
+"""Settings that change nothing on these few frames: most ask for long maps, for long ages, or for being lost.
 
-Most ask for long maps, for long ages, or for being lost for long.
+`test_culling_settings_act` and `test_slam_settings_act` show each of them on a scene made for it.
 """
 
 
@@ -146,11 +138,16 @@ def test_normalisation_changes_the_images_that_trackers_see(scene: Scene) -> Non
         assert len(seen) == len(values_of(parameter)), name
 
 
-def test_what_is_not_seen_here_is_offered() -> None:
-    assert UNSEEN <= set(OFFERED)
+def test_what_is_not_seen_here_is_offered_and_shown_elsewhere() -> None:
+    assert SHOWN_ALONE <= set(OFFERED)
+    folder = Path(__file__).parents[1]
+    shown = (folder / "culling/test_culling_settings_act.py", folder / "slam/test_slam_settings_act.py")
+    text = "".join(path.read_text() for path in shown)
+    for name in SHOWN_ALONE:
+        assert name.removeprefix("backend.").rpartition(".")[2] in text, name
 
 
-@pytest.mark.parametrize("name", [name for name in OFFERED if name not in UNSEEN and "preprocessing" not in name])
+@pytest.mark.parametrize("name", [name for name in OFFERED if name not in SHOWN_ALONE and "preprocessing" not in name])
 def test_every_setting_that_a_study_may_draw_changes_something(name: str, scene: Scene) -> None:
     system, parameter = OFFERED[name]
     system, others = CASES.get(name, (system, {}))

@@ -15,6 +15,7 @@ from simulated import SimulatedTuner, make_spec
 from dynslam_bench.cli.options import read_settings
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import Block, Outcome, finish, read_preset_text, write_page
+from dynslam_bench.tuning.evaluate import BlockFailedError
 from dynslam_bench.tuning.objectives import OBJECTIVES, find_objective, own_objective, together
 
 PLAIN = [Block(f"synthetic/walking_xyz@{scene}") for scene in range(4)]
@@ -115,3 +116,29 @@ def test_a_front_gives_three_presets_in_either_order(objectives: list[str], tmp_
     assert "x real time" not in page and "real-time factor" not in page
     with pytest.raises(StudyError, match=r"no preset 'fats'.*'fast'"):
         read_preset_text(study, tmp_path, "fats")
+
+
+class DriftingTuner(SimulatedTuner):
+    """A machine that slows down with every run, and settings that change nothing; a gain of 13 breaks."""
+
+    def evaluate(
+        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
+    ) -> dict[Block, Outcome]:
+        if settings.get("gain") == 13.0:
+            raise BlockFailedError(f"{blocks[0]}: crashed")
+        return {
+            block: replace(found, ate_m=0.02, processor_s=0.03 * 1.02 ** (self.runs / 2))
+            for block in blocks
+            for found in super(DriftingTuner, self).evaluate(settings, [block]).values()
+        }
+
+
+def test_what_is_compared_runs_block_by_block_so_that_a_slowing_machine_decides_nothing(tmp_path: Path) -> None:
+    tuner = DriftingTuner(make_spec(objectives=["speed"]), tmp_path)
+    blocks = tuner.design.held_out
+    default, same, broken = tuner.evaluate_beside([{}, {"gain": 1.1}, {"gain": 13.0}], blocks)
+    assert isinstance(broken, BlockFailedError) and not isinstance(default, BlockFailedError)
+    assert list(default) == list(blocks) == list(same)
+    assert OBJECTIVES["speed"].value(same, default) == pytest.approx(math.log(1.01), abs=0.002), "one run apart"
+    apart = [tuner.evaluate(settings, blocks) for settings in ({}, {"gain": 1.1})]
+    assert OBJECTIVES["speed"].value(apart[1], apart[0]) > 0.2, "all of one after all of the other"

@@ -44,6 +44,7 @@ def evaluate_run(
     which: Which
     for which in ("online", "final"):
         try:
+            protocol.check_sequence(record.sequence.id)
             truth = read_truth()
             if truth is None:
                 raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")

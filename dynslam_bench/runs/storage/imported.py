@@ -18,7 +18,8 @@ from dynslam_bench.envs.source import Frames, open_frames
 from dynslam_bench.evaluation.frames import STAMP_TOLERANCE
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import load_tum, write_tum
+from dynslam_bench.geometry.trajectory_file import load_trajectory
+from dynslam_bench.geometry.tum_file import write_tum
 from dynslam_bench.sequences.catalogue import parse_frames
 from dynslam_bench.sequences.part import part_of
 
@@ -43,11 +44,12 @@ def import_trajectory(
     stride: int = 1,
     data_root: str | Path | None = None,
     camera: str | Path | None = None,
+    timestamps: str | Path | None = None,
 ) -> RunRecord:
     """Store an external trajectory as a record of kind ``imported``.
 
     Args:
-        path: Trajectory file in TUM format.
+        path: Trajectory file in TUM format, or in KITTI's where `timestamps` are given.
         tracker: Name of the system that made it.
         sequence: The sequence that it was made on; its ground truth is needed to score it.
         results: The results folder, or a store.
@@ -58,6 +60,7 @@ def import_trajectory(
         stride: Every so many frames.
         data_root: Folder of the recorded sequences.
         camera: Camera of a folder that does not say its own.
+        timestamps: A file whose lines begin with the stamps of the poses in KITTI's format, in seconds.
 
     Returns:
         The record. Poses whose stamps are no input frame's are kept, and said so in its notes.
@@ -70,7 +73,7 @@ def import_trajectory(
     if not tracker.strip():
         raise RunError("an imported trajectory needs the name of its tracker")
     file = Path(path).expanduser()
-    loaded = load_tum(file)
+    loaded = load_trajectory(file, timestamps)
     opened = open_frames(sequence, data_root, camera, frames, stride)
     covered, odd = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
     notes = loaded.notes.describe()
@@ -78,14 +81,10 @@ def import_trajectory(
         notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
     asked = {
         "tracker": TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        "frames": _pair(frames),
-        "stride": stride,
-        "stamps_match": not odd,
-        "provenance": provenance or str(file),
-        "notes": notes,
-        "place": place_of(sequence),
+        **{"frames": _pair(frames), "stride": stride, "place": place_of(sequence)},
+        **{"stamps_match": not odd, "provenance": provenance or str(file), "notes": notes},
     }
-    record = _record(_identity(file, tracker, which, opened), opened, covered, asked)
+    record = _record(_identity(file, tracker, which, opened, timestamps), opened, covered, asked)
     store = results if isinstance(results, RunStore) else RunStore(results)
     _keep(store, record, opened, loaded.trajectory, which)
     return record
@@ -136,7 +135,9 @@ def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name
     return (len(near) if odd else len(exact)), odd
 
 
-def _identity(file: Path, tracker: str, which: str, sequence: Sequence) -> dict[str, Any]:
+def _identity(
+    file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None
+) -> dict[str, Any]:
     seen = part_of(sequence)
     return {
         "kind": "imported",
@@ -148,6 +149,7 @@ def _identity(file: Path, tracker: str, which: str, sequence: Sequence) -> dict[
         "frames": [seen.start, seen.stop],
         "offset": 0,
         "stride": seen.stride,
+        **({} if timestamps is None else {"timestamps": sha256(Path(timestamps).read_bytes()).hexdigest()}),
     }
 
 

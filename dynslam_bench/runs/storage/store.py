@@ -308,11 +308,10 @@ class RunStore:
             RunError: They are not stored, or damaged.
         """
         path = self._part(part) / "timestamps.txt"
-        lines = read_lines(path, kind=RunError)
         try:
-            return np.array([float(line) for line in lines if line.strip()], dtype=np.float64)
-        except ValueError as error:
-            raise RunError(f"cannot read {path}: {error}", "the results folder is incomplete") from error
+            return _read_stamps(path, path.stat().st_mtime_ns)
+        except OSError as error:
+            raise RunError(f"cannot read {path}: {error.strerror}", "the results folder is incomplete") from error
 
     def _metric_file(self, run_id: str, protocol_digest: str) -> Path:
         return self.root / "metrics" / protocol_digest / f"{_checked(run_id, A_RUN)}.json"
@@ -347,3 +346,14 @@ def _read_truth(path: Path, _changed_ns: int) -> Trajectory:
     truth = read_tum(path)
     truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
     return truth
+
+
+@lru_cache(maxsize=64)
+def _read_stamps(path: Path, _changed_ns: int) -> NDArray[np.float64]:
+    """The stamps of a part, likewise shared."""
+    try:
+        stamps = np.array([float(line) for line in read_lines(path, kind=RunError) if line.strip()], dtype=np.float64)
+    except ValueError as error:
+        raise RunError(f"cannot read {path}: {error}", "the results folder is incomplete") from error
+    stamps.flags.writeable = False
+    return stamps

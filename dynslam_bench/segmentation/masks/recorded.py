@@ -67,7 +67,7 @@ class RecordedSegmenter:
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = np.asarray(numbers, np.float64)[order]
         self._files = [files[i] for i in order]
-        self._names = _read_classes(self.folder / CLASSES_FILE)
+        self._names = read_classes(self.folder / CLASSES_FILE)
 
     def segment(self, frame: Frame) -> Instances:
         """The recorded objects of a frame.
@@ -147,7 +147,12 @@ def _one_channel(image: NDArray[Any], path: Path) -> NDArray[Any]:
     )
 
 
-def _read_classes(path: Path) -> dict[int, str] | None:
+def read_classes(path: Path) -> dict[int, str] | None:
+    """The COCO name of each number in the label images; None where no file says it.
+
+    Raises:
+        SegmentationError: The file cannot be read, or names something else.
+    """
     if not path.is_file():
         return None
     try:

@@ -11,13 +11,9 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.synthetic import TWIN_IDS, RenderSettings, parse_synthetic_id
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
-from dynslam_bench.sequences.synthetic.settings import (
-    RENDERER_VERSION,
-    SYNTHETIC_IDS,
-    RenderSettings,
-    parse_synthetic_id,
-)
+from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION
 
 from ..masks.oracle import instances_of
 from .labelled import LabelledImage
@@ -129,12 +125,12 @@ class RenderedFrames:
         return f"renderer {RENDERER_VERSION}"
 
     def __len__(self) -> int:
-        return len(self.instances) * len(SYNTHETIC_IDS) * self.frames
+        return len(self.instances) * len(TWIN_IDS) * self.frames
 
     def __getitem__(self, index: int) -> LabelledImage:
         order, draw = divmod(range(len(self))[index], self.frames)
-        instance, motion = divmod(order, len(SYNTHETIC_IDS))
-        sequence_id = f"{SYNTHETIC_IDS[motion]}@{self.instances[instance]}?frames={self.length}"
+        instance, motion = divmod(order, len(TWIN_IDS))
+        sequence_id = f"{TWIN_IDS[motion]}@{self.instances[instance]}?frames={self.length}"
         rng = stream(self.seed, "frames", sequence_id)
         frame = int(rng.choice(self.length, self.frames, replace=False)[draw])
         variant = stream(self.seed, "variant", sequence_id, draw)

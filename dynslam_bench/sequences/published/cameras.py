@@ -12,8 +12,15 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM
 
 CAMERA_FILE = "camera.toml"
+
+_WILD_SLAM = (
+    *(-0.0550149604678154, 0.06560786068439484, -0.0005061274860054255, 0.0004771310486830771),
+    -0.021717390045523643,
+)
+"""Distortion of Wild-SLAM's cameras, as its authors' configurations state it."""
 
 CAMERAS: dict[str, Camera] = {
     # Calibration of the colour cameras as published with the TUM RGB-D benchmark.
@@ -24,19 +31,44 @@ CAMERAS: dict[str, Camera] = {
     "bonn": Camera(
         640, 480, 542.822841, 542.576870, 315.593520, 237.756098, (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
     ),
-}
-
-MARKER_TO_CAMERA = {
-    # Bonn's ground truth is that of the markers on the camera. This is the rotation part of the publisher's
-    # calibration, freed of its scale of 1.059. Its lever arm of 2 cm is left out: positions stay those of the file, to
-    # which published errors refer (with it, a good trajectory's absolute error is 5 % larger on the crowd excerpt).
-    "bonn": (
-        (-0.958819, -0.172594, 0.225560),
-        (-0.284016, 0.580297, -0.763276),
-        (0.000845, -0.795906, -0.605420),
+    # Wild-SLAM MoCap, as its authors' configurations state them.
+    "wild-slam": Camera(
+        1280,
+        720,
+        647.2167358398438,
+        646.4154663085938,
+        643.1209716796875,
+        365.55963134765625,
+        (
+            -0.0550149604678154,
+            0.06560786068439484,
+            -0.0005061274860054255,
+            0.0004771310486830771,
+            -0.021717390045523643,
+        ),
+    ),
+    "wild-slam-anymal": Camera(
+        1280,
+        720,
+        647.7445068359375,
+        646.9425659179688,
+        643.1209716796875,
+        365.55963134765625,
+        (
+            -0.0550149604678154,
+            0.06560786068439484,
+            -0.0005061274860054255,
+            0.0004771310486830771,
+            -0.021717390045523643,
+        ),
     ),
 }
-"""Rotation from the camera's axes to the axes of the body whose poses the ground truth holds, where they differ."""
+
+MARKER_TO_CAMERA = {"bonn": BONN_R_BODY_CAM}
+"""Rotation from the camera's axes to those of the body whose poses the ground truth holds, where they differ.
+
+Bonn's ground truth is that of the markers on the camera. The lever arm of 2 cm is left out: positions stay those of the
+file, to which published errors refer; the protocol ``bonn-camera/v1`` takes it into account."""
 
 PUBLISHED_PREFIXES = {
     "rgbd_dataset_freiburg1_": "tum-fr1",
@@ -119,39 +151,61 @@ def write_camera(path: Path, camera: Camera, *, fps: float | None = None) -> Non
     write_atomic(path, "\n".join(lines) + "\n")
 
 
+def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> tuple[Camera, float | None] | None:
+    """The camera that the user chose, and the frame rate that a ``camera.toml`` states; None where nothing is chosen.
+
+    Args:
+        folder: A sequence's folder.
+        choice: A camera, a known camera's name or a ``camera.toml``; it wins over a ``camera.toml`` inside the folder.
+
+    Raises:
+        SequenceError: The choice is not understood.
+    """
+    if isinstance(choice, Camera):
+        return choice, None
+    inside = folder / CAMERA_FILE
+    if choice is None:
+        if not inside.is_file():
+            return None
+        file = read_camera(inside)
+        return file.camera(), file.fps
+    if str(choice) in CAMERAS:
+        return CAMERAS[str(choice)], None
+    path = Path(choice).expanduser()
+    if path.suffix == ".toml" or path.is_file():
+        file = read_camera(path)
+        return file.camera(), file.fps
+    return known_camera(str(choice)), None
+
+
 def find_camera(
-    folder: Path, choice: str | Path | Camera | None = None, *, otherwise: str | None = None
+    folder: Path,
+    choice: str | Path | Camera | None = None,
+    *,
+    told: Camera | None = None,
+    otherwise: str | None = None,
 ) -> tuple[Camera, float | None]:
     """The camera of a folder, and its nominal frame rate where a file states it.
 
     Args:
         folder: A sequence's folder.
-        choice: What the user asked for: a camera, a known camera's name or a ``camera.toml``; it wins over a
-            ``camera.toml`` inside the folder, which wins over what the published folder name tells.
+        choice: See `chosen_camera`; it wins over everything else.
+        told: What the folder's own calibration says, before what its published name tells.
         otherwise: Name of the camera if nothing else tells it, from the catalogue.
 
     Raises:
         SequenceError: The choice is not understood, or nothing tells the camera.
     """
-    if isinstance(choice, Camera):
-        return choice, None
-    inside = folder / CAMERA_FILE
-    if choice is None and inside.is_file():
-        file = read_camera(inside)
-        return file.camera(), file.fps
-    if choice is not None:
-        if str(choice) in CAMERAS:
-            return CAMERAS[str(choice)], None
-        path = Path(choice).expanduser()
-        if path.suffix == ".toml" or path.is_file():
-            file = read_camera(path)
-            return file.camera(), file.fps
-        return known_camera(str(choice)), None
+    chosen = chosen_camera(folder, choice)
+    if chosen is not None:
+        return chosen
+    if told is not None:
+        return told, None
     name = folder.resolve().name
     for prefix, camera in PUBLISHED_PREFIXES.items():
         if name.startswith(prefix):
             return CAMERAS[camera], 30.0
-    if otherwise is not None:
+    if otherwise:
         return CAMERAS[otherwise], None
     raise SequenceError(
         f"the camera of {folder} is not known: there is no {CAMERA_FILE} inside, and '{name}' is no published name",

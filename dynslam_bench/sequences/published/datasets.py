@@ -8,7 +8,7 @@ from dynslam_bench.contracts.sequence import DatasetSpec
 from dynslam_bench.core.plugins import Registry
 
 from ..synthetic import SYNTHETIC_IDS
-from .entries import catalogue
+from .entries import catalogue, public_datasets
 
 __all__ = ["DATASETS", "DatasetSpec"]
 
@@ -18,10 +18,9 @@ OPENERS = "dynslam_bench.sequences.catalogue"
 
 def _builtin() -> Iterator[DatasetSpec]:
     """The data sets that come with the package."""
-    for name, summary in (("tum", "TUM RGB-D benchmark"), ("bonn", "Bonn RGB-D Dynamic Dataset")):
-        entries = [entry for entry in catalogue().values() if entry.dataset == name]
-        ids, (license, citation) = tuple(entry.id for entry in entries), (entries[0].license, entries[0].citation)
-        yield DatasetSpec(name, f"{OPENERS}:open_public", ids, summary, license, citation)
+    for name, first in public_datasets().items():
+        ids = tuple(entry.id for entry in catalogue().values() if entry.dataset == name)
+        yield DatasetSpec(name, f"{OPENERS}:open_public", ids, first.title, first.license, first.citation)
     summary = "rendered rooms with exact poses, masks and flow"
     yield DatasetSpec("synthetic", f"{OPENERS}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.images import read_image
 
+from .arrays import read_metres
+
 
 def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.uint8]:
     """The image as uint8 ``[H, W, 3]``, red first; grey images are repeated over the channels.
@@ -39,20 +41,41 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
 
 
 def read_depth(
-    path: Path, depth_factor: float, *, size: tuple[int, int] | None = None, mismatch: str = ""
+    path: Path,
+    depth_factor: float,
+    *,
+    size: tuple[int, int] | None = None,
+    mismatch: str = "",
+    missing: int | None = None,
+    furthest_m: float | None = None,
 ) -> NDArray[np.float32]:
     """The image as float32 ``[H, W]`` in metres, 0 where the depth is missing.
 
     Args:
-        path: A 16-bit image of one channel.
-        depth_factor: Raw units a metre.
+        path: A 16-bit image of one channel, or an ``.npy`` array of metres.
+        depth_factor: Raw units a metre of an image.
         size: Width and height that it has to have; None for any.
         mismatch: Ends the message where it has another one.
+        missing: Raw value beside 0 that stands for a missing depth; None for none.
+        furthest_m: Depth beyond this is missing; None for no limit.
 
     Raises:
         SequenceError: The file is missing, empty, truncated, of another size, no image, or not of 16 bits in one
             channel.
     """
+    if path.suffix == ".npy":
+        depth = read_metres(path, size=size, mismatch=mismatch)
+    else:
+        raw = _read_raw(path, depth_factor, size, mismatch)
+        depth = raw.astype(np.float32) / np.float32(depth_factor)
+        if missing is not None:
+            depth[raw == missing] = 0
+    if furthest_m is not None:
+        depth[depth > furthest_m] = 0
+    return depth
+
+
+def _read_raw(path: Path, depth_factor: float, size: tuple[int, int] | None, mismatch: str) -> NDArray[np.uint16]:
     hint = "set the preprocessing's width and height to resize both"
     image = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
     if image.dtype != np.uint16 or image.ndim != 2:
@@ -62,4 +85,4 @@ def read_depth(
             f"{image.max()}), expected 1 of 16 bits",
             f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
         )
-    return image.astype(np.float32) / np.float32(depth_factor)
+    return image.astype(np.uint16, copy=False)

@@ -65,6 +65,8 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
             )
         colour[stamp] = (rest[0], _number(rest[1], path), rest[2])
     good = {stamp: row for stamp, row in colour.items() if math.isfinite(stamp) and math.isfinite(row[1])}
+    if not good:
+        raise SequenceError(f"{path} lists no pair of images ({len(rows)} lines, {len(colour)} with a stamp)")
     order = sorted(good)
     counts = {
         "bad_stamps": len(colour) - len(good),

@@ -9,15 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .settings import (
-    CAMERA,
-    HELD_OUT_INSTANCES,
-    SYNTHETIC_IDS,
-    TUNE_INSTANCES,
-    RenderSettings,
-    SyntheticId,
-    parse_synthetic_id,
-)
+from .families.registry import SYNTHETIC_IDS, TWIN_IDS
+from .ids import SyntheticId, parse_synthetic_id
+from .settings import CAMERA, HELD_OUT_INSTANCES, TUNE_INSTANCES, RenderSettings
 
 if TYPE_CHECKING:
     from .sequence import SyntheticSequence
@@ -27,6 +21,7 @@ __all__ = [
     "HELD_OUT_INSTANCES",
     "SYNTHETIC_IDS",
     "TUNE_INSTANCES",
+    "TWIN_IDS",
     "RenderSettings",
     "SyntheticId",
     "open_synthetic",

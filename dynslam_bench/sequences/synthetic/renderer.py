@@ -5,22 +5,37 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.settings import Settings
+
+from .bounds import bounds_of
+from .ids import SyntheticId
 from .kernels import motion as motion_kernels
 from .kernels import raycast as kernels
 from .kernels import sensors
 from .scenes.parts import QUAD, ROUND_CONE
 from .scenes.scene import Scene, Snapshot
-from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
+from .scenes.textures import Atlas
+from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
+from .views import View, rolling_flow, view_of
 
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+
+_MEAN_GREY = 105.0
+"""What automatic exposure aims at."""
+_SLACK_M = 0.01
+"""How much nearer than in the rows that were looked at a thing may be in another one."""
+Tiles = tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
+"""Tiles in a row, start of each tile's list, the lists, and the least depth of every primitive."""
 
 _LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
 """Direction to each lamp in the world (not normalised) and its strength; row 0 is the ambient light."""
@@ -54,68 +69,42 @@ class Renderer:
 
     def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
         self.settings = settings
-        self.scene = Scene(sequence, settings)
-        self.atlas = self.scene.atlas()
+        self.scene = Scene(sequence.world(), sequence.instance, settings)
+        self.depth_sensor = _adapted(settings.depth, self.scene.world.optics.depth)
+        self.color_sensor = _adapted(settings.color, self.scene.world.optics.color)
         self.threads = threads or default_threads()
         self._pool: ThreadPoolExecutor | None = None
         self._pool_process = 0
         text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
         text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
-        self._density = self._texel_density()
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+
+    @cached_property
+    def atlas(self) -> Atlas:
+        """The textures; drawn when the first frame is coloured."""
+        return self.scene.atlas()
+
+    def prepare(self) -> None:
+        """Draw the textures now: once, before several threads render."""
+        self._density  # noqa: B018
 
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
-        scene, settings = self.scene, self.settings
-        now, after = scene.snapshot(index / FPS), scene.snapshot((index + 1) / FPS)
+        settings = self.settings
+        now = view_of(self.scene, index)
         tiles = self._tiles(now)
-        height, width = CAMERA.height, CAMERA.width
         hit, depth = self._geometry(now, tiles)
-        color, cosine = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
-        lights = self._lights(now, index / FPS)
-        jitter = _JITTER if settings.antialias else np.zeros((1, 2))
-        self._rows(
-            lambda a, b: kernels.shade_pixels(
-                a,
-                b,
-                self._intrinsics,
-                tiles[0],
-                tiles[1],
-                tiles[2],
-                tiles[3],
-                scene.kind,
-                now.local,
-                scene.shape,
-                scene.texture,
-                scene.uv,
-                scene.tint,
-                self._facets(now, lights),
-                self.atlas.texels,
-                self.atlas.level_offset,
-                self.atlas.log2_size,
-                lights,
-                hit,
-                depth,
-                jitter,
-                color,
-                cosine,
-            )
-        )
+        color, cosine = self._shade(now, tiles, hit, depth, index / FPS)
         raw = self._measure(index, depth, cosine, color)
         if settings.shadow:
-            self._shadow(now, index / FPS, depth, color)
+            self._shadow(now.middle, index / FPS, depth, color)
         if settings.glare:
-            color += self._glare(now, index / FPS)
-        if settings.color.shutter > 0:
-            flow = np.empty((height, width, 2), np.float32)
-            motion = self._motion(now, after)
-            self._rows(lambda a, b: motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
-            sharp, color = color, np.empty_like(color)
-            blurred = color
-            self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, flow, settings.color.shutter, blurred))
+            color += self._glare(now.middle, index / FPS)
+        if self.color_sensor.shutter > 0:
+            color = self._blur(now, index, hit, depth, color)
         rgb = self._expose(index, color)
-        ids = np.append(scene.instance, 0).astype(np.uint8)
+        ids = np.append(self.scene.instance, 0).astype(np.uint8)
         return Rendered(rgb, raw, depth, ids[hit >> 3])
 
     def flow(self, index: int, other: int) -> NDArray[np.float32]:
@@ -123,45 +112,85 @@ class Renderer:
 
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in the other frame.
         """
-        now, after = self.scene.snapshot(index / FPS), self.scene.snapshot(other / FPS)
+        now, after = view_of(self.scene, index), view_of(self.scene, other)
         hit, depth = self._geometry(now, self._tiles(now))
+        if now.rolling:
+            return rolling_flow(now, after, hit, depth)
         flow = np.empty((*hit.shape, 2), np.float32)
-        motion = self._motion(now, after)
+        motion = self._motion(now.middle, after.middle)
         self._rows(lambda a, b: motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
         return flow
 
     def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
-        now = self.scene.snapshot(index / FPS)
+        now = view_of(self.scene, index)
         hit, depth = self._geometry(now, self._tiles(now))
         return depth, np.append(self.scene.instance, 0).astype(np.uint8)[hit >> 3]
 
-    def _rows(self, work: Callable[[int, int], None]) -> None:
-        bands = [(a, min(a + _BAND, CAMERA.height)) for a in range(0, CAMERA.height, _BAND)]
+    def _shade(
+        self, now: View, tiles: Tiles, hit: NDArray[np.int32], depth: NDArray[np.float64], time: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
+        scene, atlas = self.scene, self.atlas
+        color = np.empty((CAMERA.height, CAMERA.width, 3), np.float32)
+        cosine = np.empty((CAMERA.height, CAMERA.width), np.float32)
+        jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
+
+        def work(a: int, b: int) -> None:
+            seen = now.at_row((a + b) // 2)
+            lights = self._lights(seen, time)
+            facets = self._facets(seen, lights)
+            for first, end, local in _rows_of(now, a, b):
+                kernels.shade_pixels(
+                    first, end, self._intrinsics, *tiles, scene.kind, local, scene.shape, scene.texture, scene.uv,
+                    scene.tint, facets, atlas.texels, atlas.level_offset, atlas.log2_size, lights, hit, depth, jitter,
+                    color, cosine,
+                )  # fmt: skip
+
+        self._rows(work, bands=now.rolling)
+        return color, cosine
+
+    def _blur(
+        self, now: View, index: int, hit: NDArray[np.int32], depth: NDArray[np.float64], sharp: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Motion blur; under a rolling shutter along the motion of each band's middle row."""
+        flow, blurred = np.empty((*hit.shape, 2), np.float32), np.empty_like(sharp)
+        after = view_of(self.scene, index + 1)
+
+        def work(a: int, b: int) -> None:
+            row = (a + b) // 2
+            motion = self._motion(now.at_row(row), after.at_row(row))
+            motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
+
+        self._rows(work, bands=now.rolling)
+        shutter = self.color_sensor.shutter
+        self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, flow, shutter, blurred))
+        return blurred
+
+    def _rows(self, work: Callable[[int, int], None], *, bands: bool = False) -> None:
+        """Share the rows among the threads; `bands` asks for the same bands whatever the number of threads."""
+        parts = [(a, min(a + _BAND, CAMERA.height)) for a in range(0, CAMERA.height, _BAND)]
         if self.threads == 1:
-            work(0, CAMERA.height)
+            for a, b in parts if bands else [(0, CAMERA.height)]:
+                work(a, b)
             return
         if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
             self._pool, self._pool_process = ThreadPoolExecutor(self.threads), os.getpid()
-        for done in [self._pool.submit(work, a, b) for a, b in bands]:
+        for done in [self._pool.submit(work, a, b) for a, b in parts]:
             done.result()
 
-    def _tiles(self, snap: Snapshot) -> tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-        """Bin the primitives into tiles by the projected corners of their boxes."""
-        scene = self.scene
+    def _tiles(self, view: View) -> Tiles:
+        """Bin the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter."""
+        scene, snap = self.scene, view.middle
         world = (scene.corners * scene.scale[:, None, :]) @ np.swapaxes(snap.rotation, 1, 2) + snap.origin[:, None, :]
-        points = (world - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
-        z = points[:, :, 2]
-        nearest = z.min(axis=1)
-        seen = z.max(axis=1) > 0.05
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = points[:, :, 0] / z * CAMERA.fx + CAMERA.cx
-            v = points[:, :, 1] / z * CAMERA.fy + CAMERA.cy
+        chosen = np.linspace(0, len(view.poses) - 1, 9 if view.rolling else 1).astype(int)
+        bounds = [bounds_of((world - pose[:3, 3]) @ pose[:3, :3]) for pose in view.poses[chosen]]
+        nearest, low_u, low_v = (np.min([each[k] for each in bounds], axis=0) for k in range(3))
+        high_u, high_v = (np.max([each[k] for each in bounds], axis=0) for k in (3, 4))
+        if view.rolling:
+            nearest = nearest - _SLACK_M
         tiles_x, tiles_y = -(-CAMERA.width // kernels.TILE), -(-CAMERA.height // kernels.TILE)
-        crossing = nearest <= 0.05
-        low_u, high_u = np.where(crossing, 0, u.min(1) - 2), np.where(crossing, CAMERA.width, u.max(1) + 2)
-        low_v, high_v = np.where(crossing, 0, v.min(1) - 2), np.where(crossing, CAMERA.height, v.max(1) + 2)
-        seen &= (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
+        seen = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
         boxes = np.stack(
             [
                 np.clip(low_u, 0, CAMERA.width - 1),
@@ -177,27 +206,18 @@ class Renderer:
         start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
         return tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
 
-    def _geometry(
-        self, snap: Snapshot, tiles: tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    def _geometry(self, view: View, tiles: Tiles) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """What every pixel sees (`cast_geometry`) and its z-depth in metres."""
         hit = np.empty((CAMERA.height, CAMERA.width), np.int32)
         depth = np.empty((CAMERA.height, CAMERA.width))
-        self._rows(
-            lambda a, b: kernels.cast_geometry(
-                a,
-                b,
-                self._intrinsics,
-                tiles[0],
-                tiles[1],
-                tiles[2],
-                tiles[3],
-                self.scene.kind,
-                snap.local,
-                self.scene.shape,
-                hit,
-                depth,
-            )
-        )
+
+        def work(a: int, b: int) -> None:
+            for first, end, local in _rows_of(view, a, b):
+                kernels.cast_geometry(
+                    first, end, self._intrinsics, *tiles, self.scene.kind, local, self.scene.shape, hit, depth
+                )
+
+        self._rows(work)
         return hit, depth
 
     def _motion(self, now: Snapshot, other: Snapshot) -> NDArray[np.float64]:
@@ -236,7 +256,8 @@ class Renderer:
         facets[:, :, 4] = self._density
         return facets
 
-    def _texel_density(self) -> NDArray[np.float64]:
+    @cached_property
+    def _density(self) -> NDArray[np.float64]:
         """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
         scene = self.scene
         repeats = np.abs(scene.uv[:, :, :2])
@@ -261,7 +282,7 @@ class Renderer:
 
     def _glare(self, snap: Snapshot, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the room's back wall, brightening and fading."""
-        window = np.array([self.scene.plan.left_x * 0.55, self.scene.plan.back_y, 2.15])
+        window = np.array(self.scene.world.window)
         x, y, z = (window - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
         if z <= 0.1:
             return np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
@@ -274,7 +295,7 @@ class Renderer:
     def _measure(
         self, index: int, depth: NDArray[np.float64], cosine: NDArray[np.float32], color: NDArray[np.float32]
     ) -> NDArray[np.uint16]:
-        sensor = self.settings.depth
+        sensor = self.depth_sensor
         if not sensor.noise:
             return np.clip(np.floor(depth * CAMERA.depth_factor + 0.5), 0, 65535).astype(np.uint16)
         raw = np.empty(depth.shape, np.uint16)
@@ -302,13 +323,16 @@ class Renderer:
 
     def _expose(self, index: int, color: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Exposure of a rolling readout (drift and mains flicker), noise and rounding."""
-        sensor = self.settings.color
+        sensor, optics = self.color_sensor, self.scene.world.optics
         rows = np.arange(CAMERA.height)
         time = index / FPS + rows / CAMERA.height / FPS * 0.9
         gain = 1 + sensor.exposure_drift * (
             0.7 * np.sin(2 * math.pi * time / 6.1) + 0.3 * np.sin(2 * math.pi * time / 1.9 + 1.0)
         )
         gain *= 1 + sensor.flicker * np.sin(2 * math.pi * 100.0 * time * 1.0013)
+        if optics.gain != 1 or optics.auto_exposure:
+            mean = max(float(color.mean(dtype=np.float64)) * optics.gain, 1.0)
+            gain *= optics.gain * (_MEAN_GREY / mean) ** optics.auto_exposure
         gains = np.repeat(gain[:, None], 3, axis=1)
         offset = np.zeros_like(gains)
         rgb = np.empty(color.shape, np.uint8)
@@ -316,6 +340,23 @@ class Renderer:
         read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
         self._rows(lambda a, b: sensors.expose(a, b, seed, color, gains, offset, read, shot, rgb))
         return rgb
+
+
+def _rows_of(view: View, first: int, end: int) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+    """Runs of rows that share a pose: first row, one past the last, the maps into the primitives' frames."""
+    if not view.rolling:
+        yield first, end, view.local[0]
+        return
+    for row in range(first, end):
+        yield row, row + 1, view.local[row]
+
+
+SensorSettings = TypeVar("SensorSettings", bound=Settings)
+
+
+def _adapted(sensor: SensorSettings, family: Mapping[str, Any]) -> SensorSettings:
+    """The sensor's settings with those of the family where the user left the default."""
+    return sensor.model_copy(update={k: v for k, v in family.items() if k not in sensor.model_fields_set})
 
 
 def default_threads() -> int:

@@ -17,9 +17,11 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .frame_cache import FrameStore
+from .ids import SyntheticId
 from .renderer import Rendered, Renderer, default_threads
-from .scenes.scene import CLASS_NAMES, Scene
-from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings, SyntheticId
+from .scenes.scene import Scene
+from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
+from .views import row_times
 
 START_S = 1000.0
 """Stamp of the first frame in seconds."""
@@ -105,7 +107,7 @@ class SyntheticSequence:
     @cached_property
     def scene(self) -> Scene:
         """The geometry behind the frames."""
-        return Scene(self._id, self.settings)
+        return Scene(self._id.world(), self._id.instance, self.settings)
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -136,7 +138,8 @@ class SyntheticSequence:
         return digest({"scene": f"{self._id.name}@{self._id.instance}", "key": self._key()})
 
     def _key(self) -> str:
-        return digest({"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")}, 8)
+        family = {"family": self._id.version} if self._id.version else {}
+        return digest({"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")} | family, 8)
 
     def __len__(self) -> int:
         return self._id.frames
@@ -159,6 +162,14 @@ class SyntheticSequence:
         """
         i = range(len(self))[index]
         return self.renderer.flow(i, i + 1 if other is None else range(len(self))[other])
+
+    def row_poses(self, index: int) -> NDArray[np.float64]:
+        """Exact camera-to-world poses ``[H, 4, 4]`` of all rows of a frame; all the same under a global shutter.
+
+        The frame's own pose (`ground_truth`) is that of the middle of the image.
+        """
+        times = row_times(range(len(self))[index], self.scene.world.optics.readout_s)
+        return self.scene.poses(times)
 
     def exact_depth(self, index: int) -> NDArray[np.float64]:
         """Exact z-depth float64 ``[H, W]`` in metres at the pixel centres, 0 where nothing is hit."""
@@ -183,6 +194,7 @@ class SyntheticSequence:
             progress(done, len(self))
         if todo:
             single = Renderer(self._id, self.settings, 1)
+            single.prepare()
             with ThreadPoolExecutor(self.threads) as pool:
                 try:
                     for _ in pool.map(lambda i: self._make(i, single, lists=False) and None, todo):
@@ -221,7 +233,7 @@ class SyntheticMasks:
         ids = None if sequence.store is None else sequence.store.read("masks", float(sequence.timestamps[i]))
         if ids is None:
             ids = sequence.renderer.geometry(i)[1]
-        return FrameMasks(ids, dict(CLASS_NAMES), sequence.scene.moving(i))
+        return FrameMasks(ids, sequence.scene.world.class_names, sequence.scene.moving(i))
 
 
 def _metres(raw: NDArray[np.uint16]) -> NDArray[np.float32]:

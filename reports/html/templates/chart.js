@@ -22,6 +22,13 @@ function fitted(text, room) {
   return cut === text ? text : `${cut.slice(0, -1).trim()}…`;
 }
 
+/** A text whose beginning is cut to a width in pixels: names of sequences differ at their end. */
+function ending(text, room) {
+  let cut = text;
+  while (cut && widthOf(cut) > room) cut = cut.slice(1);
+  return cut === text ? text : `…${cut.slice(1).trim()}`;
+}
+
 const write = (lines, x, y, more = {}) => {
   const text = svg("text", { x, y, ...more });
   lines.forEach((line, at) => text.append(svg("tspan", { x, dy: at ? "1.2em" : 0 }, line)));
@@ -63,7 +70,9 @@ function scalesOf(panel, shown) {
   panel.sy = makeScale(panel.ySpec, gather("y"), zero("y"));
 }
 
-/** Names below the axis: broken at their signs where they are too long, tilted where that does not help either. */
+const LONGEST_NAME = 130;
+
+/** Names below the axis: broken at their signs where they are too long, upright where that does not help either. */
 function nameBelow(panel) {
   const room = panel.width / panel.sx.categories.length - 8, names = new Map();
   for (const name of panel.sx.categories) {
@@ -74,9 +83,10 @@ function nameBelow(panel) {
     names.set(name, lines);
   }
   const widest = Math.max(0, ...[...names.values()].flat().map(widthOf));
-  panel.tilted = widest > room;
-  panel.names = panel.tilted ? new Map([...names.keys()].map((name) => [name, [plain(name)]])) : names;
-  panel.foot = panel.tilted ? 20 + 0.8 * Math.min(150, Math.max(...[...names.keys()].map((name) => widthOf(plain(name))))) : 8 + 15 * Math.max(...[...names.values()].map((lines) => lines.length));
+  panel.upright = widest > room;
+  panel.names = panel.upright ? new Map([...names.keys()].map((name) => [name, [ending(plain(name), LONGEST_NAME)]])) : names;
+  const lines = [...panel.names.values()];
+  panel.foot = panel.upright ? 14 + Math.max(...lines.map(([line]) => widthOf(line))) : 8 + 15 * Math.max(...lines.map((each) => each.length));
 }
 
 /** Where the panels lie, for a width in pixels: side by side, or below each other where that is too narrow. */
@@ -91,7 +101,7 @@ function arrange(panels, layout, width) {
       const named = panel.sy.kind === "category";
       const longest = named ? Math.max(...panel.sy.categories.flatMap(linesOf).map(widthOf)) : 0;
       panel.inside = named && (narrow || longest > width * 0.34);
-      const ticks = named ? [] : panel.sy.ticks(6).map(tickText);
+      const ticks = named ? [] : [2, 4, 6, 8, 10].flatMap((count) => panel.sy.ticks(count)).map(tickText);
       const left = named ? (panel.inside ? 8 : longest + 14) : Math.max(28, ...ticks.map((text) => widthOf(text) + 12));
       panel.left = column * (outer + gap) + left;
       panel.width = Math.max(outer - left - 12, 40);
@@ -123,8 +133,8 @@ function axesOf(panel) {
     const room = width / sx.categories.length;
     for (const name of sx.categories) {
       const x = left + sx.at(name) * width;
-      const turn = panel.tilted ? { transform: `rotate(-52 ${x} ${bottom + 12})`, "text-anchor": "end" } : { "text-anchor": "middle" };
-      group.append(write(panel.names.get(name), x, bottom + 16, turn));
+      const turn = panel.upright ? { transform: `rotate(-90 ${x} ${bottom + 8}) translate(0 4)`, "text-anchor": "end" } : { "text-anchor": "middle" };
+      group.append(write(panel.names.get(name), x, bottom + (panel.upright ? 8 : 16), turn));
       if (room > 24) group.append(svg("path", { d: `M${x + room / 2} ${top}V${bottom}`, class: "grid" }));
     }
   } else

@@ -93,7 +93,8 @@ class Explore {
   }
 
   head(name, at, column) {
-    const group = column?.sequence?.name ?? "", label = make("button", { type: "button", textContent: name });
+    const group = column?.sequence?.name ?? "", pieces = name.split(/(?<=[/_])/).flatMap((piece, place) => (place ? [make("wbr"), piece] : [piece]));
+    const label = make("button", { type: "button" }, ...pieces);
     const head = make("th", { className: at ? "n" : "sticky", scope: "col", title: group }, label);
     label.addEventListener("click", () => {
       const up = this.view.sort !== `${name}:up`;
@@ -129,7 +130,7 @@ class Explore {
     const td = make("td", { className: "n" }), runs = cell.runs, chosen = standing(cell, metric.at);
     const link = (run, text) => make("a", { href: `run.html#${run.id}`, textContent: text, title: run.repeat + (run.ending ? `, ${run.ending}` : "") });
     if (cell.failed === runs.length) {
-      td.className = "failed";
+      td.className = "n failed";
       td.append(link(chosen, chosen.ending));
     } else {
       const value = cell.medians[metric.at], under = ratio ? this.base(sequence, metric) : 1;

@@ -14,9 +14,10 @@ function boxFigure(explore, trackers, sequences) {
     }
     return { type: "box", name: tracker.label, x: names, quartiles, marker: { color: tracker.colour }, width: 0.9 / shown.length, shift: ((at + 0.5) / shown.length - 0.5) * 0.84 };
   });
+  const known = sequences.map((sequence) => sequence.short).filter((name) => data.some((trace) => trace.x.includes(name)));
   return {
     data,
-    layout: { height: 420, xaxis: { type: "category", categories: sequences.map((sequence) => sequence.short) }, yaxis: { type: "log", title: { text: "frame-to-frame error (mm)" } } },
+    layout: { height: 420, xaxis: { type: "category", categories: known }, yaxis: { type: "log", title: { text: "frame-to-frame error (mm)" } } },
   };
 }
 

@@ -120,7 +120,7 @@ function addCompare(place, look) {
 async function showLooks(id, run, where, space) {
   const beside = $("looks"), below = $("frames");
   if (!where.pictured) {
-    const why = "Pictures are kept for the run with the median error of each cell and for failed ones; choose another repeat above. Imported tracks have none.";
+    const why = "There are no pictures of this run. They are drawn of the run with the median error of each cell and of failed ones, where the sequence is on the machine and there is time; imported tracks have none.";
     (beside ?? below).append(make("p", { className: "waiting", textContent: why }));
     if (beside) $("s-frames").remove();
     return;

@@ -98,6 +98,7 @@ async function render(id) {
     drawRunFigures(run, where);
     main.querySelectorAll("table").forEach((each) => each.classList.add("plain-table"));
     await showLooks(id, run, where, startSpace(run));
+    document.querySelectorAll("nav a").forEach((link) => { link.hidden = !document.querySelector(link.getAttribute("href")); });
   } catch (error) { main.replaceChildren(make("p", { className: "note", textContent: error.message })); }
 }
 

@@ -20,6 +20,7 @@ from dynslam_bench.core.seeding import stream
 
 Array = NDArray[np.float64]
 
+MOTIONS = ("xyz", "static", "halfsphere", "rpy")
 EYE_HEIGHT_M = 1.35
 TILT_RAD = math.radians(10.0)
 
@@ -53,15 +54,19 @@ def camera_poses(motion: str, people: str, instance: int, times: Array) -> Array
         angles[:, 1] = -0.9 * np.arctan2(offset[:, 0], distance - offset[:, 2])
         angles[:, 0] = 0.9 * np.arctan2(offset[:, 1], distance - offset[:, 2])
         angles[:, 2] = 0.2 * np.sin(around * 0.77 + 1.0)
-    offset += _hand(rng, t, 0.004, 3)
-    angles += _hand(rng, t, math.radians(0.5), 3)
-    rest = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    tilt = _rotation(np.array([[-TILT_RAD, 0.0, 0.0]]))[0]
-    base = rest @ tilt
+    offset += hand(rng, t, 0.004, 3)
+    angles += hand(rng, t, math.radians(0.5), 3)
+    base = camera_axes(TILT_RAD)
     poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = base @ _rotation(angles)
+    poses[:, :3, :3] = base @ rotations(angles)
     poses[:, :3, 3] = offset @ base.T + np.array([0.0, 0.0, EYE_HEIGHT_M])
     return poses
+
+
+def camera_axes(tilt: float) -> Array:
+    """Camera to world, 3x3, of a camera that looks along +y and `tilt` radians down."""
+    rest = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return rest @ rotations(np.array([[-tilt, 0.0, 0.0]]))[0]
 
 
 def _turns(t: Array, period: float, slots: int, slot: int) -> Array:
@@ -76,7 +81,7 @@ def _turns(t: Array, period: float, slots: int, slot: int) -> Array:
     return np.where(inside, np.sin(2 * math.pi * eased) * window, 0.0)
 
 
-def _hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Array:
+def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Array:
     """Handheld jitter: sines from 0.2 to 4 Hz whose amplitude falls with the frequency."""
     total = np.zeros((len(t), axes))
     for frequency in (0.23, 0.51, 0.97, 1.7, 2.6, 3.9):
@@ -85,7 +90,7 @@ def _hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Ar
     return total
 
 
-def _rotation(vectors: Array) -> Array:
+def rotations(vectors: Array) -> Array:
     """Rotation matrices ``[N, 3, 3]`` of rotation vectors ``[N, 3]`` (Rodrigues)."""
     theta = np.linalg.norm(vectors, axis=1)
     safe = np.where(theta < 1e-12, 1.0, theta)

@@ -206,8 +206,8 @@ def add_shelf(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> 
             )
 
 
-def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan, depth: float) -> None:
-    """Posters, a notice board and a clock on the back wall; one poster on each side wall."""
+def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
+    """Posters on the back wall."""
     for k in range(plan.posters):
         span = plan.right_x - plan.left_x - 1.6
         x = plan.left_x + 0.8 + span * (k + 0.3 + 0.4 * rng.random()) / plan.posters
@@ -221,6 +221,10 @@ def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan, depth: float
             texture=f"poster:{k % 4}",
             fit=(2,),
         )
+
+
+def add_side_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
+    """A poster on each side wall."""
     for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3)):
         y = 1.6 + 1.2 * rng.random()
         parts.add(

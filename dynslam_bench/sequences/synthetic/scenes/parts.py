@@ -67,6 +67,28 @@ class Parts:
         self.uv.append(uv)
         self.tint.append(np.asarray(tint, dtype=np.float64))
 
+    def extend(
+        self, other: Parts, yaw: float = 0.0, shift: tuple[float, float, float] | None = None, suffix: str = ""
+    ) -> None:
+        """Add copies of all primitives of `other`.
+
+        Args:
+            other: Whose primitives.
+            yaw: Turned by this many degrees about the world's z axis, then ...
+            shift: ... moved by this much, metres; None leaves them where they are.
+            suffix: Put behind the names of patterned textures, so that they are drawn anew.
+        """
+        for name in ("kind", "scale", "shape", "instance", "uv", "tint"):
+            getattr(self, name).extend(getattr(other, name))
+        self.texture += [tuple(kind + suffix if ":" in kind else kind for kind in row) for row in other.texture]
+        if shift is None:
+            self.rotation += other.rotation
+            self.origin += other.origin
+        else:
+            body = turn(yaw)
+            self.rotation += [body @ rotation for rotation in other.rotation]
+            self.origin += [body @ origin + shift for origin in other.origin]
+
 
 def turn(degrees: float) -> Array:
     """Rotation about the world's z axis."""

@@ -54,9 +54,9 @@ def pick_one(rng: np.random.Generator, instance: int, pool: list[int]) -> int:
     return half[int(rng.integers(len(half)))]
 
 
-def plan_room(instance: int) -> Plan:
-    """Draw the plan of an instance's room."""
-    rng = stream(instance, "synthetic", "room")
+def plan_room(instance: int, number: int | None = None) -> Plan:
+    """Draw the plan of an instance's room, or of one of its several rooms."""
+    rng = stream(instance, "synthetic", "room", *(() if number is None else (number,)))
 
     def color(low: float, high: float, spread: float) -> Array:
         base = pick(rng, instance, low, high)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from .furniture import add_cabinet, add_desk, add_posters, add_shelf
+from .furniture import add_cabinet, add_desk, add_posters, add_shelf, add_side_posters
 from .parts import BOX, QUAD, Parts, wall
 from .plan import Plan
 
@@ -18,7 +18,7 @@ def build_room(instance: int, plan: Plan) -> Parts:
     """All fixed primitives."""
     rng = stream(instance, "synthetic", "furniture")
     parts, tint = Parts(), plan.tints
-    depth, height = plan.back_y, 2.8
+    height = 2.8
     back, front = plan.back_y, -2.5
     mid_y, half_y = (back + front) / 2, (back - front) / 2
     mid_x, half_x = (plan.left_x + plan.right_x) / 2, (plan.right_x - plan.left_x) / 2
@@ -70,6 +70,7 @@ def build_room(instance: int, plan: Plan) -> Parts:
     parts.add(BOX, eye, np.array([mid_x, back - 0.02, 0.95]), (half_x, 0.02, 0.04), tint=(0.82,) * 3)
     add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=1.15)
     add_shelf(parts, rng, plan, plan.shelf_side)
-    add_posters(parts, rng, plan, depth)
+    add_posters(parts, rng, plan)
+    add_side_posters(parts, rng, plan)
     add_cabinet(parts, rng, plan, -plan.shelf_side)
     return parts

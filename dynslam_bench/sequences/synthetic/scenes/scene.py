@@ -9,19 +9,14 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
-from ..people.bodies import add_person, draw_person
-from ..people.script import chair_place, posture, write_script
-from ..settings import FPS, RenderSettings, SyntheticId
+from ..people.bodies import add_person
+from ..settings import FPS, RenderSettings
 from . import textures
-from .camera_paths import camera_poses
-from .furniture import add_chair
-from .parts import QUAD, ROUND_CONE, Parts, turn
-from .plan import plan_room
-from .room import build_room
+from .parts import QUAD, ROUND_CONE, Parts
+from .world import World
 
 Array = NDArray[np.float64]
 
-CLASS_NAMES = {1: "person", 2: "person", 3: "chair", 4: "chair"}
 MOVED_M = 5e-4
 """An instance moves in a frame if a point of it has moved by more than this since the previous frame."""
 
@@ -55,28 +50,24 @@ class Scene:
     """Everything of a sequence that does not depend on pixels.
 
     Args:
-        sequence: Which sequence.
+        world: What is filmed.
+        instance: Seed of the textures.
         settings: Renderer settings; only `people` matters here.
     """
 
-    def __init__(self, sequence: SyntheticId, settings: RenderSettings) -> None:
-        self.id = sequence
+    def __init__(self, world: World, instance: int, settings: RenderSettings) -> None:
+        self.world = world
+        self.seed = instance
         self.mode = settings.people
-        self.plan = plan_room(sequence.instance)
-        self.script = write_script(sequence.people, sequence.instance)
-        self.cast = [draw_person(sequence.instance, k) for k in range(2)]
-        room = build_room(sequence.instance, self.plan)
-        self._chairs = []
-        for k in range(2):
-            chair = Parts()
-            add_chair(chair, 3 + k, self.plan.tints["chair"] * (1.0 if k == 0 else 0.8), self.plan.tints["metal"])
-            self._chairs.append((np.stack(chair.rotation), np.stack(chair.origin)))
-            for name in ("kind", "rotation", "origin", "scale", "shape", "instance", "texture", "uv", "tint"):
-                getattr(room, name).extend(getattr(chair, name))
-        self.fixed = len(room) - sum(len(origin) for _, origin in self._chairs)
-        if self.mode != "none":
-            for person, keys in zip(self.cast, self.script.people, strict=True):
-                add_person(room, person, posture(keys, self.script.period, 0.0))
+        self.actors = () if self.mode == "none" else world.actors
+        room = Parts()
+        room.extend(world.room)
+        self._bodies = [(np.stack(body.parts.rotation), np.stack(body.parts.origin)) for body in world.bodies]
+        for body in world.bodies:
+            room.extend(body.parts)
+        self.fixed = len(world.room)
+        for actor in self.actors:
+            add_person(room, actor.person, actor.posture(0.0))
         self.kind = np.array(room.kind, np.int32)
         self.scale, self.shape = np.stack(room.scale), np.stack(room.shape)
         self.instance = np.array(room.instance, np.int32)
@@ -94,26 +85,24 @@ class Scene:
         images = {}
         for name in self.texture_names:
             maker = textures.MAKERS[name.partition(":")[0]]
-            images[name] = maker(stream(self.id.instance, "synthetic", "texture", name))
+            images[name] = maker(stream(self.seed, "synthetic", "texture", name))
         return textures.build_atlas(images)
 
     def poses(self, times: Array) -> Array:
         """Camera-to-world poses ``[N, 4, 4]``."""
-        return camera_poses(self.id.motion, self.id.people, self.id.instance, times)
+        return self.world.camera(times)
 
     def place(self, time: float) -> tuple[Array, Array]:
         """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start)."""
-        t = 0.0 if self.mode == "frozen" else time
+        t = time if self.mode == "moving" else 0.0
         parts = _Poses()
-        if self.mode != "none":
-            for person, keys in zip(self.cast, self.script.people, strict=True):
-                add_person(parts, person, posture(keys, self.script.period, t))
+        for actor in self.actors:
+            add_person(parts, actor.person, actor.posture(t))
         rotations, origins = [self._fixed_rotation], [self._fixed_origin]
-        for (rotation, origin), path in zip(self._chairs, self.script.chairs, strict=True):
-            x, y, facing = chair_place(path, self.script.period, 0.0 if self.mode == "none" else t)
-            body = turn(facing + 180.0)
-            rotations.append(body @ rotation)
-            origins.append(origin @ body.T + (x, y, 0.0))
+        for (rotation, origin), body in zip(self._bodies, self.world.bodies, strict=True):
+            turned, shift = body.path(t)
+            rotations.append(turned @ rotation)
+            origins.append(origin @ turned.T + shift)
         if parts.rotation:
             rotations.append(np.stack(parts.rotation))
             origins.append(np.stack(parts.origin))
@@ -121,7 +110,10 @@ class Scene:
 
     def snapshot(self, time: float) -> Snapshot:
         """The scene as the camera sees it at a time (seconds from the start)."""
-        pose = self.poses(np.array([time]))[0]
+        return self.snapshot_from(self.poses(np.array([time]))[0], time)
+
+    def snapshot_from(self, pose: Array, time: float) -> Snapshot:
+        """The scene at a time as a camera at another pose (camera to world, 4x4) would see it."""
         rotation, origin = self.place(time)
         inverse = np.swapaxes(rotation, 1, 2) / self.scale[:, :, None]
         local = np.empty((len(origin), 3, 4))

@@ -1,0 +1,99 @@
+"""What is done to both trajectories before they are associated: lost frames, the truth's corrections, which frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.geometry.association import associate
+from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, bonn_as_droid_w, bonn_camera, in_camera_axes
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from . import frames
+from .protocol import Protocol
+
+
+def truth_of_file(truth: Trajectory, protocol: Protocol) -> Trajectory:
+    """A ground-truth file's poses as `evaluate` takes them.
+
+    Bonn's files hold the orientations of the markers, its sequences those of the camera; the protocols that move the
+    positions start from the latter. For all others a file is taken as it stands.
+    """
+    if protocol.truth == "as-is":
+        return truth
+    return Trajectory(truth.timestamps, in_camera_axes(truth.T_world_cam, BONN_R_BODY_CAM))
+
+
+def compared(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    protocol: Protocol,
+    input_timestamps: ArrayLike | None = None,
+    diagnostics: list[str] | None = None,
+) -> tuple[Trajectory, Trajectory]:
+    """The trajectories that a protocol compares: the truth corrected, the estimate on the frames that count.
+
+    Args:
+        estimate: Estimated poses.
+        ground_truth: True poses, with the camera's orientations.
+        protocol: The protocol.
+        input_timestamps: Stamps in seconds of all input frames; without them those of the estimate count.
+        diagnostics: Takes a line on what was left out.
+
+    Raises:
+        EvaluationError: None of the frames that count was tracked.
+    """
+    if protocol.truth == "bonn-camera":
+        ground_truth = Trajectory(ground_truth.timestamps, bonn_camera(ground_truth.T_world_cam))
+    elif protocol.truth == "bonn-droid-w":
+        ground_truth = Trajectory(ground_truth.timestamps, bonn_as_droid_w(ground_truth.T_world_cam))
+    if not protocol.thins:
+        return estimate, ground_truth
+    stamps = estimate.timestamps if input_timestamps is None else np.asarray(input_timestamps, np.float64).reshape(-1)
+    matched = np.sort(associate(ground_truth.timestamps, stamps, protocol.max_dt, strict=protocol.strict)[1])
+    chosen = stamps[matched[:: protocol.every][: protocol.most_frames or None]]
+    index = associate(chosen, estimate.timestamps, frames.STAMP_TOLERANCE, strict=False)[1]
+    if not len(index):
+        raise EvaluationError(
+            f"none of {len(estimate)} poses is of the {len(chosen)} frames that {protocol.id} compares "
+            f"(every {protocol.every} of {len(matched)} matched ones, at most {protocol.most_frames})"
+        )
+    if diagnostics is not None:
+        diagnostics.append(
+            f"{len(index)} poses on {len(chosen)} frames are compared: every {protocol.every} of {len(matched)} matched"
+        )
+    return estimate.select(np.sort(index)), ground_truth
+
+
+def apply_policy(
+    estimate: Trajectory,
+    protocol: Protocol,
+    input_timestamps: ArrayLike | None,
+    n_input: int | None,
+    n_tracked: int | None,
+    diagnostics: list[str],
+) -> Trajectory:
+    """The estimate with its lost frames held, left out, or refused, as the protocol has it.
+
+    Raises:
+        EvaluationError: The policy needs the input frames, or allows no lost frame.
+    """
+    if input_timestamps is None or n_input is None or n_tracked is None:
+        if protocol.lost_frames != "exclude":
+            raise EvaluationError(
+                f"protocol {protocol.id} ({protocol.lost_frames}) needs the stamps of the input frames",
+                "pass input_timestamps, or use a protocol that excludes lost frames",
+            )
+        return estimate
+    lost = n_input - n_tracked
+    if not lost:
+        return estimate
+    percent = f"coverage {100 * n_tracked / n_input:.1f} %"
+    if protocol.lost_frames == "fail":
+        raise EvaluationError(f"{lost} of {n_input} frames were lost ({percent}), {protocol.id} allows none")
+    if protocol.lost_frames == "hold":
+        diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and held at the last tracked pose")
+        return frames.hold(estimate, input_timestamps)
+    diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and take no part")
+    return estimate

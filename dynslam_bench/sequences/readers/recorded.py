@@ -1,0 +1,311 @@
+"""Recorded RGB-D sequences of every layout: frames that are decoded when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Frame, MaskSource
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.harmless import inside
+from dynslam_bench.core.records import digest
+from dynslam_bench.geometry.association import associate, nearest_gap
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.rigs import in_camera_axes
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .contents import Contents
+from .diagnostics import Dropped
+from .lists import ImageList
+
+GROUND_TRUTH_DT_S = 0.02
+MISSING_TOLERATED = 0.02
+"""Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """What is known of a sequence beside its files.
+
+    Attributes:
+        id: For example ``tum/fr3/walking_xyz``.
+        camera: Intrinsics of the colour images.
+        fps: Nominal frame rate in Hz; None to take it from the stamps.
+        license: Licence of the data.
+        citation: What to cite.
+        tags: For example ``high-dynamic``.
+        split: ``tune``, ``held-out`` or empty.
+        R_body_cam: Rotation from the camera's axes to those of the body that the ground truth tracks, rows of a 3x3
+            matrix; None where the ground truth is the camera's.
+    """
+
+    id: str
+    camera: Camera
+    fps: float | None = None
+    license: str = "unknown"
+    citation: str = ""
+    tags: frozenset[str] = frozenset()
+    split: str = ""
+    R_body_cam: tuple[tuple[float, float, float], ...] | None = None
+
+
+class RecordedSequence:
+    """A folder with colour images, depth images and (maybe) a ground truth; frames are decoded when asked for.
+
+    Images that are not paired already are paired as TUM's ``associate.py`` pairs them. Files are looked for and the
+    first pair is decoded on opening, so that most damage shows at once.
+
+    Args:
+        folder: The sequence's folder.
+        contents: What its reader found in it.
+        description: Camera, id, licence and so on.
+        max_time_difference_s: Colour and depth further apart are not paired (strictly less is).
+        any_depth_size: True if the caller resizes, so that depth images may differ in size from colour images.
+
+    Attributes:
+        folder: The sequence's folder.
+        dropped: What was not used, and why.
+
+    Raises:
+        SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        contents: Contents,
+        description: Description,
+        *,
+        max_time_difference_s: float = 0.02,
+        any_depth_size: bool = False,
+    ) -> None:
+        self.folder = folder
+        self._description = description
+        self._any_depth_size = any_depth_size
+        self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
+        colour, depth = contents.colour, contents.depth
+        for file in (*colour.files, *depth.files):
+            inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+        if contents.paired:
+            index = np.arange(len(colour)), np.arange(len(colour))
+            sizes = _file_sizes(folder, colour.files, "colour"), _file_sizes(folder, depth.files, "depth")
+            absent = 0
+        else:
+            listed = len(colour) + len(depth)
+            (colour, sizes_c), (depth, sizes_d) = _existing(folder, colour, "colour"), _existing(folder, depth, "depth")
+            sizes = sizes_c, sizes_d
+            absent = listed - len(colour) - len(depth)
+            index = associate(colour.stamps, depth.stamps, max_time_difference_s)
+        if not len(index[0]):
+            gap = float(nearest_gap(colour.stamps, depth.stamps).min())
+            raise SequenceError(
+                f"none of the {len(colour)} colour images of {folder} has a depth image within "
+                f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
+                "do both lists use the same clock?",
+            )
+        self._timestamps = colour.stamps[index[0]]
+        self._timestamps.flags.writeable = False
+        self._colour = [colour.files[i] for i in index[0]]
+        self._depth = [depth.files[i] for i in index[1]]
+        self._sizes = [sizes[0][i] for i in index[0]] + [sizes[1][i] for i in index[1]]
+        self._ground_truth = _turned(contents.truth, description.R_body_cam)
+        self.dropped = _count(
+            colour,
+            depth,
+            index,
+            absent,
+            max_time_difference_s,
+            self._timestamps,
+            self._ground_truth,
+            contents.truth_dropped,
+        )
+        self[0]
+
+    @property
+    def id(self) -> str:
+        """For example ``tum/fr3/walking_xyz``."""
+        return self._description.id
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the colour images."""
+        return self._description.camera
+
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        """Stamps of the colour images in seconds ``[N]``, strictly increasing."""
+        return self._timestamps
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Camera-to-world poses in the frame of the motion capture, at their own stamps; None if there are none."""
+        return self._ground_truth
+
+    @property
+    def masks(self) -> MaskSource | None:
+        """None: recorded sequences come without exact masks."""
+        return None
+
+    @property
+    def fps(self) -> float:
+        """Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame)."""
+        if self._description.fps is not None:
+            return self._description.fps
+        return float(1 / np.median(np.diff(self._timestamps))) if len(self) > 1 else 30.0
+
+    @property
+    def license(self) -> str:
+        """Licence of the data."""
+        return self._description.license
+
+    @property
+    def citation(self) -> str:
+        """What to cite."""
+        return self._description.citation
+
+    @property
+    def tags(self) -> frozenset[str]:
+        """For example ``high-dynamic``."""
+        return self._description.tags
+
+    @property
+    def split(self) -> str:
+        """``tune``, ``held-out`` or empty."""
+        return self._description.split
+
+    def digest(self) -> str:
+        """Digest of the camera, the paired files' stamps, names and sizes, and the ground truth."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
+        truth = self._ground_truth
+        poses = None if truth is None else [truth.timestamps.tolist(), truth.T_world_cam.tolist()]
+        files = [self._timestamps.tolist(), self._colour, self._depth, self._sizes]
+        special = [value for value in (self._missing_depth, self._furthest_m) if value is not None]
+        return digest([repr(self.camera), files, poses, *special])
+
+    def __len__(self) -> int:
+        return len(self._colour)
+
+    def __getitem__(self, index: int) -> Frame:
+        from .images import read_colour, read_depth
+
+        index = range(len(self))[index]
+        size = (self.camera.width, self.camera.height)
+        expected = f"{size[0]}x{size[1]}"
+        rgb = read_colour(
+            self.folder / self._colour[index], size=size, mismatch=f"but the camera of {self.id} is {expected}"
+        )
+        depth = read_depth(
+            self.folder / self._depth[index],
+            self.camera.depth_factor,
+            size=None if self._any_depth_size else size,
+            mismatch=f"but its colour image is {expected}",
+            missing=self._missing_depth,
+            furthest_m=self._furthest_m,
+        )
+        return Frame(index, float(self._timestamps[index]), rgb, depth)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
+
+    def verify(self, indices: Iterable[int] | None = None) -> list[str]:
+        """Decode frames and say what is wrong with them.
+
+        Args:
+            indices: Which frames; all by default.
+
+        Returns:
+            One line a damaged frame; empty if all are sound.
+        """
+        faults = []
+        for index in range(len(self)) if indices is None else indices:
+            try:
+                self[index]
+            except SequenceError as error:
+                faults.append(f"frame {index}: {error}")
+        return faults
+
+
+def _existing(folder: Path, images: ImageList, kind: str) -> tuple[ImageList, list[int]]:
+    """The images whose files are there, and their sizes; a few may be missing, as in some published sequences."""
+    sizes = [_file_size(folder / file) for file in images.files]
+    missing = [file for file, size in zip(images.files, sizes, strict=True) if size is None]
+    if len(missing) > MISSING_TOLERATED * len(images):
+        _refuse(folder, missing, len(images), kind, "missing")
+    there = [i for i, size in enumerate(sizes) if size is not None]
+    kept = replace(images, stamps=images.stamps[there], files=tuple(images.files[i] for i in there))
+    return kept, _file_sizes(folder, kept.files, kind)
+
+
+def _file_sizes(folder: Path, files: tuple[str, ...], kind: str) -> list[int]:
+    sizes = [_file_size(folder / file) for file in files]
+    missing = [file for file, size in zip(files, sizes, strict=True) if size is None]
+    if missing:
+        _refuse(folder, missing, len(files), kind, "missing")
+    empty = [file for file, size in zip(files, sizes, strict=True) if size == 0]
+    if empty:
+        _refuse(folder, empty, len(files), kind, "empty (0 bytes)")
+    return [size for size in sizes if size is not None]
+
+
+def _file_size(path: Path) -> int | None:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
+
+
+def _refuse(folder: Path, files: list[str], listed: int, kind: str, state: str) -> NoReturn:
+    raise SequenceError(
+        f"{len(files)} of {listed} {kind} images of {folder} are {state}, the first is {files[0]}",
+        "fetch the sequence again, or remove their lines from the list",
+    )
+
+
+def _turned(truth: Trajectory | None, R_body_cam: tuple[tuple[float, float, float], ...] | None) -> Trajectory | None:
+    """The camera's orientations, of a truth that holds those of the body that carries it."""
+    if truth is None or R_body_cam is None:
+        return truth
+    return Trajectory(truth.timestamps, in_camera_axes(truth.T_world_cam, R_body_cam))
+
+
+def _count(
+    colour: ImageList,
+    depth: ImageList,
+    index: tuple[NDArray[np.intp], NDArray[np.intp]],
+    absent: int,
+    max_time_difference_s: float,
+    stamps: NDArray[np.float64],
+    truth: Trajectory | None,
+    ground_truth_dropped: str,
+) -> Dropped:
+    without, hole = 0, 0.0
+    if truth is not None:
+        without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
+        inside = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+        hole = float(np.diff(np.concatenate([stamps[:1], inside, stamps[-1:]])).max(initial=0.0))
+    return Dropped(
+        colour_listed=len(colour),
+        depth_listed=len(depth),
+        pairs=len(stamps),
+        colour_unpaired=len(colour) - len(index[0]),
+        depth_unpaired=len(depth) - len(index[1]),
+        bad_stamps=colour.bad_stamps + depth.bad_stamps,
+        duplicate_stamps=colour.duplicate_stamps + depth.duplicate_stamps,
+        unsorted=colour.unsorted + depth.unsorted,
+        absent=absent,
+        unnamed=colour.unnamed + depth.unnamed,
+        max_time_difference_s=max_time_difference_s,
+        ground_truth_poses=0 if truth is None else len(truth),
+        ground_truth_dropped=ground_truth_dropped,
+        frames_without_ground_truth=without,
+        largest_hole_s=hole,
+    )

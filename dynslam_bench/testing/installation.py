@@ -1,0 +1,111 @@
+"""What is installed here and what is missing: packages, extras, weights, sequences, folders, plug-ins."""
+
+from __future__ import annotations
+
+import platform
+import re
+from dataclasses import dataclass
+from importlib import metadata
+
+from dynslam_bench import __version__
+from dynslam_bench.core.folders import find_data_root, is_writable, stage_cache_folder, weights_folder
+from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
+from dynslam_bench.sequences.listing import summaries
+
+from .doctor import diagnose
+
+DISTRIBUTION = "dynslam-bench"
+FOR_DEVELOPERS = ("test", "lint")
+"""Extras that a user does not miss."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        part: ``program``, ``package``, ``extra``, ``weights``, ``sequences``, ``folder`` or ``plug-in``.
+        name: Which.
+        state: What was found.
+        missing: Whether something is not there; what works without it is not wrong.
+        hint: How to get what is missing.
+    """
+
+    part: str
+    name: str
+    state: str
+    missing: bool = False
+    hint: str = ""
+
+
+def examine() -> list[Finding]:
+    """Everything that decides what can be run on this machine; nothing is downloaded or loaded for it."""
+    system = f"{platform.system()} {platform.machine()}"
+    found = [Finding("program", DISTRIBUTION, f"{__version__}, Python {platform.python_version()}, {system}")]
+    found += _packages()
+    found += _weights()
+    here = [each for each in summaries() if each.here and not each.id.startswith("synthetic/")]
+    hint = "" if here else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
+    found.append(Finding("sequences", "recorded", f"{len(here)} in {find_data_root()}", not here, hint))
+    for name, folder in (("stage cache", stage_cache_folder()), ("weights", weights_folder())):
+        good = is_writable(folder)
+        state = f"{folder}, writable" if good else f"{folder}, not writable"
+        found.append(Finding("folder", name, state, not good, "" if good else "another one: see core/folders.py"))
+    found += [Finding("plug-in", f"{each.kind}: {each.name}", "missing", True, each.reason) for each in diagnose()]
+    return found
+
+
+def _packages() -> list[Finding]:
+    """The packages that this distribution asks for, those of an extra as one."""
+    try:
+        required = metadata.requires(DISTRIBUTION) or []
+    except metadata.PackageNotFoundError:
+        return [Finding("package", DISTRIBUTION, "not installed", True, "pip install .")]
+    extras: dict[str, list[str]] = {}
+    for requirement in required:
+        name = re.split(r"[\s<>=!~;\[(]", requirement, maxsplit=1)[0]
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
+        if extra is not None or ";" not in requirement:
+            extras.setdefault(extra.group(1) if extra else "", []).append(name)
+    found = [_package("package", name, [name], "pip install --force-reinstall dynslam-bench") for name in extras[""]]
+    found += [
+        _package("extra", extra, names, f"pip install 'dynslam-bench[{extra}]'")
+        for extra, names in sorted(extras.items())
+        if extra and extra not in FOR_DEVELOPERS
+    ]
+    return found
+
+
+def _package(part: str, title: str, names: list[str], hint: str) -> Finding:
+    versions = {}
+    for name in names:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            return Finding(part, title, f"{name} is not installed", True, hint)
+    state = ", ".join(version if name == title else f"{name} {version}" for name, version in versions.items())
+    return Finding(part, title, state)
+
+
+def _weights() -> list[Finding]:
+    embedded, coco = embedded_weights(), cached_checkpoint(COCO)
+    where = f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
+    return [
+        Finding(
+            "weights",
+            "embedded",
+            "in the package, for rendered people" if embedded else "missing",
+            not embedded,
+            "" if embedded else "reinstall",
+        ),
+        Finding("weights", "coco", str(coco) if coco else "not here", not coco, "" if coco else where),
+    ]
+
+
+def torch_device() -> Finding:
+    """Which device ``--device auto`` takes; loads torch, which takes a second or two."""
+    import torch
+
+    cuda = torch.cuda.is_available()
+    name = torch.cuda.get_device_name(0) if cuda else f"{torch.get_num_threads()} processor threads"
+    return Finding("device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}")

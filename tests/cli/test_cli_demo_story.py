@@ -1,0 +1,46 @@
+"""The demonstration's closing sentences follow its numbers, whatever they are."""
+
+from __future__ import annotations
+
+import pytest
+
+from dynslam_bench.cli.demo_story import estimate, tell
+from dynslam_bench.reports.model.row import RunRow
+
+
+def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz@100?frames=150") -> RunRow:
+    return RunRow(
+        run_id=f"{tracker}{sequence}", kind="run here", tracker=tracker, label=tracker, sequence=sequence,
+        protocol_id="p", protocol_digest="d", held_ate_m=ate_m,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("culled_m", "verdict"),
+    [
+        (0.004, "Culling makes the error 5.0 times smaller."),
+        (0.018, "Culling changes nothing that one run could show."),
+        (0.06, "Culling makes the error 3.0 times larger."),
+    ],
+)
+def test_the_verdict_is_that_of_the_numbers(culled_m: float, verdict: str) -> None:
+    first, *_ = tell([row("orb-slam2", 0.02), row("mask-rcnn", culled_m), row("never-move", 0.1)], [])
+    assert first == (
+        f"Where people walk (walking_xyz@100): 20.0 mm without culling (orb-slam2), {1e3 * culled_m:.1f} mm with "
+        f"masks of people (mask-rcnn). {verdict}"
+    )
+
+
+def test_every_sequence_has_its_sentence_and_what_did_not_run_has_none() -> None:
+    sitting = row("orb-slam2", 0.003, "synthetic/sitting_xyz@104?frames=150")
+    lines = tell([sitting, row("orb-slam2", 0.02), row("mask-rcnn", 0.004)], [])
+    assert [line.split(":")[0] for line in lines[:2]] == [
+        "Where people walk (walking_xyz@100)", "Where people sit (sitting_xyz@104)"
+    ]  # fmt: skip
+    assert lines[1].endswith("3.0 mm without culling (orb-slam2).") and len(lines) == 3, "no costs without records"
+    assert "proves nothing" in lines[-1]
+
+
+def test_the_estimate_grows_with_what_is_asked_for() -> None:
+    assert estimate(150, 37, 6, 2).startswith("about 2 minutes on 2 quiet cores")
+    assert estimate(600, 150, 30, 1).startswith("about 21 minutes on 1 quiet core,")

@@ -1,0 +1,90 @@
+"""Readers of recorded sequences, one folder layout each: one of its files is damaged, the others are sound."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.readers import (
+    arrays,
+    bodies,
+    eth3d,
+    euroc,
+    icl_nuim,
+    nanoseconds,
+    openloris,
+    seven_scenes,
+    tartanair_shibuya,
+    vslam_lab,
+    yaml_numbers,
+)
+from dynslam_bench.sequences.readers.layouts import layout_of
+from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
+
+from .target import Target, at
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sequences"))
+from published_folders import WRITERS, random_poses
+
+SIZE = (16, 12)
+
+
+@cache
+def _files(name: str) -> dict[str, bytes]:
+    """The files of a small folder of a layout."""
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made) / "s"
+        WRITERS[name](folder, random_poses(0), size=SIZE)
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
+    """A target that damages one of some files; the first byte of an input says which."""
+
+    def read(data: bytes | None, folder: Path) -> None:
+        which = damaged[(data[0] if data else 0) % len(damaged)]
+        for file, content in _files(name).items():
+            at(folder, file, content)
+        at(folder, which, None if data is None else data[1:])
+        contents = layout_of(name).read(folder)
+        camera = Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0)
+        sequence = RecordedSequence(folder, contents, Description("fuzz", camera), any_depth_size=True)
+        for index in range(min(len(sequence), 3)):
+            depth = sequence[index].depth
+            assert np.isfinite(depth).all() and (depth >= 0).all()
+
+    def seeds() -> list[bytes]:
+        return [bytes([at]) + _files(name)[file] for at, file in enumerate(damaged)]
+
+    return Target(f"layout {name}", read, seeds, COVERS[name])
+
+
+COVERS = {
+    "eth3d": (eth3d.read,),
+    "icl-nuim": (icl_nuim.read,),
+    "7-scenes": (seven_scenes.read, seven_scenes.read_pose),
+    "tartanair-shibuya": (tartanair_shibuya.read, arrays.read_metres),
+    "openloris": (openloris.read, openloris.T_base_cam, yaml_numbers.read_yaml, yaml_numbers.numbers),
+    "vslam-lab": (vslam_lab, nanoseconds.read_rows, nanoseconds.column, nanoseconds.seconds),
+    "euroc": (euroc, bodies.camera_on_body, bodies.camera_truth, nanoseconds.floats),
+}
+DAMAGED = {
+    "eth3d": ("associated.txt", "calibration.txt", "groundtruth.txt"),
+    "icl-nuim": ("livingRoom0.gt.freiburg", "rgb/1.png"),
+    "7-scenes": ("frame-000001.pose.txt", "frame-000001.depth.png"),
+    "tartanair-shibuya": ("times.txt", "gt_pose.txt", "depth_0/000001.npy"),
+    "openloris": ("sensors.yaml", "trans_matrix.yaml", "color.txt", "groundtruth.txt"),
+    "vslam-lab": ("rgb.csv", "calibration.yaml", "groundtruth.csv"),
+    "euroc": (
+        "mav0/cam0/sensor.yaml",
+        "mav0/cam0/data.csv",
+        "mav0/depth0/data.csv",
+        "mav0/state_groundtruth_estimate0/data.csv",
+    ),
+}
+TARGETS = [_attacked(name, files) for name, files in DAMAGED.items()]

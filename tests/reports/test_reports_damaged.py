@@ -1,0 +1,96 @@
+"""Damaged files of a store, and failures among repeats: the report is made, and says what it left out."""
+
+import json
+
+import pytest
+from reports_fake_store import add_run
+from reports_rows import PROTOCOL, crashed, row, rows_of
+from test_reports_browser import add_frames
+
+from dynslam_bench.reports import build_report
+from dynslam_bench.reports.figures.leaderboard import mask_figure, repeat_figure
+from dynslam_bench.reports.figures.style import log_axis
+from dynslam_bench.reports.html.run_data import exact_share
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.reports.tables.runs import repeatability
+from dynslam_bench.runs.storage.store import RunStore
+
+HEAD = b"index,timestamp,state,frame_error_trans_m,dynamic_share\n"
+DAMAGE = {
+    "no text": b"\xff\xfe\x00\x01",
+    "words": HEAD + b"0,1000.0,ok,much,0.1\n",
+    "no stamp": HEAD + b"0,,ok,0.1,0.1\n",
+    "no index": HEAD + b",1000.0,ok,0.1,0.1\n",
+    "huge index": HEAD + b"9" * 40 + b",1000.0,ok,0.1,0.1\n",
+    "another heading": b"a,b\n1,2\n",
+    "heading alone": HEAD,
+    "too many cells": HEAD + b"0,1000.0,ok,0.1,0.1,7,8,9\n",
+    "null bytes": b"\x00" * 64,
+}
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = RunStore(tmp_path / "results")
+    for name, error in (("a", 0.01), ("b", 0.02)):
+        for seed in (0, 1):
+            add_frames(store.folder(add_run(store, name, "s/a", seed, error=error, n=40)), 40)
+    return store
+
+
+def page_of(paths, run_id):
+    text = (paths.html.parent / "data" / f"run-{run_id}.js").read_text()
+    return json.loads(text.partition(",")[2].removesuffix(");\n"))
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_table_of_frames_costs_only_its_own_figures(store, tmp_path, damage):
+    hurt, other = store.ids()[:2]
+    path = store.folder(hurt) / "frames.csv"
+    path.write_bytes(DAMAGE[damage])
+    assert len(exact_share(path, 0)) <= 1 and len(exact_share(store.folder(other) / "frames.csv", 0)) == 40
+    paths = build_report(store, tmp_path / "report", picture_seconds=0)
+    assert any("frames.csv" in note for note in page_of(paths, hurt)["notes"])
+    assert page_of(paths, hurt)["frames"] == {} and page_of(paths, other)["frames"]["count"] == 40
+
+
+def test_what_is_left_out_is_named(store, tmp_path):
+    for name, text in (("d" * 16, "{"), ("e" * 16, '{"schema_version": 99, "new": 1}')):
+        (store.runs / name).mkdir()
+        (store.runs / name / "run.json").write_text(text)
+    page = build_report(store, tmp_path / "report", picture_seconds=0).html.read_text()
+    assert "2 folders without a valid record" in page
+    assert all(f"runs/{name}" in page for name in ("d" * 16, "e" * 16))
+
+
+def test_a_tracker_that_always_crashes_is_not_called_repeatable():
+    rows = [row("good", s, 0.1 + 0.01 * seed, seed=seed) for s in "st" for seed in (0, 1)]
+    rows += [crashed("c", s, seed=seed) for s in "st" for seed in (0, 1)]
+    rows += [row("half", "s", 0.2), row("half", "s", 0.3, seed=1), row("half", "t", 0.2), crashed("half", "t", seed=1)]
+    board = make_board(rows)
+    spread = repeatability(board)
+    assert {cells[0].text: cells[1].text for cells in spread.rows} == {"GOOD": "2", "HALF": "1"}
+    assert [trace["name"] for trace in repeat_figure(board)["data"]] == ["GOOD", "HALF"]
+
+
+def test_figures_show_millimetres_and_enough_ticks():
+    figure = mask_figure(make_board([row("a", "s", 0.025, mask_iou=0.7), row("b", "s", 0.05, mask_iou=0.8)]))
+    assert figure["layout"]["yaxis"]["title"]["text"] == "ATE (mm)"
+    assert sorted(trace["y"][0] for trace in figure["data"]) == [25, 50]
+    for low, high in ((1, 1.67), (1, 1.05), (12, 13), (1, 1), (0.3, 1), (0.01, 5)):
+        ticks = log_axis("x", [low, high])["tickvals"]
+        assert len(ticks) >= 3 and all(low * 0.7 < tick < high * 1.4 for tick in ticks), (low, high, ticks)
+
+
+def test_an_old_import_goes_to_no_other_camera_than_the_runs_of_its_frames(tmp_path):
+    store = RunStore(tmp_path / "r")
+    camera = {"width": 640, "height": 480, "fx": 300.0, "fy": 300.0}
+    add_run(store, "a", "s/a")
+    add_run(store, "a", "s/a", camera=camera)
+    add_run(store, "elsewhere", "s/a", kind="imported")
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    (place,) = board.cells[next(key for key in board.trackers if key.startswith("elsewhere"))]
+    assert "camera" not in place and "s/a" in place
+    paths = build_report(store, tmp_path / "report", picture_seconds=0)
+    assert {each["tracker"] for each in rows_of(paths.csv["runs"])} == {"a", "elsewhere"}

@@ -1,0 +1,79 @@
+"""Masks that were recorded come back as they were found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.cli.app import start
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.masks.recording import LabelNumbers, record_masks
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.catalogue import open_sequence
+
+ORACLE = SegmentationSettings(source="oracle")
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return open_sequence("synthetic/walking_xyz@0?frames=60", frames=(0, 3))
+
+
+def test_recorded_masks_are_the_segmenters(sequence, tmp_path: Path) -> None:
+    assert record_masks(sequence, tmp_path / "masks", ORACLE) == 3
+    assert record_masks(sequence, tmp_path / "masks", ORACLE) == 0, "what is there is kept"
+    recorded = RecordedSegmenter(tmp_path / "masks")
+    assert recorded.missing(sequence.timestamps) == []
+    people = 0
+    for index in range(len(sequence)):
+        found, exact = recorded.segment(sequence[index]), sequence.masks[index]
+        wanted = [
+            label for label, name in exact.class_names.items() if name == "person" and (exact.instances == label).any()
+        ]
+        assert found.class_names.count("person") == len(wanted)
+        np.testing.assert_array_equal(found.of_classes(["person"]).union(), np.isin(exact.instances, wanted))
+        people += len(wanted)
+    assert people > 0
+
+
+def test_a_folder_of_other_masks_is_refused(sequence, tmp_path: Path) -> None:
+    record_masks(sequence, tmp_path, ORACLE)
+    with pytest.raises(SegmentationError, match=r"holds other masks: confidence is '0\.3' there and '0\.5' now"):
+        record_masks(sequence, tmp_path, ORACLE.model_copy(update={"confidence": 0.5}))
+    other = tmp_path / "other"
+    other.mkdir()
+    cv2.imwrite(str(other / "000000.png"), np.zeros((4, 4), np.uint8))
+    with pytest.raises(SegmentationError, match="holds something else"):
+        record_masks(sequence, other, ORACLE)
+    with pytest.raises(SegmentationError, match="source=none has no masks to record"):
+        record_masks(sequence, tmp_path / "none", SegmentationSettings(source="none"))
+
+
+def test_numbers_stand_for_classes_in_every_frame(tmp_path: Path) -> None:
+    def objects(*names: str) -> Instances:
+        masks = np.zeros((len(names), 2, 8), bool)
+        for place in range(len(names)):
+            masks[place, :, place : place + 2] = True
+        scores = np.linspace(0.9, 0.5, len(names)).astype(np.float32)
+        return Instances(masks, np.zeros((len(names), 4), np.float32), names, scores)
+
+    path = tmp_path / "classes.json"
+    first = LabelNumbers(path).label_image(objects("person", "chair", "person"))
+    again = LabelNumbers(path).label_image(objects("chair", "person"))
+    table = {1: "person", 2: "chair", 3: "person"}
+    assert [table[int(v)] for v in first[0, :4]] == ["person", "person", "chair", "person"], "the surest is on top"
+    assert [table[int(v)] for v in again[0, :3]] == ["chair", "chair", "person"]
+    assert len(np.unique(first)) == 4
+
+
+def test_the_command_says_how_to_use_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        start(["segmenter", "record", "synthetic/walking_xyz@0?frames=60", str(tmp_path / "m"), "--source", "oracle",
+               "--frames", "0:2"])  # fmt: skip
+    assert ended.value.code == 0
+    assert "2 of 2 frames segmented now; use them with --set segmentation.source=recorded:" in capsys.readouterr().out
