@@ -104,15 +104,18 @@ def build_report(
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")
         draft = _drafted(board, protocol, loaded, explored, again, crew)
-    data = ReportData(
+    on_progress(0, None, "writing")
+    return _write(draft, board, output, _data(board, protocol, title))
+
+
+def _data(board: Board, protocol: Protocol, title: str) -> ReportData:
+    return ReportData(
         title=title,
         protocol=protocol.describe(),
         reference=board.reference_name,
         version=dynslam_bench.__version__,
         rows=board.rows,
     )
-    on_progress(0, None, "writing")
-    return _write(draft, board, output, data)
 
 
 def _drafted(
