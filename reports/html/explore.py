@@ -15,7 +15,7 @@ from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
 from ..model.common import representatives
-from ..model.crew import JOB, Crew
+from ..model.crew import JOB, Crew, Heard
 from ..model.rows import Loaded, LoadedRun
 from .explore_data import FrameSummary, FrameSums, explore_content, summarise
 from .page import render_run_page
@@ -124,11 +124,7 @@ def write_explore(
             for piece, share in zip(pieces, known, strict=True)
         ]
     else:
-        jobs = [
-            {"runs": [run.as_job() for run in piece], "shown": [*shown], "share": share}
-            for piece, share in zip(pieces, known, strict=True)
-        ]
-        written = [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
+        written = _written(pieces, shown, known, crew, told)
     sums, total = FrameSums(), Pages()
     for piece, pages in zip(pieces, written, strict=True):
         for run, frames in zip(piece, pages.frames, strict=True):
@@ -138,6 +134,21 @@ def write_explore(
     write_side(output, "explore", explore_content(board, protocol, sums, total.pictured))
     write_atomic(output / RUN_PAGE, render_run_page(title))
     return Explored(len(runs), len(total.pictured), total.note())
+
+
+def _written(
+    pieces: Sequence[Sequence[LoadedRun]],
+    shown: Collection[str],
+    shares: Sequence[Mapping[int, float]],
+    crew: Crew,
+    told: Heard,
+) -> list[Pages]:
+    """What the helpers write."""
+    jobs = [
+        {"runs": [run.as_job() for run in piece], "shown": [*shown], "share": share}
+        for piece, share in zip(pieces, shares, strict=True)
+    ]
+    return [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
 
 
 def _pictured(board: Board, loaded: Loaded) -> set[str]:
