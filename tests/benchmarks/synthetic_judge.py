@@ -1,12 +1,13 @@
-"""Judges the rendered twins by an outside system: the real ORB-SLAM3, repeated, with controls.
+"""Judges rendered sequences by an outside system: the real ORB-SLAM3, repeated, with controls.
 
-Usage: python tests/benchmarks/synthetic_judge.py [ID ...] [--controls moving none frozen masked] [--runs 5]
+Usage: python tests/benchmarks/synthetic_judge.py [ID ...] [--controls moving none frozen masked persons] [--runs 5]
            [--cache DIR] [--out FILE.jsonl] [--table]
 
 Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
 step. `--table` only prints the Markdown table of the file. Controls: `none` renders the room without people, `frozen`
 with people and chairs frozen at their first pose, `masked` takes the moving sequence, removes the depth of people (and
-of chairs while they move) and fills their pixels smoothly from outside, so that no feature is left on them.
+of everything while it moves) and fills their pixels smoothly from outside, so that no feature is left on them;
+`persons` does so with people alone, which is what a class label gives.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ import numpy as np
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, TWIN_IDS, RenderSettings, open_synthetic
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
 from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
 
 VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
-CONTROLS = ("moving", "none", "frozen", "masked")
+CONTROLS = ("moving", "none", "frozen", "masked", "persons")
 
 
 def rmse(estimate: Trajectory, truth: Trajectory) -> float:
@@ -75,10 +76,10 @@ def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str,
     poses: list[list[np.ndarray]] = [[] for _ in runs]
     for index in range(len(sequence)):
         frame = sequence[index]
-        if control == "masked":
+        if control in ("masked", "persons"):
             masks = sequence.masks[index]
             names = masks.class_names
-            ids = [k for k in names if names[k] == "person" or k in masks.moving]
+            ids = [k for k in names if names[k] == "person" or (control == "masked" and k in masks.moving)]
             frame = without(frame, np.isin(masks.instances, ids))
         for k, tracker in enumerate(trackers):
             result = tracker.track(frame)
@@ -107,8 +108,11 @@ def table(rows: list[dict]) -> str:
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[tuple[str, str], list[dict]] = {}
-    rank = [(id, control) for id in SYNTHETIC_IDS for control in CONTROLS]
-    for row in sorted(rows, key=lambda row: rank.index((row["id"], row["control"]))):
+
+    def rank(row: dict) -> tuple[int, str, int]:
+        return SYNTHETIC_IDS.index(row["id"].partition("?")[0]), row["id"], CONTROLS.index(row["control"])
+
+    for row in sorted(rows, key=rank):
         groups.setdefault((row["id"], row["control"]), []).append(row)
     for (id, control), members in groups.items():
         final = [m["final"] for m in members]
@@ -122,8 +126,8 @@ def table(rows: list[dict]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ids", nargs="*", default=list(SYNTHETIC_IDS))
-    parser.add_argument("--controls", nargs="+", default=list(CONTROLS), choices=CONTROLS)
+    parser.add_argument("ids", nargs="*", default=list(TWIN_IDS))
+    parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_judge")
     parser.add_argument("--out", type=Path, default=Path("synthetic_judge.jsonl"))

@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic
+from dynslam_bench.sequences.synthetic import TWIN_IDS, open_synthetic
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 EXCERPTS = {
@@ -79,9 +79,7 @@ def row(name: str, frames: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, fl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "ids", nargs="*", default=[*SYNTHETIC_IDS, "synthetic/walking_xyz@1", "synthetic/walking_xyz@100"]
-    )
+    parser.add_argument("ids", nargs="*", default=[*TWIN_IDS, "synthetic/walking_xyz@1", "synthetic/walking_xyz@100"])
     parser.add_argument("--every", type=int, default=15)
     arguments = parser.parse_args()
     print("| sequence | FAST corners | depth valid | contrast | flow px, median | 95 % | person area | moving area |")

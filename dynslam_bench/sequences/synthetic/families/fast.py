@@ -17,14 +17,14 @@ from .family import Family
 from .loop import build_loop
 from .twins import build_twin, window_of
 
-OPTICS = Optics(readout_s=0.026, auto_exposure=0.7, color={"shutter": 0.5})
+OPTICS = Optics(readout_s=0.026, auto_exposure=0.7, color={"shutter": 0.3})
 """26 ms from the first row to the last, as in the first Kinect."""
 
 SWINGS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    "desk": ((0.24, 0.16, 0.2), (0.16, 0.26, 0.14)),
-    "rpy": ((0.03, 0.03, 0.03), (0.24, 0.42, 0.3)),
-    "spin": ((0.2, 0.1, 0.2), (0.1, 0.25, 0.1)),
-    "walking": ((0.22, 0.14, 0.14), (0.14, 0.24, 0.14)),
+    "desk": ((0.17, 0.12, 0.14), (0.26, 0.46, 0.26)),
+    "rpy": ((0.03, 0.03, 0.03), (0.3, 0.52, 0.38)),
+    "spin": ((0.14, 0.08, 0.14), (0.12, 0.25, 0.12)),
+    "walking": ((0.15, 0.1, 0.1), (0.24, 0.44, 0.26)),
 }
 """Amplitudes of each variant: right, down, forward in metres; pitch, yaw, roll in radians."""
 
@@ -54,7 +54,7 @@ def fast_camera(variant: str, instance: int, times: Array) -> Array:
             values[:, axis] += 0.4 * amplitude * np.sin(2 * math.pi * (second * t + rng.random()))
     yaw, place = np.zeros((len(t), 3)), np.array([0.0, 0.0, EYE_HEIGHT_M])
     if variant == "spin":
-        yaw[:, 2] = pick(rng, instance, 1.0, 1.3) * t
+        yaw[:, 2] = pick(rng, instance, 1.3, 1.6) * t
         place = np.array([2.7, 0.2, EYE_HEIGHT_M])
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     base = rotations(yaw) @ camera_axes(TILT_RAD)

@@ -64,8 +64,8 @@ def _balloon(j: Draw, instance: int, plan: Plan) -> Cast:
 
 def _box_obstructing(j: Draw, instance: int, plan: Plan) -> Cast:
     """A large carton is moved close across the view, held before it, and moved away again."""
-    y, z, yaw = j(0.95, 1.05), j(1.08, 1.16), j(10, 25)
-    box = printed_box(1, (j(0.36, 0.42), j(0.2, 0.26), j(0.28, 0.34)))
+    y, z, yaw = j(1.15, 1.25), j(1.06, 1.14), j(10, 25)
+    box = printed_box(1, (j(0.34, 0.4), j(0.18, 0.24), j(0.28, 0.34)))
     keys = [At(0, -1.7, y, z), At(2.0, -1.7, y, z), At(4.0, -0.25, y, z, yaw), At(7.0, 0.25, y, z + 0.05, -yaw)]
     keys += [At(9.0, 1.7, y, z), At(11.5, 1.7, y, z), At(14.0, 0.1, y - 0.08, z, yaw), At(16.5, -0.2, y, z, 0.0)]
     keys += [At(18.5, -1.7, y, z), At(20.0, -1.7, y, z)]

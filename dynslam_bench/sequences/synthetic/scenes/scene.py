@@ -110,7 +110,10 @@ class Scene:
 
     def snapshot(self, time: float) -> Snapshot:
         """The scene as the camera sees it at a time (seconds from the start)."""
-        pose = self.poses(np.array([time]))[0]
+        return self.snapshot_from(self.poses(np.array([time]))[0], time)
+
+    def snapshot_from(self, pose: Array, time: float) -> Snapshot:
+        """The scene at a time as a camera at another pose (camera to world, 4x4) would see it."""
         rotation, origin = self.place(time)
         inverse = np.swapaxes(rotation, 1, 2) / self.scale[:, :, None]
         local = np.empty((len(origin), 3, 4))
