@@ -92,8 +92,7 @@ def evaluate(
         DynslamError: Tracker, settings or a block are unknown or unfit; nothing ran.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
-    held, blocks = held_protocol(protocol), list(blocks)
-    stop = [False]
+    held, blocks, stop = held_protocol(protocol), list(blocks), [False]
 
     def ended() -> bool:
         return stop[0] or (cancelled is not None and cancelled())
