@@ -19,6 +19,7 @@ from .html.draft import Draft
 from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
+from .html.run_data import MOST_FRAMES
 from .model.board import Board, On, make_board
 from .model.crew import Crew, helpers_for
 from .model.report_data import REPORT_FILE, ReportData
@@ -59,6 +60,7 @@ def build_report(
     on: On = "common",
     rank_seen: bool = False,
     picture_seconds: float = PICTURE_SECONDS,
+    most_frames: int = MOST_FRAMES,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = unheard,
@@ -76,6 +78,7 @@ def build_report(
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
+        most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -88,13 +91,15 @@ def build_report(
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
     count = helpers_for(sum(len(store.ids()) for store in stores))
-    setup = {"protocol": protocol.model_dump_json(), "output": str(output), "picture_seconds": picture_seconds}
+    shown = {"picture_seconds": picture_seconds, "most_frames": most_frames}
+    setup = {"protocol": protocol.model_dump_json(), "output": str(output), **shown}
     with Crew(count, setup) if count else nullcontext() as crew:
         loaded = load_runs(stores, protocol, on_progress, crew)
         board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
         again = command or _command([store.root for store in stores], output, board)
         explored = write_explore(
-            board, loaded, protocol, output, title=title, picture_seconds=picture_seconds, crew=crew,
+            board, loaded, protocol, output, title=title, crew=crew,
+            picture_seconds=picture_seconds, most_frames=most_frames,
             progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")

@@ -12,10 +12,13 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
 
 from .build_report import build_report
+from .html.explore import PICTURE_SECONDS
 from .html.site import render_site
 from .model.rows import OnProgress, unheard
 
 STUDY_PAGE = "index.html"
+FRAMES = 100
+"""Frames of a run that its published page shows: a site of hundreds of runs has to fit into a repository."""
 _KEPT = ("*.html", "*.csv", "*.toml", "csv/*.csv", "data/*")
 """What of a study's folder is published; its runs and its journal are not."""
 
@@ -41,6 +44,8 @@ def publish(
     *,
     study: Path | None = None,
     title: str = "Visual SLAM in dynamic scenes",
+    note: str = "",
+    picture_seconds: float = PICTURE_SECONDS,
     protocol: Protocol | str = "tum-rgbd/v1",
     on_progress: OnProgress = unheard,
 ) -> Site:
@@ -54,6 +59,8 @@ def publish(
         output: The site's folder; what it holds of an earlier site is replaced, other files are left alone.
         study: Folder of a study with its page; None for none.
         title: Heading.
+        note: What a reader should know, shown on the first page.
+        picture_seconds: Time that drawing pictures of frames may take; the frames of an earlier site stay.
         protocol: How to evaluate.
         on_progress: As in `build_report`.
 
@@ -64,12 +71,14 @@ def publish(
     output = output.expanduser().absolute()
     if study is not None and not (study / STUDY_PAGE).is_file():
         raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
-    for part in ("leaderboard", "study"):
+    for part in ("leaderboard/data", "leaderboard/csv", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
-    command = "dynslam-bench report RESULTS"
-    build_report(
-        list(runs), output / "leaderboard", protocol=protocol, title=title, command=command, on_progress=on_progress
-    )
+    report = build_report(
+        list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
+        picture_seconds=picture_seconds, most_frames=FRAMES, on_progress=on_progress,
+    )  # fmt: skip
+    for path in (report.data, report.markdown, report.latex):  # for work with the results, not for looking at them
+        path.unlink()
     pages = [("leaderboard/index.html", "Leaderboard", "Trackers, sequences, errors, speed and failures.")]
     if study is not None:
         for source in sorted({path for pattern in _KEPT for path in study.glob(pattern) if path.is_file()}):
@@ -77,7 +86,7 @@ def publish(
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
         pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
-    write_atomic(output / "index.html", render_site(title, pages))
+    write_atomic(output / "index.html", render_site(title, pages, note))
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)

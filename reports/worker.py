@@ -1,6 +1,6 @@
 """A helper process of a report, see `model.crew`: jobs come as lines of JSON on its input, answers go to its output.
 
-The first line is the setup: the protocol, the report's folder, and the time for pictures.
+The first line is the setup: protocol, the report's folder, time for pictures, and how many frames a run's page shows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Worker:
     """What a helper can do.
 
     Args:
-        setup: ``protocol``, ``output`` and ``picture_seconds``.
+        setup: ``protocol``, ``output``, ``picture_seconds`` and ``most_frames``.
         told: Told of every run.
     """
 
@@ -39,7 +39,12 @@ class Worker:
         self._protocol = Protocol.model_validate_json(setup["protocol"])
         self._output = Path(setup["output"])
         self._book = PictureBook(self._output, setup["picture_seconds"])
+        self._most = setup["most_frames"]
         self._told = told
+
+    def do(self, kind: str, job: Job) -> Any:
+        """One job of a kind."""
+        return {"rows": self.rows, "pages": self.pages, "common": self.common}[kind](job)
 
     def rows(self, job: Job) -> list[Any]:
         """The rows of some runs: ``runs`` holds the store's folder and the run's id of each."""
@@ -55,7 +60,7 @@ class Worker:
         """Write the pages of some runs of one column; see `write_pages`."""
         share = {int(frame): value for frame, value in job["share"].items()}
         runs, shown = _loaded(job), set(job["shown"])
-        return write_pages(runs, shown, share, self._protocol, self._book, lambda: self._told("")).answer()
+        return write_pages(runs, shown, share, self._protocol, self._book, self._most, lambda: self._told("")).answer()
 
     def common(self, job: Job) -> list[Any]:
         """Errors of the runs on one sequence on the frames that all of them have; see `common_of`."""
@@ -82,7 +87,7 @@ def main(source: TextIO, target: TextIO) -> None:
     for line in source:
         asked = json.loads(line)
         try:
-            say(answer=getattr(worker, asked["kind"])(asked["job"]))
+            say(answer=worker.do(asked["kind"], asked["job"]))
         except DynslamError as error:
             say(fault=[str(error.args[0]), error.hint])
 

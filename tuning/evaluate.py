@@ -13,7 +13,7 @@ import numpy as np
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.runs import RunRecord, RunStore, run_many, score
+from dynslam_bench.runs import RunEvent, RunRecord, RunStore, run_many, score
 
 from .blocks import Block
 
@@ -66,6 +66,7 @@ def evaluate(
     cache: bool = False,
     data_root: str | None = None,
     cancelled: Callable[[], bool] | None = None,
+    on_run: Callable[[RunEvent], None] | None = None,
 ) -> dict[Block, Outcome]:
     """Run a configuration on blocks; runs that are stored are taken from there.
 
@@ -80,6 +81,7 @@ def evaluate(
         cache: Whether runs use the stage cache; times are then those of when its entries were made.
         data_root: Folder of the recorded sequences.
         cancelled: Asked many times a second; True ends the runs at once.
+        on_run: Told of every run, also while it goes on; by several threads where `jobs` is more than 1.
 
     Returns:
         The outcome on each block, in their order.
@@ -100,7 +102,7 @@ def evaluate(
         spec = block.run_spec(tracker, settings=dict(settings), threads=threads, cache=cache, data_root=data_root)
         if ended():
             raise CancelledError(str(block))
-        (record,) = run_many([spec], results=store, protocol=held, cancelled=ended)
+        (record,) = run_many([spec], results=store, protocol=held, cancelled=ended, on_event=on_run)
         if record.status == "stopped":
             raise CancelledError(str(block))
         if record.failed:

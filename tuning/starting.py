@@ -15,7 +15,7 @@ from .objectives import ACCURACY, Objective, Outcomes, together
 from .pilot import FEWEST, Pilot, refuse_hopeless, run_pilot
 from .screening import Screening, screen
 from .screening_plan import live, plan
-from .study import OnEvent, StudyEvent, Tuner
+from .study import OnEvent, OnRun, StudyEvent, Tuner
 from .study_file import StudySpec
 
 PILOT_FILE, SCREENING_FILE = "pilot.json", "screening.json"
@@ -24,7 +24,12 @@ SCREENED_BLOCKS = 4
 
 
 def run_study(
-    spec: StudySpec, *, results: str | Path = "results", jobs: int = 1, on_event: OnEvent | None = None
+    spec: StudySpec,
+    *,
+    results: str | Path = "results",
+    jobs: int = 1,
+    on_event: OnEvent | None = None,
+    on_run: OnRun | None = None,
 ) -> Tuner:
     """Run a study to its end, or go on with it; a pilot runs first where the study asks for one.
 
@@ -33,6 +38,7 @@ def run_study(
         results: The results folder; the study's own files lie in ``studies/<name>``.
         jobs: Trials at a time.
         on_event: Told of everything that happens.
+        on_run: Told of every run, those of `finish` among them.
 
     Returns:
         The study, for `finish`.
@@ -41,6 +47,7 @@ def run_study(
         DynslamError: See `Tuner`; or the pilot shows that the study could find nothing.
     """
     tuner = Tuner(spec, results)
+    tuner.on_run = on_run
     begin(tuner, jobs=jobs, on_event=on_event)
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner

@@ -24,7 +24,7 @@ from dynslam_bench.core.harmless import storable
 from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.settings import apply_overrides, flatten
-from dynslam_bench.runs import RunStore
+from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.runs.identity import source_fingerprint
 from dynslam_bench.trackers import TRACKERS
 
@@ -67,6 +67,8 @@ class StudyEvent:
 
 
 OnEvent = Callable[[StudyEvent], None]
+OnRun = Callable[[RunEvent], None]
+"""Told of every run that a study makes, also while it goes on; several threads may tell at a time."""
 
 
 class Tuner:
@@ -78,6 +80,9 @@ class Tuner:
         reading: Only look at a stored study: one of another version of the code opens too, but runs nothing more.
         objectives: In place of those that the study names, in their order.
         sampler: In place of the one that the study names.
+
+    Attributes:
+        on_run: Told of every run that the study makes from now on; None for nobody.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
@@ -118,6 +123,7 @@ class Tuner:
         self._lock = threading.Lock()
         self._interrupted = threading.Event()
         self._reference: dict[Block, Outcome] = {}
+        self.on_run: OnRun | None = None
 
     def run(self, *, jobs: int = 1, on_event: OnEvent | None = None) -> optuna.Study:
         """Run trials until the study has as many finished ones as it asks for.
@@ -178,7 +184,7 @@ class Tuner:
         return evaluate(
             self.spec.tracker, settings, blocks, results=self.store, jobs=jobs, protocol=self.spec.protocol,
             threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
-            data_root=self.spec.data_root, cancelled=self._interrupted.is_set,
+            data_root=self.spec.data_root, cancelled=self._interrupted.is_set, on_run=self.on_run,
         )  # fmt: skip
 
     def evaluate_beside(

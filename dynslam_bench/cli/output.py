@@ -74,14 +74,13 @@ def write_table(
         shrink: Columns that are shortened first to fit a terminal, one after the other; then all others.
         spare: Columns that are left out then if it is still too wide, the first one first; a line below names them.
     """
-    cells = [list(columns), *([_text(value) for value in row] for row in rows)]
+    cells = [[_text(value) for value in row] for row in (columns, *rows)]
     left_out: list[str] = []
     if sys.stdout.isatty():
         cells, left_out = fitted(cells, shrink, spare, _terminal_width())
-    head, *body = aligned(cells).split("\n")
-    sys.stdout.write(f"\033[1m{head}\033[0m\n" if sys.stdout.isatty() else f"{head}\n")
-    for line in body:
-        write(line)
+    head, separator, body = aligned(cells).partition("\n")
+    sys.stdout.write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
+    sys.stdout.write(f"{separator}{body}\n")  # harmless: `_text` has made every cell so
     if left_out:
         write(f"(no room for: {', '.join(left_out)})")
 
@@ -156,10 +155,9 @@ def _terminal_width() -> int:
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Rows of text with their columns under each other."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    line = "  ".join(f"{{:{width}}}" for width in widths)
+    return "\n".join(line.format(*row).rstrip() for row in rows)
 
 
 def write_fields(fields: Mapping[str, object]) -> None:
@@ -210,7 +208,7 @@ class _Lines:
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            complain(f"{self.label}:{self.text}, {time.monotonic() - self.began:.0f} s so far")
+            complain(f"{self.label}{':' * bool(self.text)}{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 
@@ -261,6 +259,8 @@ def drawn_download(name: str) -> Iterator[Report]:
 
 
 def _text(value: object) -> str:
+    if isinstance(value, str) and value.isprintable():  # nearly every cell of a long table
+        return value
     if value is None:
         return ""
     if isinstance(value, bool):

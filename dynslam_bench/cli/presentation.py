@@ -98,6 +98,8 @@ def publish(
         typer.Option(help="Folder of a study with its page, as `tune report` names it."),
     ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
+    remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",
+    picture_seconds: Annotated[float, typer.Option(min=0, help="Time for drawing pictures of frames.")] = 60,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -105,7 +107,10 @@ def publish(
     from dynslam_bench.reports import publish as publish_site
 
     with progress("site") as advance:
-        site = publish_site(results, output, study=study, title=title, protocol=protocol, on_progress=advance)
+        site = publish_site(
+            results, output, study=study, title=title, note=remark, picture_seconds=picture_seconds,
+            protocol=protocol, on_progress=advance,
+        )  # fmt: skip
     if as_json:
         write_json({"index": site.index, "files": site.files, "size_mb": site.size_mb})
     else:

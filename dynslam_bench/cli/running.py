@@ -45,7 +45,7 @@ from .run_rows import seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.core.records import Record
-    from dynslam_bench.runs import RunRecord, RunSpec
+    from dynslam_bench.runs import RunEvent, RunRecord, RunSpec
 
 R = TypeVar("R", bound="Record")
 
@@ -241,6 +241,14 @@ def finish(
         raise typer.Exit(SOME_RUNS_FAILED)
 
 
+def run_words(event: RunEvent) -> str:
+    """What is going on in a run, in words."""
+    words = f"{event.spec.tracker} on {event.spec.sequence}"
+    if event.kind != "progress" or event.partial is None:
+        return words
+    return f"{words}, frame {event.partial['frames_done']} of {event.partial['frames']}"
+
+
 def make_runs(
     specs: Sequence[RunSpec],
     store: Any,
@@ -252,24 +260,21 @@ def make_runs(
     reused: set[str] | None = None,
 ) -> list[RunRecord]:
     """`run_many` with a progress bar; the ids of runs that were stored already are added to `reused`."""
-    from dynslam_bench.runs import RunEvent, run_many
+    from dynslam_bench.runs import run_many
 
     with progress(f"{len(specs)} runs") as advance:
         shares: dict[str, float] = {}
 
         def told(event: RunEvent) -> None:
-            what = f"{event.spec.tracker} on {event.spec.sequence}"
             if event.kind == "progress" and event.partial is not None:
-                done, frames = event.partial["frames_done"], event.partial["frames"]
-                shares[event.run_id] = done / max(frames, 1)
-                what = f"{event.spec.tracker} on {event.spec.sequence}, frame {done} of {frames}"
+                shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)
             elif event.kind in ("finished", "reused"):
                 shares[event.run_id] = 1.0
                 if event.kind == "reused" and reused is not None:
                     reused.add(event.run_id)
                 if event.record is not None:
                     note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
-            advance(sum(shares.values()), event.total, what)
+            advance(sum(shares.values()), event.total, run_words(event))
 
         with_executor: dict[str, Any] = {}
         if scheduler is not None:

@@ -12,7 +12,7 @@ import typer
 
 from . import completion
 from .options import AsJson, Camera, DataRoot
-from .output import VERIFICATION_FAILED, note, progress, write, write_fields, write_json, write_table
+from .output import VERIFICATION_FAILED, complain, note, progress, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.sequences.listing import Summary
@@ -59,12 +59,15 @@ def _write_group(title: str, found: list[Summary]) -> None:
     about.append(f"by hand: {found[0].by_hand}" if found[0].by_hand else "")
     write(f"{title} ({'; '.join(filter(None, about))})")
     write_table(
-        ("sequence", "here", "size", "tags", "split", "ground truth", "license", "verified"),
+        ("sequence", "here", "size", "tags", "split", "ground truth", "checksum", "license", "verified"),
         [
-            (each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.license, each.layout)
+            (
+                *(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum),
+                *(each.license, each.layout),
+            )
             for each in found
         ],
-        spare=("license", "verified", "ground truth", "split"),
+        spare=("license", "verified", "checksum", "ground truth", "split"),
     )
     write("")
 
@@ -100,10 +103,12 @@ def fetch(
 ) -> None:
     """Download public sequences; a call that was cut short goes on where it stopped."""
     from dynslam_bench.core.download import Progress
+    from dynslam_bench.sequences.fetch import RECEIPT, Receipt, status
     from dynslam_bench.sequences.fetch import fetch as fetch_one
     from dynslam_bench.sequences.listing import expand
 
     for name in expand(names):
+        new = status(name, data_root=data_root).folder is None
         with progress(name, unit="bytes") as advance:
 
             def report(state: Progress, advance: Any = advance) -> None:
@@ -113,6 +118,11 @@ def fetch(
                 name, data_root=data_root, progress=report, checksum=checksum, keep_archive=keep_archive, url=url
             )
         write(str(place))
+        if new and not (receipt := Receipt.read(place / RECEIPT)).checked:
+            complain(
+                f"warning: no checksum of {name} was known; that of what came is {receipt.sha256}, "
+                "and the next fetch from there has to bring the same"
+            )
 
 
 @app.command()

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from .options import AsJson, Jobs, Results
-from .output import note, progress, write, write_fields, write_json, write_table
+from .output import Advance, note, progress, write, write_fields, write_json, write_table
+from .running import run_words
 
 if TYPE_CHECKING:
+    from dynslam_bench.runs import RunEvent
     from dynslam_bench.tuning import StudySpec, StudySummary, Tuner
 
 app = typer.Typer(help="Studies: tune a tracker's settings through its environment.", no_args_is_help=True)
@@ -199,24 +201,48 @@ def report(study: Study, results: Results = Path("results"), as_json: AsJson = F
     show_summary(tuner, summary, write_page(tuner, summary), as_json=as_json)
 
 
+class _Told:
+    """Progress of a study: which part of it is under way, and the run in it that told last.
+
+    Args:
+        advance: Shows it.
+        doing: What is under way at first.
+    """
+
+    def __init__(self, advance: Advance, doing: str) -> None:
+        self._advance, self._runs = advance, 0
+        self.at: tuple[float, float | None] = (0, None)
+        self.doing = doing
+
+    def begin(self, doing: str, done: float = 0, total: float | None = None) -> None:
+        """Another part begins."""
+        self.doing, self.at = doing, (done, total)
+        self._advance(*self.at, doing)
+
+    def run(self, event: RunEvent) -> None:
+        """A run has told something."""
+        self._runs += event.kind == "finished"
+        self._advance(*self.at, f"{self.doing}, {self._runs} runs made: {run_words(event)}")
+
+
 def run_trials(spec: StudySpec, results: Path, jobs: int) -> Tuner:
     """`run_study` with a progress bar."""
     from dynslam_bench.tuning import StudyEvent, run_study
 
     with progress(f"study {spec.name}") as advance:
+        shown = _Told(advance, "pilot")
 
         def told(event: StudyEvent) -> None:
-            if event.kind == "pilot":
+            if event.kind in ("pilot", "finished"):
                 note(event.text)
             if event.kind == "finished":
-                note(event.text)
-                advance(event.number + 1, event.total)
+                shown.begin(event.text, event.number + 1, event.total)
             elif event.kind == "reference":
-                advance(0, spec.trials, f"{spec.tracker} as it is by default on {event.text}")
-            else:
-                advance(event.number, event.total, f"{spec.tracker}, {event.text}")
+                shown.begin(f"{spec.tracker} as it is by default", 0, spec.trials)
+            elif event.kind == "started":
+                shown.begin(event.text, event.number, event.total)
 
-        return run_study(spec, results=results, jobs=jobs, on_event=told)
+        return run_study(spec, results=results, jobs=jobs, on_event=told, on_run=shown.run)
 
 
 def conclude(tuner: Tuner, jobs: int = 1) -> StudySummary:
@@ -224,10 +250,12 @@ def conclude(tuner: Tuner, jobs: int = 1) -> StudySummary:
     from dynslam_bench.tuning import finish
 
     with progress(f"checking the best of {tuner.spec.name}") as advance:
+        shown = _Told(advance, "")
+        tuner.on_run = shown.run
 
         def told(text: str) -> None:
             note(text)
-            advance(0, None, text)
+            shown.begin(text)
 
         return finish(tuner, told, jobs=jobs)
 

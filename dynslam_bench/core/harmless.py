@@ -17,7 +17,7 @@ LONGEST_NAME = 255
 
 def printable(text: str) -> str:
     r"""The text with everything that a terminal would act upon shown as an escape, e.g. ``\x1b``; newlines stay."""
-    return _UNSEEN.sub(_escaped, text)
+    return text if text.isprintable() else _UNSEEN.sub(_escaped, text)
 
 
 def storable(value: Any) -> Any:

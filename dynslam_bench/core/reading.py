@@ -19,6 +19,9 @@ RECORD_BYTES = 16 * MEGABYTE
 TABLE_BYTES = 1024 * MEGABYTE
 """Most bytes of a table with a line a frame."""
 
+_MOST_FILES = 1 << 16
+"""Bytes that hold most files whole."""
+
 
 def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError) -> bytes:
     """The content of a file of at most `limit` bytes.
@@ -32,8 +35,10 @@ def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError
         DynslamError: Of the given kind: it cannot be read, or is larger.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(limit + 1)
+        with path.open("rb") as file:  # at first no more room than most files need: asking for `limit` takes as long
+            data = file.read(min(_MOST_FILES, limit + 1))
+            if len(data) == _MOST_FILES:
+                data += file.read(limit + 1 - len(data))
     except (OSError, ValueError) as error:  # ValueError: a name with a null byte
         raise kind(f"cannot read {path}: {_reason(error)}") from error
     if len(data) > limit:

@@ -146,8 +146,7 @@ def evaluate(
     estimate = apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
     estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     association = _associate(estimate, ground_truth, protocol, diagnostics)
-    matched = estimate.T_world_cam[association.estimate]
-    truth = ground_truth.T_world_cam[association.ground_truth]
+    matched, truth = estimate.T_world_cam[association.estimate], ground_truth.T_world_cam[association.ground_truth]
     similarity = _align(matched, truth, protocol, diagnostics)
     aligned = similarity.apply(matched)
     translation, rotation = absolute_errors(aligned, truth)

@@ -6,6 +6,7 @@ stored with its protocol's digest, and tables refuse to mix digests.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -60,7 +61,7 @@ class RPESpec(_Frozen):
         return "random" if self.pairs == "tum-random" else f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
 
     def unit_of(self, part: str) -> str:
-        """Unit of the error as metrics name it: ``m``, ``deg``, ``m_per_s`` or ``deg_per_s``."""
+        """Unit of the error as metrics name it: m, deg, m_per_s or deg_per_s."""
         return f"{'m' if part == 'trans' else 'deg'}{'_per_s' if self.rate else ''}"
 
     def metric(self, part: str) -> str:
@@ -119,14 +120,7 @@ class Protocol(_Frozen):
 
         What came after the first protocols counts where it is used only: digests that are stored stay what they were.
         """
-        fields = self.model_dump(mode="json")
-        for name in ("truth", "every", "most_frames", "only_for"):
-            if fields[name] == type(self).model_fields[name].default:
-                del fields[name]
-        for spec in fields["rpe"]:
-            if not spec["rate"]:
-                del spec["rate"]
-        return digest(fields)
+        return _digest(self)
 
     @property
     def thins(self) -> bool:
@@ -224,6 +218,19 @@ PROTOCOLS: dict[str, Protocol] = {
         ),
     )
 }
+
+
+@lru_cache(maxsize=64)
+def _digest(protocol: Protocol) -> str:
+    """Taken once: lists of a hundred thousand runs ask for it as often."""
+    fields = protocol.model_dump(mode="json")
+    for name in ("truth", "every", "most_frames", "only_for"):
+        if fields[name] == type(protocol).model_fields[name].default:
+            del fields[name]
+    for spec in fields["rpe"]:
+        if not spec["rate"]:
+            del spec["rate"]
+    return digest(fields)
 
 
 def get_protocol(name: str | Protocol) -> Protocol:

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+_SQUARES = 1e100
+"""Numbers up to this, and down to its inverse, have squares and sums of squares that are numbers, too."""
 
 
 def hat(v: Array) -> Array:
@@ -67,9 +69,15 @@ def inverse(pose: Array) -> Array:
 
 
 def from_quaternion(translation: Array, quaternion: Array) -> Array:
-    """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and quaternions ``[..., 4]`` in TUM's order qx qy qz qw."""
+    """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and quaternions ``[..., 4]`` in TUM's order qx qy qz qw.
+
+    Quaternions of any length but 0 are rotations, also of one whose square is no number any more.
+    """
     translation = np.asarray(translation, dtype=np.float64)
     quaternion = np.asarray(quaternion, dtype=np.float64)
+    largest = np.abs(quaternion).max(axis=-1, keepdims=True, initial=0.0)
+    if ((largest > _SQUARES) | ((largest > 0) & (largest < 1 / _SQUARES))).any():
+        quaternion = quaternion / np.where(largest > 0, largest, 1.0)
     pose = np.zeros((*translation.shape[:-1], 4, 4))
     rotation = _rotations().from_quat(quaternion.reshape(-1, 4)).as_matrix()
     pose[..., :3, :3] = rotation.reshape(*translation.shape[:-1], 3, 3)

@@ -6,13 +6,13 @@ import json
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from dynslam_bench.core.errors import InfrastructureError, RunError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
 from .identity import ResolvedRun, resolve
@@ -177,7 +177,7 @@ class _Bench:
         waiting = _Waiting(self.store, todo)
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-run") as pool:
             futures = {pool.submit(self._next, waiting): run_id for run_id in todo}
-            return dict(self._collect(futures, lambda made, _: made).values())
+            return dict(self._collect(futures, lambda future, _: future.result()).values())
 
     def _next(self, waiting: _Waiting) -> tuple[str, RunRecord]:
         """Make the first run that nobody else is making, or take what another process has made of it meanwhile."""
@@ -189,28 +189,23 @@ class _Bench:
         futures: dict[Future[bytes], str] = {}
         for run_id, run in todo.items():
             self.tell("started", run)
-            futures[executor.submit(run_packed, run.spec.model_dump_json(), options)] = run_id
+            futures[_asked(executor.submit, run_packed, run.spec.model_dump_json(), options)] = run_id
 
-        def take(data: bytes, run_id: str) -> RunRecord:
-            record = unpack(data, self.store)
+        def take(future: Future[bytes], run_id: str) -> RunRecord:
+            record = unpack(_asked(future.result), self.store)
             score(self.store, record, self.protocol)
             self.tell("finished", todo[run_id], record=record)
             return record
 
         return self._collect(futures, take)
 
-    def _collect(self, futures: Mapping[Future[Any], str], take: Callable[[Any, str], T]) -> dict[str, T]:
+    def _collect(self, futures: Mapping[Future[Any], str], take: Callable[[Future[Any], str], T]) -> dict[str, T]:
         try:
-            return {futures[future]: take(future.result(), futures[future]) for future in as_completed(futures)}
-        except BaseException as error:
+            return {futures[future]: take(future, futures[future]) for future in as_completed(futures)}
+        except BaseException:
             self.cancelled.set()
             for future in futures:
                 future.cancel()
-            if isinstance(error, (CancelledError, ConnectionError)):  # as when Dask's scheduler is gone
-                raise InfrastructureError(
-                    f"the executor gave up: {type(error).__name__} {error}".rstrip(),
-                    "what is finished is stored; the same command goes on from there",
-                ) from error
             raise
 
     def _one(self, run: ResolvedRun) -> RunRecord:
@@ -241,6 +236,20 @@ class _Bench:
         if self.on_event is not None:
             with self.lock:
                 self.on_event(RunEvent(kind, run.run_id, run.spec, self.total, record, partial))
+
+
+def _asked(ask: Callable[..., T], *arguments: object) -> T:
+    """What an executor answers; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
+    try:
+        return ask(*arguments)
+    except DynslamError:
+        raise
+    except Exception as error:  # each library of executors has errors of its own
+        words = " ".join(str(error).split())[:200]
+        raise InfrastructureError(
+            f"the executor gave up: {type(error).__name__} {words}".rstrip(),
+            "what is finished is stored; the same command goes on from there",
+        ) from error
 
 
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:

@@ -135,7 +135,8 @@ def open_folder(
     entry = entry or entry_of(folder.resolve().name)
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
     chosen = chosen_camera(folder, camera)
-    contents = layout.read(folder, (chosen and chosen[1]) or (entry and entry.fps))
+    stated = None if chosen is None else chosen[1]
+    contents = layout.read(folder, stated or (None if entry is None else entry.fps))
     otherwise = None if entry is None else entry.camera
     intrinsics, fps = chosen or find_camera(folder, told=contents.camera, otherwise=otherwise)
     body = MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera)

@@ -17,6 +17,7 @@ from dynslam_bench.core.harmless import inside, is_inside
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import Record
 
+from . import first_use
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from .published.archives import extract
 from .published.cameras import find_camera
@@ -135,7 +136,8 @@ def fetch(
         name: Id or published folder name.
         data_root: Folder of the sequences.
         progress: Called with the stage and the bytes done.
-        checksum: False to accept an archive whose checksum differs from the catalogue's.
+        checksum: False to accept an archive whose checksum differs from the catalogue's or, where that knows none, from
+            that of the archive which this address gave before.
         keep_archive: True to keep the archive beside the sequence.
         url: A mirror, in place of the catalogue's address.
         attempts: Connections in a row that may fail without bringing a byte.
@@ -158,15 +160,21 @@ def fetch(
     expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
     how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
-    parts = []
+    parts: list[Part] = []
+    root = find_data_root(data_root)
     for address in (url or entry.url, *entry.more_urls):
-        archive = find_data_root(data_root) / ".downloads" / _archive_name(address, entry)
+        archive = root / ".downloads" / _archive_name(address, entry)
         try:
             sha256 = download(address, archive, sha256=expected if not parts else None, **how)
         except DownloadError as error:
             raise SequenceError(str(error.args[0]), error.hint) from error
         parts.append(Part(address, archive, sha256))
+    unstated = [part for part in parts if part is not parts[0] or entry.sha256 is None]
+    for part in unstated if checksum else ():
+        first_use.compare(root, part.address, part.archive, part.sha256)
     _take(found, parts, expected is not None, progress)
+    for part in unstated:
+        first_use.remember(root, part.address, part.sha256)
     if not keep_archive:
         for part in parts:
             part.archive.unlink(missing_ok=True)

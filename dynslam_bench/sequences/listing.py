@@ -15,6 +15,9 @@ from .catalogue import catalogue, entry_of, open_sequence
 from .published.datasets import DATASETS
 from .synthetic import parse_synthetic_id
 
+KNOWN = "known: another archive is refused"
+FIRST_USE = "not published: the first fetch takes it, every later one has to bring the same"
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -33,6 +36,7 @@ class Summary:
         layout: How its files were known when the reader was written: ``verified``, ``not verified`` on the publisher's
             files, or empty where there are none.
         by_hand: Why this program cannot fetch it; empty where it can.
+        checksum: Whether its checksum is known before it is fetched; None for what is rendered.
     """
 
     id: str
@@ -46,6 +50,7 @@ class Summary:
     dataset: str = ""
     layout: str = ""
     by_hand: str = ""
+    checksum: bool | None = None
 
 
 def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
@@ -63,14 +68,14 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
                 tags = parse_synthetic_id(name).tags if rendered else ()
                 split = parse_synthetic_id(name).split if rendered else ""
                 size = "rendered" if rendered else ""
-                about = {"license": dataset.spec.license, "dataset": dataset.spec.summary or dataset.spec.id}
-                found.append(Summary(name, True, size, tags, split, **about))
+                title, licence = dataset.spec.summary or dataset.spec.id, dataset.spec.license
+                found.append(Summary(name, True, size, tags, split, license=licence, dataset=title))
                 continue
             layout = "verified" if entry.verified else "not verified"
             found.append(
                 Summary(
                     name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
-                    entry.license, entry.url, entry.title, layout, entry.by_hand,
+                    entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
                 )
             )  # fmt: skip
     return found
@@ -93,6 +98,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
         facts = {
             "id": entry.id, "alias": entry.folder, "url": entry.url, "page": entry.page, "size": entry.size_text(),
             "size_bytes": entry.size_bytes, "sha256": entry.sha256, "license": entry.license,
+            "checksum": KNOWN if entry.sha256 else FIRST_USE,
             "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
             "ground_truth": "public" if entry.ground_truth else "not public",
             "camera": repr(entry.intrinsics() or "as its files or its layout state"),

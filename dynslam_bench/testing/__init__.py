@@ -1,31 +1,73 @@
 """Conformance checks for the authors of plug-ins.
 
 Each ``check_*`` raises a `ConformanceError` that names what was found and its likely cause; each ``*_report`` runs the
-same checks and returns the outcome of every one.
+same checks and returns the outcome of every one. `pytest_plugin` makes tests of them.
 """
 
-from .filter import check_filter, filter_report, filter_scene
-from .isolated import isolated_tracker_report
-from .report import Check, ConformanceError, ConformanceReport
-from .scenes import CornerSequence, hard_frames
-from .segmenter import check_segmenter, segmenter_report
-from .sequence import check_sequence, sequence_report
-from .tracker import check_tracker, tracker_report
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .features import check_features, features_report
+    from .filter import check_filter, filter_report, filter_scene
+    from .flow import check_flow, flow_report
+    from .isolated import isolated_tracker_report
+    from .report import Check, ConformanceError, ConformanceReport
+    from .scenes import CornerSequence, hard_frames
+    from .segmenter import check_segmenter, segmenter_report
+    from .sequence import check_sequence, sequence_report
+    from .tracker import check_tracker, tracker_report
+
+_HOMES = {
+    "check_features": "features",
+    "check_filter": "filter",
+    "check_flow": "flow",
+    "check_segmenter": "segmenter",
+    "check_sequence": "sequence",
+    "check_tracker": "tracker",
+    "Check": "report",
+    "ConformanceError": "report",
+    "ConformanceReport": "report",
+    "CornerSequence": "scenes",
+    "features_report": "features",
+    "filter_report": "filter",
+    "filter_scene": "filter",
+    "flow_report": "flow",
+    "hard_frames": "scenes",
+    "isolated_tracker_report": "isolated",
+    "segmenter_report": "segmenter",
+    "sequence_report": "sequence",
+    "tracker_report": "tracker",
+}
 
 __all__ = [
     "Check",
     "ConformanceError",
     "ConformanceReport",
     "CornerSequence",
+    "check_features",
     "check_filter",
+    "check_flow",
     "check_segmenter",
     "check_sequence",
     "check_tracker",
+    "features_report",
     "filter_report",
     "filter_scene",
+    "flow_report",
     "hard_frames",
     "isolated_tracker_report",
     "segmenter_report",
     "sequence_report",
     "tracker_report",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load what is asked for: pytest reads this package wherever the distribution is installed."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -20,7 +20,7 @@ from ..model.rows import Loaded, LoadedRun
 from .explore_data import FrameSummary, FrameSums, explore_content, summarise
 from .page import render_run_page
 from .pictures import PictureBook
-from .run_data import exact_share, read_frames, run_content
+from .run_data import MOST_FRAMES, exact_share, read_frames, run_content
 from .side_files import write_side
 
 RUN_PAGE = "run.html"
@@ -82,6 +82,7 @@ def write_explore(
     *,
     title: str,
     picture_seconds: float = PICTURE_SECONDS,
+    most_frames: int = MOST_FRAMES,
     progress: Progress | None = None,
     crew: Crew | None = None,
 ) -> Explored:
@@ -96,6 +97,7 @@ def write_explore(
         output: Folder of the report.
         title: Title of the report.
         picture_seconds: Time that opening sequences and drawing pictures may take.
+        most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
         progress: Told of the runs that are done, and of all.
         crew: Helpers that write the pages; None to write them here.
 
@@ -120,7 +122,7 @@ def write_explore(
     if crew is None:
         book = PictureBook(output, picture_seconds)
         written = [
-            write_pages(piece, shown, share, protocol, book, lambda: told(1, ""))
+            write_pages(piece, shown, share, protocol, book, most_frames, lambda: told(1, ""))
             for piece, share in zip(pieces, known, strict=True)
         ]
     else:
@@ -146,6 +148,7 @@ def write_pages(
     share: Mapping[int, float],
     protocol: Protocol,
     book: PictureBook,
+    most_frames: int,
     told: Callable[[], None],
 ) -> Pages:
     """Write the pages of some runs of one column.
@@ -156,12 +159,15 @@ def write_pages(
         share: Exact share of dynamic pixels of the column's frames, without offset.
         protocol: How errors are computed.
         book: Draws the pictures.
+        most_frames: As in `write_explore`.
         told: Called after every run.
     """
     pages = Pages()
     for run in runs:
         frames = read_frames(run, share)
-        write_side(book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth()))
+        write_side(
+            book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth(), most_frames)
+        )
         exact = frames.share_source == "exact masks"
         known = summarise(run.row, frames.errors_m, frames.share, exact) if len(frames) else FrameSummary([], [], [])
         pages.frames.append(known)

@@ -27,7 +27,7 @@ from .side_files import packed_rows
 Array = NDArray[np.float64]
 
 MOST_FRAMES = 400
-"""Frames of a run that its page shows; of longer ones every second, third, ..."""
+"""Frames of a run that its page shows unless something else is asked for."""
 _LOG_BYTES = 20_000
 _COUNTS = ("keypoints", "culled", "matches", "inliers")
 _STATS = {f"stat_{name}" for name in (*_COUNTS, "mask_fraction")}
@@ -117,7 +117,9 @@ def exact_share(path: Path, offset: int) -> dict[int, float]:
     return {index + offset: share for index, share in known.itertuples(index=False)}
 
 
-def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:
+def run_content(
+    run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None, most: int = MOST_FRAMES
+) -> dict[str, Any]:
     """Everything that the page of a run shows, as the page's script reads it.
 
     Args:
@@ -125,6 +127,7 @@ def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Tr
         frames: Its frames.
         protocol: How its errors are computed.
         truth: Ground truth of its part of the sequence.
+        most: Frames that are shown; of longer runs every second, third, ...
     """
     row, record = run.row, run.record
     return {
@@ -146,8 +149,8 @@ def run_content(run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Tr
         "command": run_command(row),
         "asked": row.command,
         "log": _log(run),
-        "frames": _series(frames),
-        "track": _track(run, protocol, truth),
+        "frames": _series(frames, most),
+        "track": _track(run, protocol, truth, most),
     }
 
 
@@ -190,12 +193,12 @@ def _log(run: LoadedRun) -> str:
     return cut + text[-_LOG_BYTES:].decode(errors="replace")
 
 
-def _series(frames: RunFrames) -> dict[str, Any]:
+def _series(frames: RunFrames, most: int) -> dict[str, Any]:
     """The frames over time, thinned and packed."""
     columns = frames.columns
     if not columns:
         return {}
-    step = -(-len(frames) // MOST_FRAMES)
+    step = -(-len(frames) // most)
     stamps, start = columns["timestamp"], float(columns["timestamp"][0])
     stages = [name for name in columns if name.endswith("_s") and name not in ("total_s", "read_s")]
     counts = [name for name in _COUNTS if f"stat_{name}" in columns]
@@ -216,7 +219,7 @@ def _series(frames: RunFrames) -> dict[str, Any]:
     return found | {"share": share} if np.isfinite(frames.share).any() else found
 
 
-def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict[str, Any]:
+def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None, most: int) -> dict[str, Any]:
     """The aligned track beside the true one; without ground truth the track alone; empty if nothing was tracked.
 
     Where the time between two poses exceeds twice the median interval, all series have a gap.
@@ -226,7 +229,7 @@ def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict
         if estimate is None or len(estimate) < 2:
             return {}
         if truth is None or not run.row.metrics:
-            return _packed_track(estimate, {"xyz": estimate.positions, "angles": _angles(estimate, estimate)})
+            return _packed_track(estimate, {"xyz": estimate.positions, "angles": _angles(estimate, estimate)}, most)
         aligned, true, series = pose_errors(estimate, truth, protocol)
     except DynslamError as error:
         return {"reason": str(error)}
@@ -238,15 +241,15 @@ def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None) -> dict
         "angles": _angles(aligned, true),
         "true_angles": _angles(true, true),
     }
-    return _packed_track(aligned, columns) | {"alignment": protocol.alignment}
+    return _packed_track(aligned, columns, most) | {"alignment": protocol.alignment}
 
 
-def _packed_track(track: Trajectory, columns: Mapping[str, Array]) -> dict[str, Any]:
+def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) -> dict[str, Any]:
     """Series along a track ``[N]`` or ``[N, 3]``, thinned, broken at gaps and packed."""
     start = float(track.timestamps[0])
     widths = [1 if values.ndim == 1 else values.shape[1] for values in columns.values()]
     together = np.column_stack(list(columns.values()))
-    stamps, values = broken(track.timestamps - start, together, MOST_FRAMES)
+    stamps, values = broken(track.timestamps - start, together, most)
     t, *rows = packed_rows(np.vstack([stamps, values.T]))
     found: dict[str, Any] = {"start": start, "t": t}
     for name, width in zip(columns, widths, strict=True):

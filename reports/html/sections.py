@@ -210,6 +210,6 @@ def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> No
     if notes:
         shown = notes[:_MOST_NOTES]
         if len(notes) > len(shown):
-            shown.append(f"... and {len(notes) - len(shown)} more in report.json")
+            shown.append(f"... and {len(notes) - len(shown)} more on the pages of the runs")
         section.blocks.append(Block(kind="list", title="Diagnostics", entries=shown, folded=True))
     draft.add(section)

@@ -8,6 +8,8 @@ from typing import Literal
 
 import pandas as pd
 
+from dynslam_bench.core.harmless import printable
+
 Emphasis = Literal["", "best", "second", "muted", "failed"]
 
 
@@ -160,7 +162,10 @@ def to_csv(table: Table) -> str:
 
 
 def csv_text(frame: pd.DataFrame) -> str:
-    """A frame as CSV that a spreadsheet may open: words that it would take for a formula begin with a quote."""
+    """A frame as CSV that a spreadsheet may open, a terminal may show: nothing is a formula or an escape.
+
+    Words that a spreadsheet would take for a formula begin with a quote.
+    """
     safe = frame.astype(object).map(_harmless)
     safe.columns = pd.Index([_harmless(name) for name in frame.columns])
     return str(safe.to_csv(index=False, lineterminator="\n"))
@@ -180,7 +185,7 @@ def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
 
 def prose(text: str) -> str:
     """A sentence for Markdown: on one line, and without markup of HTML."""
-    return " ".join(text.split()).replace("<", "&lt;")
+    return printable(" ".join(text.split())).replace("<", "&lt;")
 
 
 def _escape_markdown(text: str) -> str:
@@ -212,4 +217,6 @@ def _words(cell: TableCell) -> str:
 
 
 def _harmless(value: object) -> object:
-    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value
+    if not isinstance(value, str):
+        return value
+    return ("'" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else "") + printable(value)

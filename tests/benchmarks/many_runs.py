@@ -21,7 +21,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "envs")]
 
 from envs_toys import write_folder  # noqa: E402
 
-from dynslam_bench.core.temporary import SHARED_MEMORY  # noqa: E402
 from dynslam_bench.runs import RunSpec, RunStore, run_many  # noqa: E402
 from dynslam_bench.runs.process.family import family  # noqa: E402
 
@@ -30,7 +29,7 @@ def held() -> dict[str, float]:
     """What this session holds."""
     members = family(os.getpid())
     pages = [int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in members]
-    folders = [*Path(tempfile.gettempdir()).glob("dynslam-held-*"), *SHARED_MEMORY.glob("dynslam-held-*")]
+    folders = list(Path(tempfile.gettempdir()).glob("dynslam-held-*"))
     return {
         "memory_mb": sum(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6,
         "files": sum(len(list(Path(f"/proc/{pid}/fd").iterdir())) for pid in members),
@@ -48,6 +47,8 @@ def main() -> int:
     marks: list[dict[str, float]] = []
     step = max(1, options.runs // 10)
     with tempfile.TemporaryDirectory(prefix="many-runs-") as folder:
+        tempfile.tempdir = os.environ["TMPDIR"] = str(Path(folder) / "temporary")  # of this session alone
+        Path(tempfile.tempdir).mkdir()
         sequence = str(write_folder(Path(folder) / "toy", 10))
         store = RunStore(Path(folder) / "results")
         for begin in range(0, options.runs, step):

@@ -35,6 +35,11 @@ def test_on_a_terminal_what_has_no_room_is_named(capsys, monkeypatch):
     assert lines[2].startswith("(no room for: masks")
 
 
+def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape(capsys):
+    write_table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]])
+    assert capsys.readouterr().out.splitlines() == [r"tum/\x1b[2J  \u202ea", r"x y          \x9b1m", "1.5          yes"]
+
+
 def test_a_reports_table_has_no_markup(capsys):
     table = Table(
         "t", "A_title", "One | caption * of [it]. " * 9, [Column("a_b", numeric=False)], [[TableCell("x|y_*")]]

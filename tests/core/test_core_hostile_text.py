@@ -139,3 +139,13 @@ def test_what_a_killed_process_left_beside_a_folder_is_swept_up(tmp_path: Path) 
     with atomic_folder(tmp_path / "seq"), atomic_folder(tmp_path / "other"):
         assert not left.exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "seq"]
+
+
+@pytest.mark.parametrize("size", [0, 1, 1 << 16, (1 << 16) + 1, 1 << 17])
+def test_files_of_any_size_are_read_whole_up_to_the_limit(tmp_path, size):
+    path = tmp_path / "file"
+    path.write_bytes(bytes(range(256)) * (size // 256) + b"x" * (size % 256))
+    assert read_bytes(path, limit=size) == path.read_bytes()
+    (tmp_path / "larger").write_bytes(path.read_bytes() + b"x")
+    with pytest.raises(DynslamError, match="more than the"):
+        read_bytes(tmp_path / "larger", limit=size)

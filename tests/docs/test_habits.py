@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,6 +26,7 @@ PRIVATE = {
     "flow/test_flow_sparse.py": ({"_runner"}, "counts the threads' work, which no result shows"),
     "runs/hostile.py": ({"_exit"}, "os._exit: a process that dies at once"),
     "runs/test_runs_infrastructure.py": ({"_process"}, "kills the fork server"),
+    "segmentation/test_segmentation_hostile.py": ({"_cells"}, "the anchors, which no result of shapes alone shows"),
     "segmentation/test_segmentation_torchvision.py": ({"_dynamo"}, "torch._dynamo must not be loaded"),
     "sequences/test_synthetic_geometry.py": ({"_geometry", "_tiles"}, "the exact scene behind a rendered frame"),
     "trackers/adapters/test_adapter_orbslam3.py": (
@@ -46,6 +48,8 @@ PRIVATE = {
     ),
 }
 """Private names that a test may use, each file with its reason."""
+CLOCK = {"core/files.py": "ages of files, which are stamped by that clock"}
+"""Where the clock of the wall decides anything: it may jump, the monotonic one may not."""
 
 
 def private_names(tree: ast.Module) -> set[str]:
@@ -142,3 +146,13 @@ def test_every_exception_for_dead_code_has_a_reason() -> None:
     entries = [line for line in text.splitlines() if line and not line.startswith(("#", '"'))]
     assert len(entries) > 10
     assert [line for line in entries if "  # " not in line] == []
+
+
+def test_nothing_waits_for_a_clock_that_may_jump() -> None:
+    """Durations and deadlines come from ``time.monotonic``; ``time.time`` runs backwards when the clock is set."""
+    root = TESTS.parent
+    sources = [path for room in ("dynslam_bench", "envs", "tuning", "reports") for path in (root / room).rglob("*.py")]
+    wall = re.compile(r"\btime\.time(_ns)?\(|import time as|from time import (.*, )?time\b")
+    asked = {path for path in sources if wall.search(path.read_text())}
+    assert len(sources) > 200
+    assert {path.relative_to(root / "dynslam_bench").as_posix() for path in asked} == set(CLOCK)

@@ -71,6 +71,8 @@ def test_quaternions_are_normalised_and_canonical():
     q = np.array([[0.1, -0.2, 0.3, -0.4]])
     pose = se3.from_quaternion(np.zeros((1, 3)), q)
     assert np.allclose(pose, se3.from_quaternion(np.zeros((1, 3)), -7 * q))
+    for length in (1e-300, 1e200, 1e308):  # a file may hold any number
+        assert np.allclose(pose, se3.from_quaternion(np.zeros((1, 3)), length * q))
     _, again = se3.to_quaternion(pose)
     assert np.linalg.norm(again) == pytest.approx(1)
     assert again[0, 3] > 0

@@ -86,7 +86,7 @@ def test_no_name_is_more_than_a_name():
 
 def test_a_spreadsheet_takes_no_name_for_a_formula(tmp_path):
     store = RunStore(tmp_path / "r")
-    for label in ("=cmd|' /C calc'!A0", "+1", "@sum", "-2+3"):
+    for label in ("=cmd|' /C calc'!A0", "+1", "@sum", "-2+3", "\x1b[2J\u202e"):
         add_run(store, f"t{label}", "s/a", label=label, n=40)
     paths = build_report(store, tmp_path / "report", title="one\n# two\n<script>")
     cells = [cell for path in paths.csv.values() for line in csv.reader(path.open()) for cell in line]
@@ -94,3 +94,5 @@ def test_a_spreadsheet_takes_no_name_for_a_formula(tmp_path):
     for cell in cells:
         assert not cell.startswith(("=", "+", "@")) and (cell[:1] != "-" or float(cell) < 0), cell
     assert paths.markdown.read_text().startswith("# one # two &lt;script>\n")
+    for path in (*paths.csv.values(), paths.markdown, paths.latex):
+        assert not set(path.read_text()) & {"\x1b", "\u202e"}, path

@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import multiprocessing
 import zipfile
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from envs_toys import TARGET, truth
 
-from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import write_tum
 from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
@@ -103,6 +103,28 @@ def test_any_executor(tmp_path: Path, toy_folder: str, monkeypatch: pytest.Monke
             paths = (tmp_path / "here" / "runs" / mine.run_id, store.folder(theirs.run_id))
             assert len({(path / "trajectory_online.txt").read_text() for path in paths}) == 1
         assert score(store, there[0], "evo-default").metrics["ate_rmse_m"] > 0
+
+
+class _Dying(Executor):
+    """An executor whose other end goes: before anything is handed over, or while it is made."""
+
+    def __init__(self, error: Exception, *, at_once: bool) -> None:
+        self.error, self.at_once = error, at_once
+
+    def submit(self, *_: object, **__: object) -> Future:
+        if self.at_once:
+            raise self.error
+        future: Future = Future()
+        future.set_exception(self.error)
+        return future
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+@pytest.mark.parametrize("error", [CancelledError(), OSError("comm\nclosed"), RuntimeError("shutdown"), KeyError(1)])
+def test_an_executor_that_dies_is_one_clear_line_and_no_outcome(tmp_path, toy_folder, error, at_once) -> None:
+    with pytest.raises(InfrastructureError, match=rf"^the executor gave up: {type(error).__name__}") as told:
+        run_many(specs(toy_folder, range(2)), results=tmp_path, executor=_Dying(error, at_once=at_once))
+    assert "\n" not in str(told.value) and RunStore(tmp_path).ids() == []
 
 
 def test_children_can_be_made_in_a_daemonic_process(tmp_path: Path, toy_folder: str) -> None:

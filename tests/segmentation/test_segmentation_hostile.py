@@ -170,3 +170,16 @@ def test_damaged_prepared_images_are_one_clear_line(tmp_path: Path) -> None:
         (tmp_path / "images.npy").write_bytes(content)
         with pytest.raises(SegmentationError, match=r"the prepared images in .* are damaged"):
             PreparedImages(tmp_path, ("person",))
+
+
+def test_a_network_that_is_only_compared_with_a_file_is_made_of_shapes_alone(monkeypatch):
+    """Numbers on torch's ``meta`` device take its compiler, and seconds to load that in every run."""
+
+    def drawn(*_: object, **__: object) -> None:
+        raise AssertionError("numbers are drawn")
+
+    monkeypatch.setattr(torch.Tensor, "normal_", drawn)
+    with torch.device("meta"):
+        network = MaskRCNN(SMALL)
+    assert all(weight.is_meta for weight in network.parameters())
+    assert all(not cell.is_meta for cell in network.rpn._cells)  # made of numbers, so not made there

@@ -80,5 +80,6 @@ def tgz(folder, name=FOLDER, extra=()):
 
 
 def left_behind(root):
-    """Every file below the root, hidden ones included."""
-    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    """Every file below the root, hidden ones included, but for the checksums that are kept of archives."""
+    kept = {*root.glob(".downloads/*.sha256")}
+    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file() and path not in kept)

@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import shutil
 import stat
 from pathlib import Path
 
@@ -113,6 +114,20 @@ def test_wrong_checksum(get, server, monkeypatch, tmp_path, packed):
     assert left_behind(tmp_path / "root") == []
     monkeypatch.setattr(fetching, "entry_of", lambda name: entry.model_copy(update={"sha256": right}))
     assert Receipt.read(get() / "fetched.json").checked
+
+
+def test_without_a_known_checksum_the_first_one_counts(get, server, packed, tmp_path):
+    first = hashlib.sha256(packed).hexdigest()
+    shutil.rmtree(get())
+    shutil.rmtree(get())
+    (kept,) = (tmp_path / "root" / ".downloads").iterdir()
+    assert kept.read_text() == f"{first}  {server.url}\n"
+    kept.write_text(kept.read_text().replace(first, "0" * 64))
+    with pytest.raises(SequenceError, match=f"has the checksum {first}, but gave {'0' * 64} before"):
+        get()
+    assert list((tmp_path / "root" / ".downloads").iterdir()) == [kept]
+    assert Receipt.read(get(checksum=False) / "fetched.json").sha256 == first
+    assert kept.read_text().startswith(first)
 
 
 def test_the_checksum_can_be_waived(get, monkeypatch):

@@ -16,7 +16,7 @@ import toy_tracker
 from optuna.trial import TrialState
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.runs import RunStore
+from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
 from dynslam_bench.tuning.space import distribution
 from dynslam_bench.tuning.study import CRASHED_WORKER
@@ -80,13 +80,17 @@ def test_an_untunable_study_says_that_it_did_not_help(sequences: list[str], tmp_
 
 
 def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> None:
-    tuner = run_study(make(sequences, trials=3), results=tmp_path)
+    told: list[RunEvent] = []
+    tuner = run_study(make(sequences, trials=3), results=tmp_path, on_run=told.append)
     stored = set(RunStore(tmp_path).ids())
     trials = tuner.study.get_trials()
     assert trials
     for trial in trials:
         named = {run_id for _, run_id, *_ in trial.user_attrs["blocks"]}
         assert len(named) == 2 and named <= stored
+    assert {event.run_id for event in told if event.kind == "finished"} == stored  # those of the default among them
+    frames = [event.partial["frames_done"] for event in told if event.kind == "progress" and event.partial]
+    assert frames and min(frames) > 0
 
 
 def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_path: Path) -> None:
@@ -105,7 +109,8 @@ def test_several_objectives_have_a_front(sequences: list[str], tmp_path: Path) -
     spec = make(sequences, tune=sequences, held_out=[], objectives=["accuracy", "speed"], trials=10, sampler="nsga2")
     tuner = run_study(spec, results=tmp_path)
     assert all(len(trial.values) == 2 for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,)))
-    assert "front" in write_page(tuner, finish(tuner)).read_text()
+    page = write_page(tuner, finish(tuner)).read_text()
+    assert '"name":"front"' in page and '"name":"default"' in page
 
 
 def test_constraints_decide_who_is_a_candidate(sequences: list[str], tmp_path: Path) -> None:

@@ -81,17 +81,10 @@ def import_trajectory(
         notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
     asked = {
         "tracker": TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        "frames": _pair(frames),
-        "stride": stride,
-        "stamps_match": not odd,
-        "provenance": provenance or str(file),
-        "notes": notes,
-        "place": place_of(sequence),
+        **{"frames": _pair(frames), "stride": stride, "place": place_of(sequence)},
+        **{"stamps_match": not odd, "provenance": provenance or str(file), "notes": notes},
     }
-    identity = _identity(file, tracker, which, opened)
-    if timestamps is not None:
-        identity["timestamps"] = sha256(Path(timestamps).expanduser().read_bytes()).hexdigest()
-    record = _record(identity, opened, covered, asked)
+    record = _record(_identity(file, tracker, which, opened, timestamps), opened, covered, asked)
     store = results if isinstance(results, RunStore) else RunStore(results)
     _keep(store, record, opened, loaded.trajectory, which)
     return record
@@ -142,7 +135,9 @@ def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name
     return (len(near) if odd else len(exact)), odd
 
 
-def _identity(file: Path, tracker: str, which: str, sequence: Sequence) -> dict[str, Any]:
+def _identity(
+    file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None
+) -> dict[str, Any]:
     seen = part_of(sequence)
     return {
         "kind": "imported",
@@ -154,6 +149,7 @@ def _identity(file: Path, tracker: str, which: str, sequence: Sequence) -> dict[
         "frames": [seen.start, seen.stop],
         "offset": 0,
         "stride": seen.stride,
+        **({} if timestamps is None else {"timestamps": sha256(Path(timestamps).read_bytes()).hexdigest()}),
     }
 
 

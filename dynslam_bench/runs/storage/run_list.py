@@ -44,12 +44,12 @@ def list_runs(
     known = _read(path)
     kept: dict[str, list[Any]] = {}
     unreadable: list[Unreadable] = []
-    ids = store.ids()
+    ids, runs = store.ids(), str(store.runs)
     for position, run_id in enumerate(ids):
         if position % 100 == 0:
             on_progress(position, len(ids))
         try:
-            stamp = _stamp(f"{store.runs}/{run_id}/{RUN_FILE}")
+            stamp = _stamp(f"{runs}/{run_id}/{RUN_FILE}")
             found = known.get(run_id)
             if found is None or found[0] != stamp:
                 record = store.read_whole(run_id)

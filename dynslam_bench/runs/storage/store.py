@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 LOGGER = logging.getLogger(__name__)
 RUN_FILE = "run.json"
+A_RUN = "a run's id"
 _RUN_ID = re.compile(r"[0-9a-f]{16}")
 
 
@@ -54,16 +55,16 @@ class RunStore:
 
     Args:
         root: The folder; it is made when something is written.
+
+    Attributes:
+        root: The same, absolute.
+        runs: Folder of the runs.
     """
 
     def __init__(self, root: str | Path = "results") -> None:
         self.root = Path(root).expanduser().absolute()
+        self.runs = self.root / "runs"
         self._swept = False
-
-    @property
-    def runs(self) -> Path:
-        """Folder of the runs."""
-        return self.root / "runs"
 
     def folder(self, run_id: str) -> Path:
         """Folder of one run, whether it exists or not.
@@ -71,7 +72,7 @@ class RunStore:
         Raises:
             RunError: It is no run's id, which is 16 hexadecimal digits: anything else could lead out of the store.
         """
-        return self.runs / _checked(run_id, "a run's id")
+        return self.runs / _checked(run_id, A_RUN)
 
     def _part(self, part: str) -> Path:
         """Folder of the stamps and the ground truth of a sequence's part."""
@@ -313,7 +314,7 @@ class RunStore:
             raise RunError(f"cannot read {path}: {error.strerror}", "the results folder is incomplete") from error
 
     def _metric_file(self, run_id: str, protocol_digest: str) -> Path:
-        return self.root / "metrics" / protocol_digest / f"{self.folder(run_id).name}.json"
+        return self.root / "metrics" / protocol_digest / f"{_checked(run_id, A_RUN)}.json"
 
     def _forget_metrics(self, run_id: str) -> None:
         for metrics in (self.root / "metrics").glob(f"*/{run_id}.json"):

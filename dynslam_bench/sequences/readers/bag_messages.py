@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
 
-COLOURS = {
+COLOURS: dict[str, int | None] = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "bgr8": None,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -20,7 +20,11 @@ COLOURS = {
     "8UC3": None,
     "8UC1": None,
 }
-DEPTHS = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
+DEPTHS: dict[str, np.dtype[Any]] = {
+    "16UC1": np.dtype(np.uint16),
+    "mono16": np.dtype(np.uint16),
+    "32FC1": np.dtype(np.float32),
+}
 MILLIMETRES = 1000.0
 """Units a metre of a 16-bit depth image, as REP 118 of ROS has it; one of floating-point numbers is in metres."""
 
@@ -94,7 +98,7 @@ def camera_of(message: Any, where: str) -> Camera:
         raise SequenceError(f"{where} has the distortion '{message.distortion_model}', only plumb_bob is read")
     coefficients = [*d[:5].tolist(), *[0.0] * 5][:5]
     size = int(message.width), int(message.height)
-    return Camera(*size, k[0], k[4], k[2], k[5], tuple(coefficients), MILLIMETRES)  # type: ignore[arg-type]
+    return Camera(*size, k[0], k[4], k[2], k[5], tuple(coefficients), MILLIMETRES)
 
 
 def pose_line(message: Any) -> str:

@@ -1,7 +1,7 @@
 """ETH3D SLAM: TUM lists, paired by ``associated.txt``, with the camera in ``calibration.txt``.
 
-A sequence is published as two archives of one folder: ``NAME_mono.zip`` (colour, lists, calibration, ground truth) and
-``NAME_rgbd.zip`` (depth and ``associated.txt``).
+A sequence is published as two archives of one folder: ``*_mono.zip`` (colour, lists, calibration, ground truth) and
+``*_rgbd.zip`` (depth and ``associated.txt``).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""7-Scenes: ``frame-NNNNNN.color.png``, ``.depth.png`` and ``.pose.txt``, the poses being KinectFusion's 4x4 matrices.
+"""7-Scenes: ``frame-*.color.png``, ``.depth.png`` and ``.pose.txt``, the poses being KinectFusion's 4x4 matrices.
 
 The poses are camera to world and taken to the last digit. A frame that KinectFusion lost (a pose that is no number)
 stays a frame without ground truth. Raw depth 65535 is missing.

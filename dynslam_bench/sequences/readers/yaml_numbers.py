@@ -18,7 +18,7 @@ MOST_BRACKETS = 1000
 """What opens more takes yaml's parser minutes."""
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no annotations
     """Plain values only; OpenCV's matrices are mappings with their numbers under ``data``."""
 
 
@@ -60,10 +60,11 @@ def numbers(value: object, count: int, where: str) -> list[float]:
         SequenceError: It is no list of so many finite numbers.
     """
     data = value.get("data") if isinstance(value, Mapping) else value
-    found = data if isinstance(data, list) else [data]
-    if len(found) != count or not all(isinstance(x, (int, float)) and _finite(x) for x in found):
+    listed: list[object] = data if isinstance(data, list) else [data]
+    found = [float(x) for x in listed if isinstance(x, (int, float)) and _finite(x)]
+    if not len(found) == len(listed) == count:
         raise SequenceError(f"{where} holds no {count} numbers")
-    return [float(x) for x in found]
+    return found
 
 
 def section(value: object, key: str, where: str) -> Any:

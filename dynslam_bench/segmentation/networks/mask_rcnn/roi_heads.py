@@ -11,6 +11,7 @@ from torch.nn import functional
 from .assignment import match, sample, smooth_l1
 from .box_ops import BOX_WEIGHTS, clip, decode, encode, grouped_nms
 from .config import NetworkConfig
+from .initial import kaiming_normal
 from .roi_align import roi_align
 
 BOX_POOL = 7
@@ -72,7 +73,7 @@ class MaskPredictor(nn.Module):
         self.conv5_mask = nn.ConvTranspose2d(config.mask_channels, config.mask_channels, 2, 2)
         self.mask_fcn_logits = nn.Conv2d(config.mask_channels, len(config.classes) + 1, 1)
         for module in (self.conv5_mask, self.mask_fcn_logits):
-            nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            kaiming_normal(module.weight)
 
     def forward(self, x: Tensor) -> Tensor:
         """``[K, C, m, m]`` to logits ``[K, n + 1, 2m, 2m]``."""
@@ -86,7 +87,7 @@ def mask_head(config: NetworkConfig) -> nn.Sequential:
     inputs = config.channels
     for _ in range(config.mask_layers):
         conv = nn.Conv2d(inputs, config.mask_channels, 3, padding=1)
-        nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")
+        kaiming_normal(conv.weight)
         layers.append(nn.Sequential(conv, nn.ReLU(inplace=True)))
         inputs = config.mask_channels
     return nn.Sequential(*layers)

@@ -9,13 +9,14 @@ from torch.nn import functional
 from .assignment import Sampled, match, sample, smooth_l1
 from .box_ops import RPN_WEIGHTS, clip, decode, encode, grouped_nms
 from .config import NetworkConfig
+from .initial import normal
 
 MIN_BOX_PX = 1e-3
 
 
 def anchor_cells(config: NetworkConfig) -> list[Tensor]:
     """Anchors ``[A, 4]`` of each level around the origin, rounded to pixels as the published models have them."""
-    ratios = torch.tensor(config.anchor_ratios)
+    ratios = torch.tensor(config.anchor_ratios, device="cpu")
     heights, widths = ratios.sqrt(), 1 / ratios.sqrt()
     cells = []
     for size in config.anchor_sizes:
@@ -48,7 +49,7 @@ class RPNHead(nn.Module):
         self.bbox_pred = nn.Conv2d(config.channels, 4 * count, 1)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
-                nn.init.normal_(module.weight, std=0.01)
+                normal(module.weight, std=0.01)
                 assert module.bias is not None
                 nn.init.zeros_(module.bias)
 

@@ -1,0 +1,151 @@
+"""The conformance checks as tests of pytest: ``pytest --dynslam-tracker my_slam.py:SPEC``.
+
+Every check of a subject becomes a test item named after it. The checks run while pytest collects (what they are called
+is known only then), those of a tracker in a process of their own. Installing the distribution makes pytest find this
+module (entry point ``pytest11``); it imports nothing of weight before it is asked for something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from .report import Check, ConformanceReport
+
+OPTIONS = {
+    "tracker": "a tracker: id, module:Attr or file.py:Attr of a TrackerSpec; runs in a process of its own",
+    "segmenter": "a segmenter: id, module:Attr or file.py:Attr of a SegmenterSpec",
+    "flow": "an optical flow: id, module:Attr or file.py:Attr of a FlowSpec",
+    "features": "a feature extractor: id, module:Attr or file.py:Attr of a FeatureSpec",
+    "filter": "a dynamic filter: module:Attr or file.py:Attr of a class or function that constructs it",
+    "sequence": "a sequence: an id or a folder",
+}
+"""What can be checked: the option ``--dynslam-KIND`` and its help."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add an option for each kind of plug-in."""
+    group = parser.getgroup("dynslam-bench", "conformance checks of dynslam-bench")
+    for kind, meaning in OPTIONS.items():
+        group.addoption(f"--dynslam-{kind}", action="append", default=[], metavar="NAME", help=f"check {meaning}")
+
+
+def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Add the checks of every subject that was asked for."""
+    for kind in OPTIONS:
+        for name in config.getoption(f"--dynslam-{kind}"):
+            suite = ConformanceSuite.from_parent(session, name=f"{kind} {name}", kind=kind, subject=name)
+            items.extend(suite.collect())
+
+
+class ConformanceSuite(pytest.Collector):
+    """The checks of one subject; they are known by name once they have run."""
+
+    def __init__(self, *, kind: str, subject: str, **rest: Any) -> None:
+        super().__init__(**rest)
+        self.kind, self.subject = kind, subject
+
+    def collect(self) -> Iterator[pytest.Item]:
+        """Run the checks, one item each."""
+        from dynslam_bench.core.errors import DynslamError
+
+        try:
+            checks = report_on(self.kind, self.subject).checks
+        except DynslamError as error:
+            raise pytest.UsageError(f"--dynslam-{self.kind}: {error}") from error
+        for check in checks:
+            yield ConformanceItem.from_parent(self, name=check.name, check=check)
+
+
+class ConformanceItem(pytest.Item):
+    """One check."""
+
+    def __init__(self, *, check: Check, **rest: Any) -> None:
+        super().__init__(**rest)
+        self.check = check
+
+    def runtest(self) -> None:
+        """Pass, fail or skip as the check did."""
+        if self.check.status == "skipped":
+            pytest.skip(self.check.message)
+        if self.check.status == "failed":
+            pytest.fail(self.check.message, pytrace=False)
+
+    def reportinfo(self) -> tuple[str, None, str]:
+        """Where the item stands, for pytest's output."""
+        parent = self.parent.name if self.parent is not None else ""
+        return "dynslam-bench", None, f"{parent}: {self.name}"
+
+
+def report_on(kind: str, subject: str) -> ConformanceReport:
+    """Run the checks of a subject.
+
+    Args:
+        kind: One of `OPTIONS`.
+        subject: Its name.
+
+    Raises:
+        DynslamError: There is no such subject.
+    """
+    from dynslam_bench import testing
+
+    if kind == "tracker":
+        return testing.isolated_tracker_report(subject)
+    if kind == "sequence":
+        from dynslam_bench.sequences.catalogue import open_sequence
+
+        return testing.sequence_report(open_sequence(subject))
+    if kind == "filter":
+        from dynslam_bench.core.plugins import load_object
+
+        return testing.filter_report(load_object(subject))
+    return _REPORTS[kind](subject)
+
+
+def _segmenter(subject: str) -> ConformanceReport:
+    from dynslam_bench.segmentation.build_segmenter import build_segmenter
+    from dynslam_bench.segmentation.registry import SEGMENTERS
+    from dynslam_bench.segmentation.settings import SegmentationSettings
+
+    from . import CornerSequence, segmenter_report
+
+    SEGMENTERS.get(subject)  # unknown ones are no failed check
+    scene, settings = CornerSequence(2), SegmentationSettings(source=f"plugin:{subject}")
+
+    def construct() -> Any:
+        return build_segmenter(settings, sequence_id=scene.id, masks=scene.masks)
+
+    return segmenter_report(construct, sequence=scene)
+
+
+def _flow(subject: str) -> ConformanceReport:
+    from dynslam_bench.flow.build_flow import build_flow
+    from dynslam_bench.flow.registry import FLOWS
+    from dynslam_bench.flow.settings import FlowSettings
+
+    from . import flow_report
+
+    FLOWS.get(subject)  # unknown ones are no failed check
+    settings = FlowSettings(plugin=subject)
+    return flow_report(lambda: build_flow(settings))
+
+
+def _features(subject: str) -> ConformanceReport:
+    from dynslam_bench.features.build_extractor import build_extractor
+    from dynslam_bench.features.registry import FEATURES
+    from dynslam_bench.features.settings import FeatureSettings
+
+    from . import features_report
+
+    spec, settings = FEATURES.get(subject), FeatureSettings(extractor=subject)
+    return features_report(lambda: build_extractor(settings), descriptor_bytes=spec.descriptor_bytes)
+
+
+_REPORTS: dict[str, Callable[[str], ConformanceReport]] = {
+    "segmenter": _segmenter,
+    "flow": _flow,
+    "features": _features,
+}

@@ -1,0 +1,109 @@
+"""The race replayed on recorded runs: what share of the grid's runs it takes, and how much worse its choice is.
+
+    python tests/benchmarks/race_replay.py RESULTS... [--default orb-slam2] [--orders 200] [--best 0]
+
+The trials are the configurations of stored runs (systems, and their variants), the blocks what all of them ran on; each
+order of the trials is one study. Values, steps and rules are those of studies. A study runs on the blocks of one start;
+its choice is judged on the other starts, which none of its runs has seen: regret is the log ATE ratio there of the
+choice to the best. `--best N` keeps the N best alone, which lie closer together.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from dynslam_bench.evaluation import get_protocol
+from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.runs import RunStore
+from dynslam_bench.tuning.blocks import Block, scenes
+from dynslam_bench.tuning.race import FIRST_STEP, is_dropped, is_worse, running_order, steps
+from dynslam_bench.tuning.statistics import by_scene, centre
+from dynslam_bench.tuning.study_file import RaceName
+
+Errors = dict[Block, float]
+Grid = dict[str, Errors]
+
+
+def recorded(folders: list[Path]) -> Grid:
+    """ATE in metres of every configuration on the blocks that all of them ran on."""
+    grid: Grid = {}
+    for run in load_runs([RunStore(folder) for folder in folders], get_protocol("tum-rgbd/v1")).runs:
+        row = run.row
+        if row.score_m is not None:
+            grid.setdefault(row.variant_key, {})[Block(row.sequence, offset=row.offset, seed=row.seed)] = row.score_m
+    most = max(map(len, grid.values()))
+    whole = {name: errors for name, errors in grid.items() if len(errors) == most}
+    common = set.intersection(*(set(errors) for errors in whole.values()))
+    return {name: {block: errors[block] for block in sorted(common)} for name, errors in whole.items()}
+
+
+def value(errors: Errors, default: Errors, blocks: list[Block]) -> float:
+    """What a study tells of a trial after these blocks: log ATE ratio to the default over scenes."""
+    return centre(by_scene({block: errors[block] for block in blocks}, default).values())
+
+
+def replay(grid: Grid, default: Errors, rule: RaceName, order: list[str], blocks: list[Block]) -> tuple[str, int]:
+    """The choice of one study, and its runs."""
+    passed = steps(rule, len(blocks))
+    course: dict[int, list[list[float]]] = {step: [] for step in passed}
+    done: dict[str, float] = {}
+    runs = 0
+    for name in order:
+        for step, following in zip(passed, [*passed[1:], 0], strict=True):
+            mine = [value(grid[name], default, blocks[:step])]
+            course[step].append(mine)
+            if following and rule == "wilcoxon" and done:
+                seen = {block: np.log(grid[name][block]) for block in blocks[:step]}
+                if is_worse(seen, _logs(grid[min(done, key=lambda each: done[each])])):
+                    break
+            elif following and rule != "wilcoxon":
+                if is_dropped(mine, course[step], len(course[FIRST_STEP]), FIRST_STEP / following):
+                    break
+        else:
+            done[name] = mine[0]
+        runs += step
+    return min(done, key=lambda each: done[each]), runs
+
+
+def _logs(errors: Mapping[Block, float]) -> dict[Block, float]:
+    return {block: float(np.log(error)) for block, error in errors.items()}
+
+
+def main() -> None:
+    """Replay every rule in many orders."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", nargs="+", type=Path)
+    parser.add_argument("--default", default="orb-slam2")
+    parser.add_argument("--orders", type=int, default=200)
+    parser.add_argument("--best", type=int, default=0)
+    options = parser.parse_args()
+    grid = recorded(options.results)
+    default = next(errors for name, errors in grid.items() if options.default in name)
+    blocks = list(default)
+    worth = {name: value(errors, default, blocks) for name, errors in grid.items()}
+    kept = sorted(worth, key=lambda name: worth[name])[: options.best or len(worth)]
+    starts = sorted({block.offset for block in blocks})
+    print(f"{len(kept)} configurations, {len(blocks)} blocks in {len(scenes(blocks))} scenes, {options.orders} orders")
+    print("| race | runs | regret |\n| --- | --- | --- |")
+    for rule in get_args(RaceName):
+        found = []
+        for number in range(options.orders):
+            start = starts[number % len(starts)]
+            seen = running_order([block for block in blocks if block.offset == start], number)
+            order = [str(name) for name in np.random.default_rng(number).permutation(kept)]
+            choice, runs = replay(grid, default, rule, order, seen)
+            unseen = [block for block in blocks if block.offset != start]
+            truth = {name: value(grid[name], default, unseen) for name in kept}
+            found.append((runs / (len(kept) * len(seen)), truth[choice] - min(truth.values())))
+        runs, regret = np.mean(found, axis=0)
+        error = np.std([each for _, each in found], ddof=1) / np.sqrt(len(found))
+        print(f"| `{rule}` | {100 * runs:.0f} % | {regret:.3f} ± {error:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""The conformance checks as tests of pytest, and what they find in broken flows and feature extractors."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dynslam_bench.contracts import FlowResult, Keypoints
+from dynslam_bench.features.build_extractor import build_extractor
+from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.testing import ConformanceError, check_features, check_flow, features_report, flow_report
+
+FLOW = """
+import numpy as np
+from dynslam_bench.contracts import FlowResult, FlowSpec
+
+class Still:
+    def prepare(self, gray):
+        return gray
+
+    def track(self, reference, target, points, *, guess=None, seed=0):
+        inside = (points >= 0).all(1) & (points < reference.shape[::-1]).all(1)
+        return FlowResult(points.copy(), inside, np.zeros(len(points), np.float32))
+
+def build(settings, *, device="cpu", threads=1):
+    return Still()
+
+SPEC = FlowSpec("still", f"{__file__}:build")
+"""
+
+
+def run_pytest(folder: Path, *options: str) -> str:
+    command = [sys.executable, "-m", "pytest", "-v", "-p", "dynslam_bench.testing.pytest_plugin", *options]
+    command += ["-p", "no:cacheprovider", "-p", "no:xdist", str(folder)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
+
+
+def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
+    (tmp_path / "still.py").write_text(FLOW)
+    out = run_pytest(tmp_path, "--dynslam-flow", "still.py:SPEC")
+    assert re.search(r"still\.py:SPEC::determinism PASSED", out), out
+    assert re.search(r"still\.py:SPEC::a small shift is found FAILED", out), out
+    assert "xy are positions in the target, x first, not displacements" in out
+    assert "1 failed" in out and "INTERNALERROR" not in out
+
+
+def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pytest", "-p", "dynslam_bench.testing.pytest_plugin", "-p", "no:cacheprovider"]
+    ended = subprocess.run([*command, "--dynslam-flow", "dasiy", str(tmp_path)], capture_output=True, text=True)
+    assert ended.returncode == 4 and "--dynslam-flow: unknown flow 'dasiy'" in ended.stderr + ended.stdout
+    assert "Traceback" not in ended.stderr + ended.stdout
+
+
+def test_pytest_elsewhere_is_not_slowed_down() -> None:
+    code = "import dynslam_bench.testing.pytest_plugin, sys; print([m for m in ('cv2', 'torch') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("method", ["lucas-kanade", "dis", "daisy"])
+def test_the_built_in_flows_conform(method: str) -> None:
+    check_flow(lambda: build_flow(FlowSettings(method=method)))
+
+
+def test_the_built_in_extractor_conforms() -> None:
+    report = features_report(build_extractor, descriptor_bytes=32)
+    assert report.ok, report.failed
+    assert {"results", "beside a mask", "all-black image"} <= {c.name for c in report.checks if c.status == "passed"}
+
+
+class BadFlow:
+    """Each fault by name."""
+
+    def __init__(self, fault: str) -> None:
+        self.fault, self.calls = fault, 0
+
+    def prepare(self, gray):
+        prepared = gray.copy()
+        if self.fault == "changes images":
+            gray[:] = 0
+        return prepared
+
+    def track(self, reference, target, points, *, guess=None, seed=0):
+        self.calls += 1
+        xy, valid = points.copy(), np.isfinite(points).all(1) & (points >= 0).all(1) & (points < 600).all(1)
+        if self.fault == "double":
+            xy = xy.astype(np.float64)
+        if self.fault == "not finite":
+            xy[:1] = np.nan
+        if self.fault == "valid outside":
+            valid[:] = np.isfinite(xy).all(1)
+        if self.fault == "random":
+            xy = xy + np.random.default_rng().normal(size=xy.shape).astype(np.float32)
+        return FlowResult(xy, valid, np.zeros(len(points), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("fault", "check"),
+    [("double", "results"), ("not finite", "results"), ("valid outside", "points outside"),
+     ("random", "determinism"), ("changes images", "images are left alone")],
+)  # fmt: skip
+def test_a_flow_that_breaks_the_contract_is_found(fault: str, check: str) -> None:
+    report = flow_report(lambda: BadFlow(fault))
+    assert check in {each.name for each in report.failed}
+    with pytest.raises(ConformanceError, match=check):
+        report.raise_for_failures()
+
+
+class BadFeatures:
+    def __init__(self, fault: str) -> None:
+        self.fault = fault
+
+    def extract(self, gray):
+        corners = cv2.goodFeaturesToTrack(gray, 100, 0.01, 5)
+        if self.fault == "changes images":
+            gray[:] = 0
+        xy = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        if self.fault == "outside":
+            xy = xy + 1000
+        count = len(xy)
+        angle = np.full(count, -1 if self.fault == "radians" else 1, np.float32)
+        octave = np.zeros(count, np.int64 if self.fault == "octave" else np.int32)
+        size = 16 if self.fault == "short" else 32
+        return Keypoints(xy, octave, angle, np.ones(count, np.float32), np.zeros((count, size), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("fault", "found"),
+    [("outside", "lie outside the image"), ("radians", "degrees, not radians"), ("octave", "octave is int64"),
+     ("short", "16 bytes, the spec says 32"), ("changes images", "was changed"), ("none", "")],
+)  # fmt: skip
+def test_an_extractor_that_breaks_the_contract_is_found(fault: str, found: str) -> None:
+    if not found:
+        check_features(lambda: BadFeatures(fault), descriptor_bytes=32)
+        return
+    with pytest.raises(ConformanceError, match=found):
+        check_features(lambda: BadFeatures(fault), descriptor_bytes=32)
