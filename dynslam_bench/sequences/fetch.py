@@ -148,8 +148,7 @@ def fetch(
         The sequence's folder.
 
     Raises:
-        SequenceError: Unknown id, or one that has to be got by hand, or the download or the archive is faulty; the
-            message says what was found.
+        SequenceError: Unknown id, one that has to be got by hand, or a faulty download or archive.
     """
     found = status(name, data_root=data_root)
     if found.folder is not None:
@@ -175,9 +174,8 @@ def fetch(
     _take(found, parts, expected is not None, progress)
     for part in unstated:
         first_use.remember(root, part.address, part.sha256)
-    if not keep_archive:
-        for part in parts:
-            part.archive.unlink(missing_ok=True)
+    for part in () if keep_archive else parts:
+        part.archive.unlink(missing_ok=True)
     return found.place
 
 
