@@ -153,14 +153,13 @@ def fetch(
     found = status(name, data_root=data_root)
     if found.folder is not None:
         return found.folder
-    entry = found.entry
+    entry, root = found.entry, find_data_root(data_root)
     if entry.by_hand:
         raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
     expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
     how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
     parts: list[Part] = []
-    root = find_data_root(data_root)
     for address in (url or entry.url, *entry.more_urls):
         archive = root / ".downloads" / _archive_name(address, entry)
         try:
