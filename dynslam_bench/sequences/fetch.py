@@ -148,20 +148,18 @@ def fetch(
         The sequence's folder.
 
     Raises:
-        SequenceError: Unknown id, or one that has to be got by hand, or the download or the archive is faulty; the
-            message says what was found.
+        SequenceError: Unknown id, one that has to be got by hand, or a faulty download or archive.
     """
     found = status(name, data_root=data_root)
     if found.folder is not None:
         return found.folder
-    entry = found.entry
+    entry, root = found.entry, find_data_root(data_root)
     if entry.by_hand:
         raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
     expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
     how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
     parts: list[Part] = []
-    root = find_data_root(data_root)
     for address in (url or entry.url, *entry.more_urls):
         archive = root / ".downloads" / _archive_name(address, entry)
         try:
@@ -175,9 +173,8 @@ def fetch(
     _take(found, parts, expected is not None, progress)
     for part in unstated:
         first_use.remember(root, part.address, part.sha256)
-    if not keep_archive:
-        for part in parts:
-            part.archive.unlink(missing_ok=True)
+    for part in () if keep_archive else parts:
+        part.archive.unlink(missing_ok=True)
     return found.place
 
 
