@@ -77,7 +77,8 @@ def publish(
         list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
         picture_seconds=picture_seconds, most_frames=FRAMES, on_progress=on_progress,
     )  # fmt: skip
-    report.data.unlink()  # rows for `compare`, as large as the rest
+    for path in (report.data, report.markdown, report.latex):  # for work with the results, not for looking at them
+        path.unlink()
     pages = [("leaderboard/index.html", "Leaderboard", "Trackers, sequences, errors, speed and failures.")]
     if study is not None:
         for source in sorted({path for pattern in _KEPT for path in study.glob(pattern) if path.is_file()}):

@@ -42,6 +42,10 @@ class Worker:
         self._most = setup["most_frames"]
         self._told = told
 
+    def do(self, kind: str, job: Job) -> Any:
+        """One job of a kind."""
+        return {"rows": self.rows, "pages": self.pages, "common": self.common}[kind](job)
+
     def rows(self, job: Job) -> list[Any]:
         """The rows of some runs: ``runs`` holds the store's folder and the run's id of each."""
         found = []
@@ -83,7 +87,7 @@ def main(source: TextIO, target: TextIO) -> None:
     for line in source:
         asked = json.loads(line)
         try:
-            say(answer=getattr(worker, asked["kind"])(asked["job"]))
+            say(answer=worker.do(asked["kind"], asked["job"]))
         except DynslamError as error:
             say(fault=[str(error.args[0]), error.hint])
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
@@ -21,15 +20,14 @@ from dynslam_bench.reports.tables.table import Column, Table, TableCell, number,
 
 from .blocks import Block, scenes
 from .importance import FEWEST_TRIALS, importances, inert_parameters
+from .page_figures import MOST_SLICES, front, history, settings_table, slices
 from .preset import preset_text
 from .ratio import Ratio
 from .samplers import is_feasible
 from .seen import seen_note, splits_seen
 from .study import Tuner
 from .summary import Candidate, StudySummary, worth
-from .trials import errors_of
-
-_MODEBAR = {"bgcolor": "rgba(0,0,0,0)", "color": "#c4c9d1", "activecolor": "#1f6fb4"}
+from .trials import best_trials, errors_of
 
 
 def write_page(tuner: Tuner, summary: StudySummary) -> Path:
@@ -48,12 +46,12 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     )  # a stored one may be older than the check
     summary = summary.model_copy(update={"inert": _inert(tuner), "importances": _importances(tuner)})
     summary = summary.model_copy(update={"seen": splits_seen(tuner.defaults, tuner.design)})
-    tables = [_candidates(summary), _trials(tuner, summary)]
+    tables = [_candidates(summary), _trials(tuner, summary), _settings(tuner, summary)]
     figures = _figures(tuner, summary)
     result = [Piece("table", table=tables[0]), *_shown(figures, "ratios")]
     sections = [
         Section("result", "What the study found", "Result", _found(summary), result),
-        Section("preset", "The chosen settings", "Settings", _picks(summary), _preset(tuner, summary)),
+        Section("preset", "The chosen settings", "Settings", _picks(summary), _preset(tuner, summary, tables[2])),
         Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
         Section("trials", "All trials", "Trials", [], [Piece("table", table=tables[1])]),
@@ -103,17 +101,17 @@ def _importances(tuner: Tuner) -> dict[str, float]:
     return importances(tuner.study, _names(tuner))
 
 
-def _preset(tuner: Tuner, summary: StudySummary) -> list[Piece]:
+def _preset(tuner: Tuner, summary: StudySummary, settings: Table) -> list[Piece]:
     """The chosen settings; how to use them stands there only if they hold up on the held-out split."""
-    spec = tuner.spec
+    spec, shown = tuner.spec, Piece("table", table=settings)
     if summary.chosen is None:
-        return []
+        return [shown]
     chosen = summary.candidates[0]
     text = preset_text({**spec.space.fixed, **chosen.params}, spec.tracker, summary.verdict)
     if not summary.improves:
-        return [Piece("code", title="Not recommended: they do not hold up; shown as a record", text=text)]
+        return [shown, Piece("code", title="Not recommended: they do not hold up; shown as a record", text=text)]
     command = f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"
-    return [Piece("code", text=text), Piece("code", title="Use them", text=command)]
+    return [shown, Piece("code", text=text), Piece("code", title="Use them", text=command)]
 
 
 def _picks(summary: StudySummary) -> list[str]:
@@ -156,44 +154,36 @@ def _importance_figure(summary: StudySummary) -> dict[str, Any]:
 
 
 def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
-    """Optuna's own plots, and the ratios with their intervals."""
-    study, spec = tuner.study, tuner.spec
-    several = len(spec.objectives) > 1
-    target: Callable[[FrozenTrial], float] | None = (lambda trial: float(trial.values[0])) if several else None
-    named = [f"log ratio of {each.what} to the default (less is better)" for each in tuner.objectives]
-    name = named[0]
-    finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    shared = sorted({key for trial in finished for key in trial.params})
-    figures: dict[str, Any] = {}
+    """Ratios with their intervals, trials in their order, the front, settings against the objective."""
+    finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    whats = [each.what for each in tuner.objectives]
+    chosen = _best_trial(summary)
+    figures: dict[str, dict[str, Any]] = {}
+    ratio = _ratio_figure(summary)
+    if ratio is not None:
+        figures["ratios"] = ratio
     if finished:
-        plots = optuna.visualization
-        figures["history"] = plots.plot_optimization_history(study, target=target, target_name=name)
-        if shared:
-            ranked = sorted(shared, key=lambda key: -summary.importances.get(key, 0.0))[:5]
-            figures["slices"] = plots.plot_slice(study, params=ranked, target=target, target_name=name)
-        if several:
-            figures["front"] = plots.plot_pareto_front(study, target_names=named)
-    drawn = {key: _plain(figure) for key, figure in figures.items()}
+        figures["history"] = history(finished, whats[0], chosen)
+        used = [each for each in tuner.space if any(each.name in trial.params for trial in finished)]
+        if used:
+            ranked = sorted(used, key=lambda each: -summary.importances.get(each.name, 0.0))[:MOST_SLICES]
+            figures["slices"] = slices(finished, ranked, tuner.base, whats[0], chosen)
+        if len(whats) > 1:
+            best = {trial.number for trial in best_trials(tuner.study, len(finished))}
+            figures["front"] = front(finished, best, whats, chosen)
     if summary.importances:
-        drawn["importances"] = _importance_figure(summary)
-    ratios = _ratio_figure(summary)
-    return drawn if ratios is None else {"ratios": ratios, **drawn}
+        figures["importances"] = _importance_figure(summary)
+    return figures
 
 
-def _plain(figure: Any) -> dict[str, Any]:
-    """A plotly figure as the page draws it: data and layout, without the bulky template."""
-    specification = json.loads(figure.to_json())
-    layout = specification["layout"]
-    layout.pop("template", None)
-    layout.pop("title", None)
-    for name, drawn in layout.items():
-        if name.startswith(("xaxis", "yaxis")):
-            drawn |= {"automargin": True, "gridcolor": "#e5e7eb", "zeroline": False}
-    layout["modebar"] = _MODEBAR
-    layout |= {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)"}
-    layout.setdefault("height", 420)
-    layout.pop("width", None)
-    return {"data": specification["data"], "layout": layout}
+def _best_trial(summary: StudySummary) -> int | None:
+    """The trial that the page is about: the chosen one, else the first candidate; None without any."""
+    return summary.candidates[0].trial if summary.candidates else None
+
+
+def _settings(tuner: Tuner, summary: StudySummary) -> Table:
+    chosen = summary.candidates[0].params if summary.candidates else None
+    return settings_table(tuner.space, tuner.base, chosen, summary.improves)
 
 
 def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
@@ -235,9 +225,9 @@ def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Piece]:
         "ratios": "Ratio to the default settings and its 95 % interval: on the blocks of the choice (confirm), which "
         "no trial had seen, and, for the choice alone, on the held-out blocks and on recordings.",
         "history": "Every trial that came to the end of the race, on its own blocks; trial 0 is the default.",
-        "front": "One objective against the other.",
+        "front": "One objective against the other, with those that no other trial beats in both.",
         "importances": "",
-        "slices": "The most important settings against the objective.",
+        "slices": "The first settings (by importance where that is known) against the objective.",
     }
     return [Piece("figure", figure=name, caption=captions[name]) for name in names if name in figures]
 

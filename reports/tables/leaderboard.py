@@ -141,9 +141,9 @@ def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[T
 
 
 def _mark(board: Board, standing: Standing) -> Emphasis:
-    """Bold for those that may be first, unless that is everybody."""
+    """Bold for those that may be first, unless that is most of them: then it would say nothing."""
     first = [s for s in board.standings if s.group is not None and s.group[0] == 1]
-    return "best" if standing in first and len(first) < len(board.ranked) else ""
+    return "best" if standing in first and 2 * len(first) <= len(board.ranked) else ""
 
 
 def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:

@@ -49,7 +49,6 @@ FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--fixed_delta"}
 FOREIGN_FILES = {
     "associate.py": "a script of the TUM benchmark",
     "evaluate_rpe.py": "a script of the TUM benchmark",
-    "times.txt": "a file of KITTI",
     "masks.txt": "written below the name of each kind of image",
     "my_tracker.py": "the reader's",
 }

@@ -16,8 +16,9 @@ from gymnasium.utils.env_checker import check_env
 import dynslam_bench.envs
 from dynslam_bench.envs import GENERIC_ID, SlamEnv, env_id, register_envs
 from dynslam_bench.sequences.catalogue import sequence_ids
+from dynslam_bench.sequences.synthetic.families.registry import FAMILIES
 
-SYNTHETIC = [name for name in sequence_ids() if name.startswith("synthetic/")]
+SYNTHETIC = [family.ids()[0] for family in FAMILIES.values()]
 CONTROL = ["noise.level_m", "noise.clip", "noise.passes", "noise.enabled"]
 
 
@@ -29,7 +30,7 @@ def checked(env: gym.Env) -> None:
 
 
 @pytest.mark.parametrize("name", SYNTHETIC)
-def test_every_synthetic_id_passes_the_checker_without_a_warning(name: str) -> None:
+def test_every_family_passes_the_checker_without_a_warning(name: str) -> None:
     checked(gym.make(env_id(name), tracker="constant-velocity", render_mode="rgb_array", frames=[0, 20]))
 
 

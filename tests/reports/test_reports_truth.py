@@ -300,6 +300,23 @@ def test_little_data_claims_little():
     assert [cells[names.index("wins")].text for cells in table.rows] == ["2 of 2", "reference"]
 
 
+def test_bold_is_not_given_to_most():
+    """Eleven of twelve that may be first are not eleven bests."""
+    names = "stuvwxyz"
+    apart = [row(name, s, error * (1 + 0.02 * at)) for name, error in (("a", 0.01), ("b", 0.1), ("c", 1.0))
+             for at, s in enumerate(names)]  # fmt: skip
+    near = [row(f"n{k}", s, 0.1 * (1 + 0.4 * ((at * 7 + k * 5) % 4))) for k in range(3) for at, s in enumerate(names)]
+    far = [row("far", s, 50.0 + at, never_move_m=99.0) for at, s in enumerate(names)]
+
+    def bold(rows):
+        table = leaderboard(make_board(rows, reference=rows[0].tracker), PROTOCOL)
+        place = [column.name for column in table.columns].index("ATE ratio")
+        return [cells[place].emphasis for cells in table.rows]
+
+    assert bold(apart) == ["best", "", ""]
+    assert bold(near + far) == [""] * 4
+
+
 # -- frames
 
 

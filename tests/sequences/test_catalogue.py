@@ -13,6 +13,7 @@ from dynslam_bench.sequences import DATASETS, open_sequence, sequence_ids
 from dynslam_bench.sequences.catalogue import catalogue, entry_of
 from dynslam_bench.sequences.fetch import fetch
 from dynslam_bench.sequences.published.cameras import CAMERAS, read_camera, write_camera
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 
 
 @pytest.fixture
@@ -73,7 +74,7 @@ def test_what_has_to_be_got_by_hand_says_so(tmp_path):
 def test_ids_of_all_data_sets_are_listed():
     ids = sequence_ids()
     assert "synthetic/walking_xyz" in ids and "bonn/crowd" in ids and len(ids) == len(set(ids))
-    assert len([name for name in ids if name.startswith("synthetic/")]) == 8
+    assert [name for name in ids if name.startswith("synthetic/")] == list(SYNTHETIC_IDS)
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ class TestRollingShutter:
         renderer: Renderer = sequence.renderer
         for row in (0, 121, 300, 479):
             still = scene.snapshot_from(poses[row], index / 30)
-            view = View(still, poses[row][None], still.local[None])
+            view = View(still, poses[row][None], scene.scale)
             alone = renderer._geometry(view, renderer._tiles(view))[1]
             assert np.abs(alone[row] - depth[row]).max() < 1e-9
 

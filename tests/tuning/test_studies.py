@@ -109,7 +109,8 @@ def test_several_objectives_have_a_front(sequences: list[str], tmp_path: Path) -
     spec = make(sequences, tune=sequences, held_out=[], objectives=["accuracy", "speed"], trials=10, sampler="nsga2")
     tuner = run_study(spec, results=tmp_path)
     assert all(len(trial.values) == 2 for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,)))
-    assert "front" in write_page(tuner, finish(tuner)).read_text()
+    page = write_page(tuner, finish(tuner)).read_text()
+    assert '"name":"front"' in page and '"name":"default"' in page
 
 
 def test_constraints_decide_who_is_a_candidate(sequences: list[str], tmp_path: Path) -> None:

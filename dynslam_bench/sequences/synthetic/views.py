@@ -7,6 +7,7 @@ middle of the image is exposed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,17 +27,32 @@ class View:
     Attributes:
         middle: The scene when the middle of the image is exposed.
         poses: ``[R, 4, 4]`` camera poses of all rows; R is 1 or the height of the image.
-        local: ``[R, P, 12]`` as in `Snapshot`.
+        scale: ``[P, 3]`` scale of each primitive's local axes.
     """
 
     middle: Snapshot
     poses: Array
-    local: Array
+    scale: Array
 
     @property
     def rolling(self) -> bool:
         """Whether every row has its own pose."""
         return len(self.poses) > 1
+
+    @cached_property
+    def local(self) -> Array:
+        """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`."""
+        if not self.rolling:
+            return self.middle.local[None]
+        inverse = np.swapaxes(self.middle.rotation, 1, 2) / self.scale[:, :, None]
+        axes = np.tensordot(inverse.reshape(-1, 3), self.poses[:, :3, :3], axes=(1, 1)).reshape(
+            -1, 3, len(self.poses), 3
+        )
+        away = self.poses[:, None, :3, 3] - self.middle.origin[None]
+        local = np.empty((len(self.poses), len(inverse), 3, 4))
+        local[..., :3] = axes.transpose(2, 0, 1, 3)
+        local[..., 3] = (inverse[None] @ away[..., None])[..., 0]
+        return local.reshape(len(self.poses), -1, 12)
 
     def at_row(self, row: int) -> Snapshot:
         """The scene from the pose of a row."""
@@ -53,16 +69,8 @@ def view_of(scene: Scene, index: int) -> View:
     """How frame `index` sees the scene."""
     middle, readout = scene.snapshot(index / FPS), scene.world.optics.readout_s
     if readout == 0:
-        return View(middle, middle.T_world_cam[None], middle.local[None])
-    poses = scene.poses(row_times(index, readout))
-    inverse = np.swapaxes(middle.rotation, 1, 2) / scene.scale[:, :, None]
-    flat = inverse.reshape(-1, 3)
-    axes = np.tensordot(flat, poses[:, :3, :3], axes=(1, 1)).reshape(-1, 3, len(poses), 3)
-    away = poses[:, None, :3, 3] - middle.origin[None]
-    local = np.empty((len(poses), len(inverse), 3, 4))
-    local[..., :3] = axes.transpose(2, 0, 1, 3)
-    local[..., 3] = (inverse[None] @ away[..., None])[..., 0]
-    return View(middle, poses, local.reshape(len(poses), -1, 12))
+        return View(middle, middle.T_world_cam[None], scene.scale)
+    return View(middle, scene.poses(row_times(index, readout)), scene.scale)
 
 
 def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ from .family import Family
 from .loop import build_loop
 from .twins import build_twin, window_of
 
-OPTICS = Optics(readout_s=0.026, auto_exposure=0.7, color={"shutter": 0.5})
+OPTICS = Optics(readout_s=0.026, auto_exposure=0.7, color={"shutter": 0.3})
 """26 ms from the first row to the last, as in the first Kinect."""
 
 SWINGS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
