@@ -156,26 +156,34 @@ def fetch(
     entry, root = found.entry, find_data_root(data_root)
     if entry.by_hand:
         raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
-    expected = entry.sha256 if checksum else None
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
-    how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
-    parts: list[Part] = []
-    for address in (url or entry.url, *entry.more_urls):
-        archive = root / ".downloads" / _archive_name(address, entry)
-        try:
-            sha256 = download(address, archive, sha256=expected if not parts else None, **how)
-        except DownloadError as error:
-            raise SequenceError(str(error.args[0]), error.hint) from error
-        parts.append(Part(address, archive, sha256))
+    parts = _downloaded(entry, (url or entry.url, *entry.more_urls), root, checksum, how)
     unstated = [part for part in parts if part is not parts[0] or entry.sha256 is None]
     for part in unstated if checksum else ():
         first_use.compare(root, part.address, part.archive, part.sha256)
-    _take(found, parts, expected is not None, progress)
+    _take(found, parts, checksum and entry.sha256 is not None, progress)
     for part in unstated:
         first_use.remember(root, part.address, part.sha256)
     for part in () if keep_archive else parts:
         part.archive.unlink(missing_ok=True)
     return found.place
+
+
+def _downloaded(
+    entry: CatalogueEntry, addresses: tuple[str, ...], root: Path, checksum: bool, how: dict[str, Any]
+) -> list[Part]:
+    """The archives of a sequence; the checksum that the catalogue may know is the first one's."""
+    how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
+    parts: list[Part] = []
+    for address in addresses:
+        archive = root / ".downloads" / _archive_name(address, entry)
+        expected = entry.sha256 if checksum and not parts else None
+        try:
+            sha256 = download(address, archive, sha256=expected, **how)
+        except DownloadError as error:
+            raise SequenceError(str(error.args[0]), error.hint) from error
+        parts.append(Part(address, archive, sha256))
+    return parts
 
 
 def _take(found: Status, parts: list[Part], checked: bool, progress: Report | None) -> None:
