@@ -292,9 +292,9 @@ TARGETS = [
     ),
     Target(
         "classes of recorded masks",
-        lambda data, folder: recorded._read_classes(at(folder, "classes.json", data)),
+        lambda data, folder: recorded.read_classes(at(folder, "classes.json", data)),
         lambda: [b'{"1": "person", "7": "chair"}'],
-        (recorded._read_classes, reading.parse_json),
+        (recorded.read_classes, reading.parse_json),
         mutate_json,
     ),
     Target(
