@@ -74,3 +74,4 @@ pose_error_rot_deg  # a column of frames.csv
 reward_m  # a column of frames.csv
 _.append_logs  # Optuna calls it: a backend of its journal
 _.tempdir  # tempfile reads it: where a run's temporary files go
+_.row_poses  # rendered sequences: the exact pose of every row

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -93,7 +93,8 @@ def build_report(
     count = helpers_for(sum(len(store.ids()) for store in stores))
     shown = {"picture_seconds": picture_seconds, "most_frames": most_frames}
     setup = {"protocol": protocol.model_dump_json(), "output": str(output), **shown}
-    with Crew(count, setup) if count else nullcontext() as crew:
+    hired: AbstractContextManager[Crew | None] = Crew(count, setup) if count else nullcontext()
+    with hired as crew:
         loaded = load_runs(stores, protocol, on_progress, crew)
         board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
         again = command or _command([store.root for store in stores], output, board)
@@ -104,15 +105,18 @@ def build_report(
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")
         draft = _drafted(board, protocol, loaded, explored, again, crew)
-    data = ReportData(
+    on_progress(0, None, "writing")
+    return _write(draft, board, output, _data(board, protocol, title))
+
+
+def _data(board: Board, protocol: Protocol, title: str) -> ReportData:
+    return ReportData(
         title=title,
         protocol=protocol.describe(),
         reference=board.reference_name,
         version=dynslam_bench.__version__,
         rows=board.rows,
     )
-    on_progress(0, None, "writing")
-    return _write(draft, board, output, data)
 
 
 def _drafted(

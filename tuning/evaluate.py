@@ -92,8 +92,7 @@ def evaluate(
         DynslamError: Tracker, settings or a block are unknown or unfit; nothing ran.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
-    held, blocks = held_protocol(protocol), list(blocks)
-    stop = [False]
+    held, blocks, stop = held_protocol(protocol), list(blocks), [False]
 
     def ended() -> bool:
         return stop[0] or (cancelled is not None and cancelled())
@@ -103,10 +102,6 @@ def evaluate(
         if ended():
             raise CancelledError(str(block))
         (record,) = run_many([spec], results=store, protocol=held, cancelled=ended, on_event=on_run)
-        if record.status == "stopped":
-            raise CancelledError(str(block))
-        if record.failed:
-            raise BlockFailedError(f"{block}: {record.status}: {record.reason}")
         return outcome(store, record, block, held, data_root)
 
     with ThreadPoolExecutor(max(1, min(jobs, len(blocks))), thread_name_prefix="dynslam-block") as pool:
@@ -118,7 +113,16 @@ def evaluate(
 
 
 def outcome(store: RunStore, record: RunRecord, block: Block, protocol: Protocol, data_root: str | None) -> Outcome:
-    """What a stored run amounts to; one in which nothing was tracked counts as never having moved."""
+    """What a stored run amounts to; one in which nothing was tracked counts as never having moved.
+
+    Raises:
+        BlockFailedError: It did not come to its end.
+        CancelledError: It was stopped.
+    """
+    if record.status == "stopped":
+        raise CancelledError(str(block))
+    if record.failed:
+        raise BlockFailedError(f"{block}: {record.status}: {record.reason}")
     evaluation = score(store, record, protocol).online
     ate = never_moved_m(block, data_root) if evaluation is None else float(evaluation.metrics["ate_rmse_m"])
     total = record.timings["total"].mean_s

@@ -148,17 +148,15 @@ def fetch(
         The sequence's folder.
 
     Raises:
-        SequenceError: Unknown id, or one that has to be got by hand, or the download or the archive is faulty; the
-            message says what was found.
+        SequenceError: Unknown id, one that has to be got by hand, or a faulty download or archive.
     """
     found = status(name, data_root=data_root)
     if found.folder is not None:
         return found.folder
-    entry = found.entry
+    entry, root = found.entry, find_data_root(data_root)
     if entry.by_hand:
         raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
     how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
-    root = find_data_root(data_root)
     parts = _downloaded(entry, (url or entry.url, *entry.more_urls), root, checksum, how)
     unstated = [part for part in parts if part is not parts[0] or entry.sha256 is None]
     for part in unstated if checksum else ():
@@ -166,9 +164,8 @@ def fetch(
     _take(found, parts, checksum and entry.sha256 is not None, progress)
     for part in unstated:
         first_use.remember(root, part.address, part.sha256)
-    if not keep_archive:
-        for part in parts:
-            part.archive.unlink(missing_ok=True)
+    for part in () if keep_archive else parts:
+        part.archive.unlink(missing_ok=True)
     return found.place
 
 

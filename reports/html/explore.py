@@ -15,7 +15,7 @@ from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
 from ..model.common import representatives
-from ..model.crew import JOB, Crew
+from ..model.crew import JOB, Crew, Heard
 from ..model.rows import Loaded, LoadedRun
 from .explore_data import FrameSummary, FrameSums, explore_content, summarise
 from .page import render_run_page
@@ -104,8 +104,7 @@ def write_explore(
     Raises:
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
-    shown = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
-    shown |= {row.run_id for row in board.rows if row.failed}
+    shown = _pictured(board, loaded)
     shares = _shares(loaded)
     runs = sorted(loaded.runs, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
     done = 0
@@ -116,8 +115,7 @@ def write_explore(
         if progress is not None:
             progress(done, len(runs))
 
-    by_column = [list(group) for _, group in groupby(runs, lambda run: (run.row.run_id in shown, run.row.column_id))]
-    pieces = [group[at : at + JOB] for group in by_column for at in range(0, len(group), JOB)]
+    pieces = _pieces(runs, shown)
     known = [shares.get(piece[0].row.column_id, {}) for piece in pieces]
     if crew is None:
         book = PictureBook(output, picture_seconds)
@@ -126,11 +124,7 @@ def write_explore(
             for piece, share in zip(pieces, known, strict=True)
         ]
     else:
-        jobs = [
-            {"runs": [run.as_job() for run in piece], "shown": [*shown], "share": share}
-            for piece, share in zip(pieces, known, strict=True)
-        ]
-        written = [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
+        written = _written(pieces, shown, known, crew, told)
     sums, total = FrameSums(), Pages()
     for piece, pages in zip(pieces, written, strict=True):
         for run, frames in zip(piece, pages.frames, strict=True):
@@ -140,6 +134,34 @@ def write_explore(
     write_side(output, "explore", explore_content(board, protocol, sums, total.pictured))
     write_atomic(output / RUN_PAGE, render_run_page(title))
     return Explored(len(runs), len(total.pictured), total.note())
+
+
+def _written(
+    pieces: Sequence[Sequence[LoadedRun]],
+    shown: Collection[str],
+    shares: Sequence[Mapping[int, float]],
+    crew: Crew,
+    told: Heard,
+) -> list[Pages]:
+    """What the helpers write."""
+    jobs = [
+        {"runs": [run.as_job() for run in piece], "shown": [*shown], "share": share}
+        for piece, share in zip(pieces, shares, strict=True)
+    ]
+    return [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
+
+
+def _pictured(board: Board, loaded: Loaded) -> set[str]:
+    """The runs of which pictures are shown: those with the median error of their cell, and those that failed."""
+    typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
+    return typical | {row.run_id for row in board.rows if row.failed}
+
+
+def _pieces(runs: Sequence[LoadedRun], shown: Collection[str]) -> list[list[LoadedRun]]:
+    """The runs in pieces of one column each, those with pictures and those without apart."""
+    by_column = groupby(runs, lambda run: (run.row.run_id in shown, run.row.column_id))
+    groups = [list(group) for _, group in by_column]
+    return [group[at : at + JOB] for group in groups for at in range(0, len(group), JOB)]
 
 
 def write_pages(

@@ -147,7 +147,7 @@ def _rows(
     by_part = sorted(range(len(runs)), key=lambda at: runs[at][1].sequence.part)  # a helper reads few ground truths
     pieces = [by_part[at : at + JOB] for at in range(0, len(runs), JOB)]
     jobs = [{"runs": [(str(runs[at][0].root), runs[at][1].run_id) for at in piece]} for piece in pieces]
-    found = {}
+    found: dict[int, RunRow] = {}
     for piece, answer in zip(pieces, crew.work("rows", jobs, heard), strict=True):
         found |= dict(zip(piece, map(RunRow.model_validate, answer), strict=True))
     return [found[at] for at in range(len(runs))]

@@ -23,8 +23,8 @@ from dynslam_bench.sequences.published import cameras
 from dynslam_bench.sequences.readers import lists, tum
 from dynslam_bench.sequences.readers import recorded as recorded_sequence
 from dynslam_bench.sequences.readers.recorded import Description
+from dynslam_bench.sequences.synthetic import ids as synthetic
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
-from dynslam_bench.sequences.synthetic import settings as synthetic
 from dynslam_bench.slam.settings import TrackingSettings
 from dynslam_bench.suites import suite
 from dynslam_bench.trackers.adapters import answers, program

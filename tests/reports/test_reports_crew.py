@@ -39,7 +39,12 @@ def test_helpers_make_the_same_report(store, tmp_path, monkeypatch):
 
 
 def test_a_job_that_cannot_be_done_is_one_line_and_a_dead_helper_is_said(tmp_path):
-    setup = {"protocol": get_protocol("kitti").model_dump_json(), "output": str(tmp_path), "picture_seconds": 0}
+    setup = {
+        "protocol": get_protocol("kitti").model_dump_json(),
+        "output": str(tmp_path),
+        "picture_seconds": 0,
+        "most_frames": 9,
+    }
     with crew.Crew(1, setup) as helpers, pytest.raises(ReportError, match="cannot read"):
         helpers.work("rows", [{"runs": [(str(tmp_path), "0" * 16)]}], crew.unheard_run)
     with crew.Crew(1, {}) as helpers, pytest.raises(InfrastructureError, match="ended early"):

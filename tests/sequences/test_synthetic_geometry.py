@@ -7,6 +7,7 @@ from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic import CAMERA, TWIN_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
+from dynslam_bench.sequences.synthetic.views import view_of
 
 CLEAN = RenderSettings(
     depth=DepthSensor(noise=False), color=ColorSensor(noise=False, shutter=0, exposure_drift=0, flicker=0)
@@ -87,8 +88,9 @@ def test_colours_follow_the_flow() -> None:
 def test_hits_lie_on_their_surfaces(walking) -> None:
     """Every hit point satisfies the implicit equation of its primitive (an independent formula)."""
     renderer, scene = walking.renderer, walking.scene
-    snap = scene.snapshot(3.0)
-    hit, depth = renderer._geometry(snap, renderer._tiles(snap))
+    view = view_of(scene, 90)
+    snap = view.middle
+    hit, depth = renderer._geometry(view, renderer._tiles(view))
     points = CAMERA.unproject(np.stack([U, V], -1), depth)[::3, ::3].reshape(-1, 3)
     keys = hit[::3, ::3].ravel()
     assert (keys >= 0).all()

@@ -25,8 +25,9 @@ def build_condition(alter: Callable[[World, int], World], variant: str, instance
     """The walking twin under a condition, with its own way of the camera."""
     world = alter(build_twin("walking", "xyz", instance), instance)
     camera = partial(camera_poses, "halfsphere", "conditions", instance)
-    people = {} if variant == "walking" else {"actors": (), "bodies": ()}
-    return replace(world, camera=camera, **people)
+    if variant == "walking":
+        return replace(world, camera=camera)
+    return replace(world, camera=camera, actors=(), bodies=())
 
 
 def _plain(world: World, instance: int) -> World:

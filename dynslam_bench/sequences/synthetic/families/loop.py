@@ -67,7 +67,7 @@ def build_loop(variant: str, instance: int) -> World:
 
 def _moves(building: _Building, walk: Walk, moved: bool) -> list[Callable[[float], tuple[Array, Array]]]:
     """Where each loose piece stands, by lap."""
-    paths = []
+    paths: list[Callable[[float], tuple[Array, Array]]] = []
     for number, (_, _, yaw, at) in enumerate(building.loose):
         rng = stream(building.instance, "synthetic", "moved", number)
         places = [(turn(yaw), np.array([*at, 0.0]))]

@@ -66,7 +66,7 @@ def camera_poses(motion: str, people: str, instance: int, times: Array) -> Array
 def camera_axes(tilt: float) -> Array:
     """Camera to world, 3x3, of a camera that looks along +y and `tilt` radians down."""
     rest = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    return rest @ rotations(np.array([[-tilt, 0.0, 0.0]]))[0]
+    return np.asarray(rest @ rotations(np.array([[-tilt, 0.0, 0.0]]))[0])
 
 
 def _turns(t: Array, period: float, slots: int, slot: int) -> Array:

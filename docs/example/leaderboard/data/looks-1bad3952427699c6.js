@@ -1,0 +1,1 @@
+keep("looks-1bad3952427699c6",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":1.2135},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":2.8075}],"stored":false});

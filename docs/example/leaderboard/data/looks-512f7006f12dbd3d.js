@@ -1,0 +1,1 @@
+keep("looks-512f7006f12dbd3d",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":10.206},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":4.6196}],"stored":false});

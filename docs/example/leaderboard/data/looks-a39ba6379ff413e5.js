@@ -1,0 +1,1 @@
+keep("looks-a39ba6379ff413e5",{"looks":[{"index":68,"image":"frames/4bf82fe19e102b32/68.webp","error_mm":6.3607},{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":1.8618},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":2.2074}],"stored":false});

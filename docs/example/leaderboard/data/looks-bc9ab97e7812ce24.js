@@ -1,0 +1,1 @@
+keep("looks-bc9ab97e7812ce24",{"looks":[{"index":94,"image":"frames/4bf82fe19e102b32/94.webp","error_mm":167.08},{"index":103,"image":"frames/4bf82fe19e102b32/103.webp","error_mm":73.299},{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":5.447},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":16.582}],"stored":false});
