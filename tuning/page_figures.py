@@ -80,7 +80,10 @@ def front(trials: Sequence[FrozenTrial], best: set[int], whats: Sequence[str], c
         yaxis=log_axis(titles[1], [1.0, *(pair[1] for pair in found.values())]),
         shapes=[guide(x=1.0), guide(y=1.0)],
     )
-    return {"data": [line, *_marked([(key, *pair) for key, pair in found.items()], chosen)], "layout": layout}
+    return {
+        "data": [line, *_marked([(key, pair[0], pair[1]) for key, pair in found.items()], chosen)],
+        "layout": layout,
+    }
 
 
 def settings_table(

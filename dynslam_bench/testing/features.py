@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
+from dynslam_bench.geometry.pixels import inside
 
 from .report import ConformanceReport, NotApplicable, require
-from .scenes import CornerSequence, hard_frames
+from .scenes import CornerSequence, grey, hard_frames
 
 
 def check_features(construct: Callable[[], FeatureExtractor], *, descriptor_bytes: int | None = None) -> None:
@@ -32,7 +32,7 @@ def features_report(
 ) -> ConformanceReport:
     """Run all checks of `check_features` and report each."""
     scene = CornerSequence(2)
-    images = [cv2.cvtColor(scene[index].rgb, cv2.COLOR_RGB2GRAY) for index in (0, 1)]
+    images = [grey(scene[0]), grey(scene[1])]
     report = ConformanceReport(f"extractor {getattr(construct, '__name__', type(construct).__name__)!r}")
     if not report.run("construction", lambda: _construct(construct)):
         return report
@@ -42,10 +42,10 @@ def features_report(
     report.run("determinism", lambda: _determinism(construct, images))
     report.run("beside a mask", lambda: _beside(construct(), images[0]))
     for name, frame in hard_frames(scene[0]).items():
-        grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        image = grey(frame)
         report.run(
             f"{name} image",
-            lambda grey=grey: _results(construct(), grey, descriptor_bytes),  # type: ignore[misc]
+            lambda image=image: _results(construct(), image, descriptor_bytes),  # type: ignore[misc]
         )
     return report
 
@@ -86,10 +86,10 @@ def check_keypoints(found: Keypoints, shape: tuple[int, ...], descriptor_bytes: 
         f"descriptors have {descriptors.shape[1]} bytes, the spec says {descriptor_bytes}",
     )
     require(np.isfinite(found.xy).all(), "a keypoint is not finite")
-    inside = (found.xy >= -0.5).all(axis=1) & (found.xy <= np.array(shape[::-1]) - 0.5).all(axis=1)
+    within = (found.xy >= -0.5).all(axis=1) & (found.xy <= np.array(shape[::-1]) - 0.5).all(axis=1)
     require(
-        inside.all(),
-        f"{int((~inside).sum())} of {count} keypoints lie outside the image",
+        within.all(),
+        f"{int((~within).sum())} of {count} keypoints lie outside the image",
         "pixels of the full resolution, x first",
     )
     require((found.octave >= 0).all(), "a pyramid level is negative")
@@ -134,12 +134,5 @@ def _beside(extractor: FeatureExtractor, image: NDArray[np.uint8]) -> None:
     found, usual = extractor.extract_beside(image, mask, 1.0), extractor.extract(image)
     check_keypoints(found, image.shape)
 
-    def outside(points: Keypoints) -> int:
-        column, row = np.rint(points.xy).astype(int).T
-        hit = mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]
-        return int((~hit).sum())
-
-    require(
-        outside(found) >= outside(usual),
-        f"{outside(found)} keypoints beside the mask, {outside(usual)} without asking for any",
-    )
+    there, before = (int((~inside(mask, points.xy)).sum()) for points in (found, usual))
+    require(there >= before, f"{there} keypoints beside the mask, {before} without asking for any")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,6 +63,11 @@ class _Masks:
     def __getitem__(self, index: int) -> FrameMasks:
         panel = _draw(self._sequence.camera, range(len(self._sequence))[index])[2]
         return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index else ()))
+
+
+def grey(frame: Frame) -> NDArray[np.uint8]:
+    """A frame's brightness, uint8 ``[H, W]``."""
+    return np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def hard_frames(like: Frame) -> dict[str, Frame]:
