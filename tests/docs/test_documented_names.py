@@ -23,6 +23,7 @@ from documented_names import (
 from dynslam_bench.cli.app import app
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.evaluation import PROTOCOLS
+from dynslam_bench.testing.pytest_plugin import OPTIONS as CHECKED_KINDS
 from dynslam_bench.trackers import TRACKERS
 
 MENTIONS = [*in_pages(), *in_docstrings()]
@@ -67,7 +68,7 @@ def setting_names() -> frozenset[str]:
 @cache
 def options() -> frozenset[str]:
     """Every option of every verb, and those that the benchmark scripts take."""
-    found = set(FOREIGN_OPTIONS)
+    found = set(FOREIGN_OPTIONS) | {f"--dynslam-{kind}" for kind in CHECKED_KINDS}
     waiting: list[Any] = [typer.main.get_command(app)]
     while waiting:
         command = waiting.pop()

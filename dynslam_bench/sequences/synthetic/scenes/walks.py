@@ -32,12 +32,6 @@ class Walk:
     control: Array
     lap_s: float
 
-    @property
-    def lap_m(self) -> float:
-        """Length of a lap in metres."""
-        points = self.at(np.linspace(0.0, self.lap_s, 20 * len(self.control) + 1))
-        return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
     def at(self, times: Array) -> Array:
         """Places ``[N, 2]`` at times (seconds)."""
         s = np.asarray(times, dtype=np.float64) * (len(self.control) / self.lap_s)
