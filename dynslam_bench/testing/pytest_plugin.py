@@ -23,7 +23,7 @@ OPTIONS = {
     "filter": "a dynamic filter: module:Attr or file.py:Attr of a class or function that constructs it",
     "sequence": "a sequence: an id or a folder",
 }
-"""What can be checked: the option ``--dynslam-KIND`` and its help."""
+"""What can be checked: the end of the option's name, and its help."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -21,8 +21,9 @@ STUDY = (
 
 
 def attentive():
-    """Programs that a script starts in the background ignore Ctrl-C, and so do their children."""
+    """Programs that a script starts in the background ignore Ctrl-C, below `nohup` the end of the terminal too."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize(

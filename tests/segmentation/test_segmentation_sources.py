@@ -220,7 +220,9 @@ def test_auto(monkeypatch, tmp_path):
     assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "embedded"
     monkeypatch.setattr(building, "embedded_weights", lambda: None)
     assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "oracle"
-    with pytest.raises(SegmentationError, match=r"'bonn/crowd'.*segmentation.source=onnx:PATH.*needs no masks"):
+    with pytest.raises(
+        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*embedded.*needs no masks"
+    ):
         resolve_source(auto, "bonn/crowd")
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
     assert resolve_source(auto, "bonn/crowd") == "coco"

@@ -139,8 +139,8 @@ function axesOf(panel) {
     }
   } else
     for (const tick of sx.ticks(Math.max(2, width / 70))) {
-      const x = left + sx.at(tick) * width;
-      group.append(svg("path", { d: `M${x} ${top}V${bottom}`, class: "grid" }), write([tickText(tick)], x, bottom + 16, { "text-anchor": "middle" }));
+      const x = left + sx.at(tick) * width, text = tickText(tick), within = Math.min(x, left + width + 10 - widthOf(text) / 2);
+      group.append(svg("path", { d: `M${x} ${top}V${bottom}`, class: "grid" }), write([text], within, bottom + 16, { "text-anchor": "middle" }));
     }
   if (sy.kind === "category") {
     for (const name of sy.categories) {
