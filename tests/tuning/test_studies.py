@@ -106,7 +106,7 @@ def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_pat
 
 
 def test_several_objectives_have_a_front(sequences: list[str], tmp_path: Path) -> None:
-    spec = make(sequences, tune=sequences, held_out=[], objectives=["accuracy", "speed"], trials=10, sampler="nsga2")
+    spec = make(sequences, held_out=[], objectives=["accuracy", "speed"], trials=6, sampler="nsga2")
     tuner = run_study(spec, results=tmp_path)
     assert all(len(trial.values) == 2 for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,)))
     page = write_page(tuner, finish(tuner)).read_text()
@@ -131,7 +131,7 @@ if __name__ == "__main__":
 
 
 def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_path: Path) -> None:
-    spec = make(sequences, trials=12)
+    spec = make(sequences, trials=8)
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
     checkout = str(Path(__file__).resolve().parents[2])
@@ -152,7 +152,7 @@ def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_
     assert len(before) >= 3
     assert all(after[number].values == values for number, values in before.items()), "no finished trial was lost"
     lost = [trial for trial in after if trial.user_attrs.get("reason") == CRASHED_WORKER]
-    assert len(lost) <= 1 and len(after) == 12 + len(lost), "none doubled"
+    assert len(lost) <= 1 and len(after) == 8 + len(lost), "none doubled"
     assert [trial.number for trial in after] == list(range(len(after)))
 
 
