@@ -30,9 +30,6 @@ IDENTITY = {"orb-slam2"}
 SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
 """Need five keyframes, or a window of frames, before they judge."""
 
-UNMEASURED_F = {"emfoa-oft-paper-no-masks"}
-"""Ablations of which it has not been measured yet how often their fundamental matrix judges."""
-
 
 @pytest.fixture(scope="module")
 def walking():
@@ -166,8 +163,7 @@ def test_of_every_system_with_a_fundamental_matrix_it_was_measured_how_often_tha
         if any("f_asked" in each.stats_names for each in tracker._filters):
             asking.add(spec.id)
     assert len(asking) > 15
-    assert asking - UNMEASURED_F == {spec.id for spec in SYSTEMS if epipolar_skipped(spec.id)}
-    assert asking >= UNMEASURED_F
+    assert asking == {spec.id for spec in SYSTEMS if epipolar_skipped(spec.id)}
     shares = [share for name in asking for share in epipolar_skipped(name).values()]
     assert min(shares) >= 0 and max(shares) <= 1
 
