@@ -38,8 +38,8 @@ def estimate(frames: int, study_frames: int, trials: int, jobs: int) -> str:
     minutes = max(1, math.ceil(seconds / max(jobs, 1) / 60))
     machine = f"{jobs} quiet core{'s' * (jobs != 1)}"
     return (
-        f"about {minutes} minute{'s' * (minutes > 1)} on {machine}, the first time some more for compiling: {rendered} "
-        f"frames are rendered, {runs} runs made, and {trials} trials of a study"
+        f"about {minutes} minute{'s' * (minutes > 1)} on {machine}, two or three times that when it first compiles; "
+        f"{rendered} frames are rendered, {runs} runs made, and {trials} trials of a study"
     )
 
 
@@ -78,12 +78,10 @@ def _verdict(factor: float) -> str:
 
 
 def _costs(records: Sequence[RunRecord]) -> list[str]:
-    """Mean processor milliseconds a frame, of systems that ran."""
-    from dynslam_bench.tuning.evaluate import processor_seconds
-
+    """Milliseconds of the median frame, of systems that ran; a mean would count the compiling of a first run."""
     spent: dict[str, list[float]] = {}
     for record in records:
-        if not record.failed and record.tracker.id in (PLAIN, *CULLING):
-            spent.setdefault(record.tracker.id, []).append(1e3 * processor_seconds(record))
+        if not record.failed and record.frame_time_s is not None and record.tracker.id in (PLAIN, *CULLING):
+            spent.setdefault(record.tracker.id, []).append(1e3 * record.frame_time_s)
     costs = [f"{mean(spent[name]):.0f} ms ({name})" for name in (PLAIN, *CULLING) if name in spent]
-    return [f"What it costs: {', '.join(costs)} of processor time a frame."] if len(costs) > 1 else []
+    return [f"What it costs, at the median frame: {', '.join(costs)}."] if len(costs) > 1 else []

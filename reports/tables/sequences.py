@@ -64,7 +64,7 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         caption += f" {SEEN_NOTE}"
     brief = "Absolute trajectory error (RMSE, mm), lost frames held"
     return Table(
-        "per_sequence", "Absolute trajectory error by sequence", caption, columns, rows, muted, separators, brief
+        "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
     )
 
 

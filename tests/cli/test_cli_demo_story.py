@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from dynslam_bench.cli.demo_story import estimate, tell
@@ -39,6 +41,20 @@ def test_every_sequence_has_its_sentence_and_what_did_not_run_has_none() -> None
     ]  # fmt: skip
     assert lines[1].endswith("3.0 mm without culling (orb-slam2).") and len(lines) == 3, "no costs without records"
     assert "proves nothing" in lines[-1]
+
+
+def test_what_culling_costs_is_the_median_frame_of_the_runs_that_ended_well() -> None:
+    def record(tracker: str, frame_time_s: float | None, failed: bool = False) -> SimpleNamespace:
+        return SimpleNamespace(tracker=SimpleNamespace(id=tracker), frame_time_s=frame_time_s, failed=failed)
+
+    records = [
+        record("orb-slam2", 0.03),
+        record("orb-slam2", 0.05),
+        record("mask-rcnn", 0.1),
+        record("mask-rcnn", 9, True),
+    ]
+    *_, costs, _ = tell([row("orb-slam2", 0.02)], records)
+    assert costs == "What it costs, at the median frame: 40 ms (orb-slam2), 100 ms (mask-rcnn)."
 
 
 def test_the_estimate_grows_with_what_is_asked_for() -> None:
