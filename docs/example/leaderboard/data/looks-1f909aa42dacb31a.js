@@ -1,1 +1,0 @@
-keep("looks-1f909aa42dacb31a",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":1.3327},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":1.8566}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-2b3bf491e4917590",{"looks":[{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":0.72052},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":0.56761}],"stored":false});

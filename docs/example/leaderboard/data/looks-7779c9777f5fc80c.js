@@ -1,1 +1,0 @@
-keep("looks-7779c9777f5fc80c",{"looks":[{"index":169,"image":"frames/5c6b2da4d248adf9/172.webp","error_mm":4.6536},{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":0.90857},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":1.5095}],"stored":false});

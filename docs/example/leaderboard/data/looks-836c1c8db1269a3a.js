@@ -1,1 +1,0 @@
-keep("looks-836c1c8db1269a3a",{"looks":[{"index":84,"image":"frames/5c6b2da4d248adf9/87.webp","error_mm":24.352},{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":2.1557},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":3.0687}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-af20bc58b6c63f1e",{"looks":[{"index":116,"image":"frames/5c6b2da4d248adf9/119.webp","error_mm":9.4094},{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":0.32241},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":1.0483}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-b89de4a2e75e5667",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":1.9585},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":2.0361}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-d8f8b9b036d22180",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":2.3864},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":1.3587}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-e0813559f001f514",{"looks":[{"index":81,"image":"frames/4bf82fe19e102b32/81.webp","error_mm":5.9332},{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":1.2384},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":3.9954}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-ec74f0c8c9aad9ea",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":1.0365},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":2.1512}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-ef3c93325600522c",{"looks":[{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":14.753},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":2.0094}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-f72143b1f14e416d",{"looks":[{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":1.2074},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":0.18387}],"stored":false});

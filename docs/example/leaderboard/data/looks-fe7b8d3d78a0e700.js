@@ -1,1 +1,0 @@
-keep("looks-fe7b8d3d78a0e700",{"looks":[{"index":81,"image":"frames/4bf82fe19e102b32/81.webp","error_mm":54.692},{"index":186,"image":"frames/4bf82fe19e102b32/186.webp","error_mm":9.1526},{"index":199,"image":"frames/4bf82fe19e102b32/199.webp","error_mm":2.0777}],"stored":false});
