@@ -51,7 +51,13 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     result = [Piece("table", table=tables[0]), *_shown(figures, "ratios")]
     sections = [
         Section("result", "What the study found", "Result", _found(summary), result),
-        Section("preset", "Settings: default, best trial, range", "Settings", _picks(summary), _preset(tuner, summary, tables[2])),
+        Section(
+            "preset",
+            "Settings: default, best trial, range",
+            "Settings",
+            _picks(summary),
+            _preset(tuner, summary, tables[2]),
+        ),
         Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
         Section("trials", "All trials", "Trials", [], [Piece("table", table=tables[1])]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import cv2
@@ -36,15 +37,19 @@ SPEC = FlowSpec("still", f"{__file__}:build")
 """
 
 
-def run_pytest(folder: Path, *options: str) -> str:
-    command = [sys.executable, "-m", "pytest", "-v", "-p", "dynslam_bench.testing.pytest_plugin", *options]
-    command += ["-p", "no:cacheprovider", "-p", "no:xdist", str(folder)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
+INSTALLED = bool(entry_points(group="pytest11", name="dynslam-bench"))
+"""Where the distribution is installed, pytest finds the plug-in by itself."""
+
+
+def run_pytest(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", "-p", "no:xdist", *options, str(folder)]
+    command += [] if INSTALLED else ["-p", "dynslam_bench.testing.pytest_plugin"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
 def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(FLOW)
-    out = run_pytest(tmp_path, "--dynslam-flow", "still.py:SPEC")
+    out = run_pytest(tmp_path, "--dynslam-flow", "still.py:SPEC").stdout
     assert re.search(r"still\.py:SPEC::determinism PASSED", out), out
     assert re.search(r"still\.py:SPEC::a small shift is found FAILED", out), out
     assert "xy are positions in the target, x first, not displacements" in out
@@ -52,8 +57,7 @@ def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
 
 
 def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pytest", "-p", "dynslam_bench.testing.pytest_plugin", "-p", "no:cacheprovider"]
-    ended = subprocess.run([*command, "--dynslam-flow", "dasiy", str(tmp_path)], capture_output=True, text=True)
+    ended = run_pytest(tmp_path, "--dynslam-flow", "dasiy")
     assert ended.returncode == 4 and "--dynslam-flow: unknown flow 'dasiy'" in ended.stderr + ended.stdout
     assert "Traceback" not in ended.stderr + ended.stdout
 

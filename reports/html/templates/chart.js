@@ -2,6 +2,7 @@
 const DEFAULT_COLOURS = ["#1f6fb4", "#d9542b", "#2a9d6f", "#8a5cc2"];
 const NARROW = 620, FONT = "12.5px Inter, system-ui, sans-serif";
 const ruler = document.createElement("canvas").getContext("2d");
+const COUNTS = Array.from({ length: 41 }, (_, step) => 2 + step / 4);  // of ticks: how many fit is known only once the room for them is
 const widthOf = (text) => { ruler.font = FONT; return ruler.measureText(text).width; };
 const plain = (text) => String(text ?? "").replace(/<b>|<\/b>/g, "").replace(/&lt;/g, "<").replace(/&gt;/g, ">").replace(/&amp;/g, "&");
 const linesOf = (text) => String(text ?? "").split("<br>").map(plain);
@@ -101,7 +102,7 @@ function arrange(panels, layout, width) {
       const named = panel.sy.kind === "category";
       const longest = named ? Math.max(...panel.sy.categories.flatMap(linesOf).map(widthOf)) : 0;
       panel.inside = named && (narrow || longest > width * 0.34);
-      const ticks = named ? [] : [2, 4, 6, 8, 10].flatMap((count) => panel.sy.ticks(count)).map(tickText);
+      const ticks = named ? [] : COUNTS.flatMap((count) => panel.sy.ticks(count)).map(tickText);
       const left = named ? (panel.inside ? 8 : longest + 14) : Math.max(28, ...ticks.map((text) => widthOf(text) + 12));
       panel.left = column * (outer + gap) + left;
       panel.width = Math.max(outer - left - 12, 40);
