@@ -114,6 +114,7 @@ def opened(page: Path, folder: Path) -> str:
     paints, loads = [], []
     for _ in range(5):
         browser.open(page)
+        browser.until(f"{PAINT} && {LOAD}")  # the first paint may be noted after the load event
         paints.append(browser.run(PAINT))
         loads.append(browser.run(LOAD))
     fetched = {url.removeprefix("file://") for url in browser.fetched if url.startswith("file://")}
