@@ -169,7 +169,7 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
         try:
             values.extend(map(float, parts))
         except ValueError:
-            bad = next(part for part in parts if not _is_number(part))
+            bad = next(part for part in parts if not is_number(part))
             raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
     if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
@@ -188,7 +188,8 @@ def _plain_table(path: Path, columns: int) -> NDArray[np.float64] | None:
     return None
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a text is a number, as tables of numbers are read."""
     try:
         float(text)
     except ValueError:

@@ -174,7 +174,7 @@ TARGETS = [
             b"# nothing\n",
             b"1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",
         ],
-        (tum_file.load_tum, tum_file.read_table, tum_file._is_number, tum_file._hint, reading.read_lines),
+        (tum_file.load_tum, tum_file.read_table, tum_file.is_number, tum_file._hint, reading.read_lines),
     ),
     Target(
         "KITTI trajectory",

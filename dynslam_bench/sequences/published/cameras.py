@@ -22,6 +22,15 @@ _WILD_SLAM = (
 )
 """Distortion of Wild-SLAM's cameras, as its authors' configurations state it."""
 
+_WILD_SLAM_DISTORTION = (
+    -0.0550149604678154,
+    0.06560786068439484,
+    -0.0005061274860054255,
+    0.0004771310486830771,
+    -0.021717390045523643,
+)
+"""Of both of its cameras."""
+
 CAMERAS: dict[str, Camera] = {
     # Calibration of the colour cameras as published with the TUM RGB-D benchmark.
     "tum-fr1": Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -39,13 +48,7 @@ CAMERAS: dict[str, Camera] = {
         646.4154663085938,
         643.1209716796875,
         365.55963134765625,
-        (
-            -0.0550149604678154,
-            0.06560786068439484,
-            -0.0005061274860054255,
-            0.0004771310486830771,
-            -0.021717390045523643,
-        ),
+        _WILD_SLAM_DISTORTION,
     ),
     "wild-slam-anymal": Camera(
         1280,
@@ -54,13 +57,7 @@ CAMERAS: dict[str, Camera] = {
         646.9425659179688,
         643.1209716796875,
         365.55963134765625,
-        (
-            -0.0550149604678154,
-            0.06560786068439484,
-            -0.0005061274860054255,
-            0.0004771310486830771,
-            -0.021717390045523643,
-        ),
+        _WILD_SLAM_DISTORTION,
     ),
 }
 

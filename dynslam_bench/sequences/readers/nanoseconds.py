@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.reading import read_lines
+from dynslam_bench.geometry.tum_file import is_number
 
 from .lists import MOST_LINES
 
@@ -72,16 +73,8 @@ def _numbers(texts: list[str], path: Path, meaning: str) -> NDArray[np.float64]:
     try:
         found = np.array([float(text) for text in texts])
     except ValueError:
-        bad = next(text for text in texts if not _is_number(text))
+        bad = next(text for text in texts if not is_number(text))
         raise SequenceError(f"{path}: '{bad[:40]}' is not {meaning}") from None
     if not np.isfinite(found).all():
         raise SequenceError(f"{path} holds values that are not finite")
     return found
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
