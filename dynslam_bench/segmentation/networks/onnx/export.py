@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing
 
+from ...settings import SegmentationSettings
+from ..checkpoints import COCO, embedded_weights, fetch_checkpoint
 from ..mask_rcnn.loading import load_network
 from ..mask_rcnn.network import MaskRCNN
 from ..mask_rcnn.static import StaticMaskRCNN
@@ -23,6 +26,8 @@ OPSET = 18
 SIZE = (480, 640)
 """Height and width of the images, unless others are asked for: those of TUM and Bonn."""
 FLOOR = 0.1
+SMALLEST, LARGEST = 32, 4096
+"""Sides of an image in pixels."""
 OUTPUTS = ("boxes", "labels", "scores", "masks")
 
 
@@ -67,6 +72,51 @@ def export_network(
     if side > 0:
         network.set_input(side)
     return write_onnx(network.fuse(), path, size=size, score=score, iou=iou)
+
+
+class Weights(NamedTuple):
+    """A checkpoint and the shorter side at which it works, 0 for its own."""
+
+    path: Path
+    side: int
+
+
+def weights_of(source: str, side: int | None = None) -> Weights:
+    """The checkpoint behind a source of masks, fetched if need be.
+
+    Args:
+        source: ``embedded``, ``coco`` or ``weights:PATH``.
+        side: Shorter side in pixels; None for that of a run.
+
+    Raises:
+        SegmentationError: There is no such checkpoint, or it cannot be fetched.
+    """
+    kind, _, argument = source.partition(":")
+    if kind == "embedded" and not argument:
+        path = embedded_weights()
+        if path is None:
+            raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
+        return Weights(path, side or 0)
+    if kind == "coco" and not argument:
+        return Weights(fetch_checkpoint(COCO), SegmentationSettings().network_side if side is None else side)
+    if kind == "weights" and argument:
+        return Weights(Path(argument).expanduser(), SegmentationSettings().network_side if side is None else side)
+    raise SegmentationError(f"'{source}' is no network of ours", "export embedded, coco or weights:PATH")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Height and width of ``640x480``, which names the width first.
+
+    Raises:
+        SegmentationError: It is no such text, or a side is outside 32 to 4096 pixels.
+    """
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    width, height = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
+        raise SegmentationError(
+            f"'{text}' is no size of an image", f"for example 640x480; sides from {SMALLEST} to {LARGEST} pixels"
+        )
+    return height, width
 
 
 def write_onnx(
