@@ -78,7 +78,8 @@ def _logs(errors: Mapping[Block, float]) -> dict[Block, float]:
 def unseen_blocks(blocks: list[Block], split: str, number: int) -> set[Block]:
     """What the study of this number must not see."""
     if split == "starts":
-            return {block for block in blocks if block.offset != starts[number % len(starts)]}
+        starts = sorted({block.offset for block in blocks})
+        return {block for block in blocks if block.offset != starts[number % len(starts)]}
     found = list(scenes(blocks).values())
     return set(found[number % len(found)])
 
