@@ -1,6 +1,7 @@
 """The race replayed on recorded runs: what share of the grid's runs it takes, and how much worse its choice is.
 
     python tests/benchmarks/race_replay.py RESULTS... [--default orb-slam2] [--orders 200] [--best 0] [--unseen starts]
+                                             [--race halving none ...]
 
 The trials are the configurations of stored runs (systems, and their variants), the blocks what all of them ran on; each
 order of the trials is one study. Values, steps and rules are those of studies. A study runs on the blocks of one start
@@ -91,6 +92,7 @@ def main() -> None:
     parser.add_argument("--default", default="orb-slam2")
     parser.add_argument("--orders", type=int, default=200)
     parser.add_argument("--best", type=int, default=0)
+    parser.add_argument("--race", nargs="+", choices=get_args(RaceName), default=get_args(RaceName))
     parser.add_argument("--unseen", choices=("starts", "scene"), default="starts")
     options = parser.parse_args()
     grid = recorded(options.results)
@@ -100,7 +102,7 @@ def main() -> None:
     kept = sorted(worth, key=lambda name: worth[name])[: options.best or len(worth)]
     print(f"{len(kept)} configurations, {len(blocks)} blocks in {len(scenes(blocks))} scenes, {options.orders} orders")
     print("| race | runs | regret |\n| --- | --- | --- |")
-    for rule in get_args(RaceName):
+    for rule in options.race:
         found = []
         for number in range(options.orders):
             unseen = unseen_blocks(blocks, options.unseen, number)
