@@ -1,4 +1,4 @@
-"""Our networks for other runtimes: fixed shapes give the same objects, and so does the ONNX file where it can be made."""
+"""Our networks for other runtimes: fixed shapes give the same objects, and so does the ONNX file, if it can be made."""
 
 from __future__ import annotations
 
