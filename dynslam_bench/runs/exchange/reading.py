@@ -7,11 +7,12 @@ from pathlib import Path
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_file import load_trajectory
 from dynslam_bench.geometry.tum_file import FileNotes, TumFile
+from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.sequences.readers.lists import read_image_list
 
 from .colmap import IMAGES, read_colmap
 from .pose_tables import is_pose_table, read_pose_table
-from .ros_bag import SUFFIXES, read_bag_trajectory
+from .ros_bag import read_bag_trajectory
 
 
 def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topic: str | None = None) -> TumFile:
@@ -30,7 +31,7 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
     path = Path(path).expanduser()
     if path.name == IMAGES or (path / IMAGES).is_file():
         return _whole(read_colmap(path, None if timestamps is None else _stamps_by_name(Path(timestamps))))
-    if path.suffix in SUFFIXES or path.is_dir():
+    if is_bag(path) or path.is_dir():
         return _whole(read_bag_trajectory(path, topic))
     if is_pose_table(path):
         return _whole(read_pose_table(path))

@@ -20,7 +20,6 @@ from dynslam_bench.sequences.readers.bodies import camera_truth
 
 from .pose_tables import nanoseconds
 
-SUFFIXES = (".mcap", ".bag", ".db3")
 POSE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
 BAG = "trajectory"
 _BILLION = 1_000_000_000

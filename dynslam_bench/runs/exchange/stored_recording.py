@@ -6,6 +6,7 @@ import contextlib
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -61,7 +62,7 @@ def write_stored(
     return notes if len(seen) < len(sequence) else []
 
 
-def _scaled(shot: Snapshot, scale: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Snapshot:
+def _scaled(shot: Snapshot, scale: NDArray[np.float64]) -> Snapshot:
     """A snapshot of an image that the tracker's preprocessing had resized, in pixels of the sequence's."""
     if (scale == 1).all():
         return shot
@@ -69,8 +70,9 @@ def _scaled(shot: Snapshot, scale: np.ndarray[tuple[int, ...], np.dtype[np.float
     return Snapshot(shot.index, points, shot.kept, shot.mask)
 
 
-def _pose_at(trajectory: Trajectory, stamp: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+def _pose_at(trajectory: Trajectory, stamp: float) -> NDArray[np.float64] | None:
     near = int(np.searchsorted(trajectory.timestamps, stamp - _TOLERANCE_S))
     if near < len(trajectory) and abs(trajectory.timestamps[near] - stamp) <= _TOLERANCE_S:
-        return trajectory.T_world_cam[near]
+        pose: NDArray[np.float64] = trajectory.T_world_cam[near]
+        return pose
     return None

@@ -108,7 +108,8 @@ class StaticMaskRCNN(nn.Module):
 
     def _pooled(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         """RoIAlign ``[K, C, size, size]`` of one image's boxes; see `roi_align`."""
-        return torch.cat([self._pooled_few(levels, few, size, canonical) for few in boxes.split(CHUNK)])
+        few = [boxes[start : start + CHUNK] for start in range(0, len(boxes), CHUNK)]
+        return torch.cat([self._pooled_few(levels, each, size, canonical) for each in few])
 
     def _pooled_few(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         count, channels = len(boxes), levels[0].shape[1]
