@@ -21,7 +21,7 @@ OPTIONS = {
     "flow": "an optical flow: id, module:Attr or file.py:Attr of a FlowSpec",
     "features": "a feature extractor: id, module:Attr or file.py:Attr of a FeatureSpec",
     "filter": "a dynamic filter: module:Attr or file.py:Attr of a class or function that constructs it",
-    "sequence": "a sequence: an id or a folder; module:Attr or file.py:Attr of a DatasetSpec for the first one it lists",
+    "sequence": "a sequence: id, folder, or module:Attr or file.py:Attr of a DatasetSpec (the first that it lists)",
 }
 """What can be checked: the end of the option's name, and its help."""
 
