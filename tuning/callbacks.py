@@ -15,7 +15,7 @@ class TensorBoard:
     """Writes each complete trial as a run of TensorBoard: its settings as hyper-parameters, its values as metrics.
 
     Example:
-        ``Study(..., callbacks=[TensorBoard("board")]).run()``, then ``tensorboard --logdir board``
+        ``Study(..., callbacks=[TensorBoard("board")]).run()``, then point TensorBoard at that folder
 
     Args:
         folder: Where; one folder a trial is made in it.

@@ -50,14 +50,12 @@ def import_trajectory(
     """Store an external trajectory as a record of kind ``imported``.
 
     Args:
-        path: A trajectory in any of the formats that `read_trajectory` knows: TUM, KITTI, EuRoC, VSLAM-LAB, COLMAP, a
-            ROS bag or MCAP file.
+        path: A trajectory in any of the formats that `read_trajectory` knows.
         tracker: Name of the system that made it.
         sequence: The sequence that it was made on; its ground truth is needed to score it.
         results: The results folder, or a store.
         label: Name for tables; default is ``<tracker> (imported)``.
-        provenance: Where it came from, e.g. a URL or "authors' repository"; by default what ``provenance.json`` beside
-            an export of this package says, else the file's name.
+        provenance: Where it came from, e.g. a URL; by default what ``provenance.json`` beside it says, else its name.
         which: Whether its poses are the causal ones or those after the final optimisation.
         frames: Part of the sequence it covers; None for all.
         stride: Every so many frames.
