@@ -64,6 +64,7 @@ ap  # segmenter evaluate
 ap50  # segmenter evaluate
 frame_iou  # segmenter evaluate
 instance_iou  # segmenter evaluate
+tracker_provenance  # provenance.json of an export
 checked  # record of a fetched sequence
 improves  # a study's summary
 cost_before  # BundleResult, printed by tests/benchmarks/backend_bundle.py
