@@ -113,10 +113,13 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
         SequenceError: `rosbags` is not installed, the bag is damaged, or the topic is missing or one of several.
     """
     source = Path(bag).expanduser()
-    with _opened(source) as reader:
-        topics = _Topics(reader, source)
-        chosen = topics.pose(topic, "--topic")
-        lines = [messages.pose_line(found) for found in _read(reader, topics.connection(chosen))] if chosen else []
+    try:
+        with _opened(source) as reader:
+            topics = _Topics(reader, source)
+            chosen = topics.pose(topic, "--topic")
+            lines = [messages.pose_line(found) for found in _read(reader, topics.connection(chosen))] if chosen else []
+    except OSError as error:  # e.g. a file that its metadata name is missing
+        raise SequenceError(f"bag {source} cannot be read: {error.strerror or error}") from error
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
     if not np.isfinite(table).all():
         raise SequenceError(f"{source} holds poses that are not finite")

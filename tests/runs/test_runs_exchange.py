@@ -225,3 +225,14 @@ def test_a_damaged_map_is_one_line(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(RunError, match="is no map of this package"):
         read_ply(path)
+
+
+def test_folders_that_hold_no_trajectory(store: RunStore, run: RunRecord, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(TrajectoryError, match=r"holds neither images\.txt of COLMAP nor a bag of ROS 2"):
+        read_trajectory(tmp_path / "empty")
+    bag = export_run(run, "mcap", results=store).folder
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("trajectory.mcap", "gone.mcap"))
+    with pytest.raises(DynslamError, match="cannot be read"):
+        read_trajectory(bag, topic="/estimate/pose")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_file import load_trajectory
 from dynslam_bench.geometry.tum_file import FileNotes, TumFile
@@ -31,8 +32,10 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
     path = Path(path).expanduser()
     if path.name == IMAGES or (path / IMAGES).is_file():
         return _whole(read_colmap(path, None if timestamps is None else _stamps_by_name(Path(timestamps))))
-    if is_bag(path) or path.is_dir():
+    if is_bag(path):
         return _whole(read_bag_trajectory(path, topic))
+    if path.is_dir():
+        raise TrajectoryError(f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2")
     if is_pose_table(path):
         return _whole(read_pose_table(path))
     return load_trajectory(path, timestamps)
