@@ -35,6 +35,7 @@ FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / 
 RUN = "a7abe04996a79cc4"
 
 
+@cache
 def _stored(name: str) -> bytes:
     (path,) = FIXTURE.glob(name)
     return path.read_bytes()
