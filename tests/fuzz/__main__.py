@@ -48,7 +48,8 @@ def _all(
                 said.unlink()
             else:
                 what = [f"its process ended with {child.exitcode} (seed {seed})"]
-                yield dict(reader=target.name, inputs=0, refused=0, seconds=0, code="", missed=[], n_lines=0, findings=what)
+                none = {"inputs": 0, "refused": 0, "seconds": 0, "code": "", "missed": [], "n_lines": 0}
+                yield {"reader": target.name, **none, "findings": what}
 
 
 def _job(target: Target, seconds: float, inputs: float, seed: int, findings: Path, said: Path) -> None:
