@@ -54,7 +54,7 @@ def show(
 ) -> None:
     """Show everything about a run."""
     from dynslam_bench.runs import RunStore, score
-    from dynslam_bench.runs.storage.run_list import part_words
+    from dynslam_bench.runs.storage.run_index import part_words
 
     store = RunStore(results)
     record = store.read(run)

@@ -2,9 +2,9 @@
 
     python tests/benchmarks/many_records.py [--records 100000] [--report]
 
-Makes a results folder of so many runs, each stored as runs are (record, trajectory, errors), by giving the two runs of
-`tests/fixtures` other ids, trackers, sequences and seeds. A list is `dynslam-bench runs list`, the report
-`dynslam-bench report`; each runs in a process of its own, whose processor time is printed beside the wall time.
+Makes a results folder of so many runs, each stored as runs are (record, trajectory, errors), by giving a run of
+`tests/fixtures` other ids, trackers, sequences, seeds, errors and settings. A list is `dynslam-bench runs list`, the
+report `dynslam-bench report`; each runs in a process of its own, whose processor time is printed beside the wall time.
 
 Bars: 100,000 records are listed within 3 s once they are known, and reported within 60 s.
 """
@@ -12,6 +12,8 @@ Bars: 100,000 records are listed within 3 s once they are known, and reported wi
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import resource
 import shutil
@@ -24,6 +26,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 FIXTURE = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
 TRACKERS, SEQUENCES = 20, 50
+SETTINGS = 120
+"""As many as trackers have: a record of 12 KB."""
 
 
 def fill(results: Path, records: int) -> None:
@@ -31,22 +35,25 @@ def fill(results: Path, records: int) -> None:
     shutil.copytree(FIXTURE / "sequences", results / "sequences")
     (metrics,) = (FIXTURE / "metrics").iterdir()
     old = min((FIXTURE / "runs").iterdir())
-    record = (old / "run.json").read_text()
-    scored = (metrics / f"{old.name}.json").read_text()
+    record, scored = json.loads((old / "run.json").read_text()), json.loads((metrics / f"{old.name}.json").read_text())
     track = (old / "trajectory_online.txt").read_text()
-    tracker, sequence = ('"id": "never-move"', '"id": "synthetic/walking_xyz"')
+    record["settings"] = {f"group_{at % 12}.setting_{at}": 0.5 * at for at in range(SETTINGS)}
+    record["identity"]["settings"] = record["settings"]
     (results / "metrics" / metrics.name).mkdir(parents=True)
     for number in range(records):
-        run = f"{number:016x}"
+        tracker, sequence, repeat = number % TRACKERS, number // TRACKERS % SEQUENCES, number // (TRACKERS * SEQUENCES)
+        run = hashlib.sha256(str(number).encode()).hexdigest()[:16]
+        record["run_id"], record["seed"], record["coverage"] = run, repeat, 1 - repeat / 1000
+        record["started"] = f"2026-01-01T{number // 3600 % 24:02d}:{number // 60 % 60:02d}:{number % 60:02d}.000+00:00"
+        record["tracker"] |= {"id": f"tracker-{tracker}", "label": f"Tracker {tracker}"}
+        record["sequence"] |= {"id": f"sequence/{sequence}", "content": f"{sequence:012x}", "block": f"{sequence:016x}"}
+        scored["run_id"] = run
+        scored["online"]["metrics"]["ate_rmse_m"] = 0.01 * (1 + tracker) + 1e-3 * sequence + 1e-5 * repeat
         folder = results / "runs" / run
         folder.mkdir(parents=True)
-        seed = number // (TRACKERS * SEQUENCES)
-        text = record.replace(old.name, run).replace('"seed": 0', f'"seed": {seed}')
-        text = text.replace(tracker, f'"id": "tracker-{number % TRACKERS}"')
-        text = text.replace(sequence, f'"id": "sequence/{number // TRACKERS % SEQUENCES}"')
-        (folder / "run.json").write_text(text)
+        (folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
         (folder / "trajectory_online.txt").write_text(track)
-        (results / "metrics" / metrics.name / f"{run}.json").write_text(scored.replace(old.name, run))
+        (results / "metrics" / metrics.name / f"{run}.json").write_text(json.dumps(scored, indent=2) + "\n")
 
 
 def timed(*arguments: str) -> tuple[float, float, float]:

@@ -20,7 +20,7 @@ from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the ca
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunRecord, RunStore
 from dynslam_bench.runs import frame_row as rows
-from dynslam_bench.runs.storage import packing, run_list
+from dynslam_bench.runs.storage import packing, run_index, run_list
 from dynslam_bench.runs.storage.evaluating import evaluate_run
 from dynslam_bench.runs.storage.frame_table import load_frames
 from dynslam_bench.runs.storage.frames import FrameLog
@@ -72,7 +72,8 @@ def _read_list(data: bytes | None, folder: Path) -> None:
     store = _store(folder, _stored(f"runs/{RUN}/run.json"))
     at(store.runs / ("0" * 16), "run.json", b"{")
     at(store.root / "metrics" / get_protocol("tum-rgbd/v1").digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
-    at(store.root / "index", f"{get_protocol('tum-rgbd/v1').digest()}.json", data)
+    path = run_index.index_file(store.root, get_protocol("tum-rgbd/v1"))
+    at(path.parent, path.name, data)
     rows, unreadable = run_list.list_runs(store)
     assert [row["run"] for row in rows] == [RUN] and len(unreadable) == 1
 
@@ -81,7 +82,7 @@ def _read_list(data: bytes | None, folder: Path) -> None:
 def _index() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         _read_list(None, Path(folder))
-        (path,) = Path(folder).glob("results/index/*.json")
+        (path,) = Path(folder).glob("results/index/*.jsonl")
         return path.read_bytes()
 
 
@@ -234,7 +235,7 @@ TARGETS = [
         (RunStore.read_whole, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
         mutate_json,
     ),
-    Target("list of runs", _read_list, lambda: [_index()], (run_list.list_runs, run_list._read), mutate_json),
+    Target("list of runs", _read_list, lambda: [_index()], (run_list._list_runs, run_index), mutate_lines),
     Target(
         "metric record", _read_metrics, lambda: [_stored(f"metrics/*/{RUN}.json")], (RunStore.metrics,), mutate_json
     ),

@@ -11,7 +11,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 from reports_fake_store import add_run
 
 from dynslam_bench.runs import RunStore
-from dynslam_bench.runs.storage.run_list import FIELDS, list_runs, run_row
+from dynslam_bench.runs.storage.run_index import FIELDS, run_row
+from dynslam_bench.runs.storage.run_list import list_runs
 
 
 @pytest.fixture

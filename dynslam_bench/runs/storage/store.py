@@ -27,6 +27,7 @@ from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
 from .evaluating import DEFAULT_PROTOCOL, evaluate_run
 from .record import MetricRecord, RunRecord
+from .run_index import Stamp, add_line, index_file, make_line, stamp_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,8 +51,8 @@ class RunStore:
 
     ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``, ``frames.csv``,
     ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``metrics/<protocol digest>/<run_id>.json`` the errors under a
-    protocol; ``sequences/<part>/`` stamps and ground truth, so that a run can be scored again without its data;
-    ``latest`` links the newest run.
+    protocol; ``index/`` what a list says of each run; ``sequences/<part>/`` stamps and ground truth, so that a run can
+    be scored again without its data; ``latest`` links the newest run.
 
     Args:
         root: The folder; it is made when something is written.
@@ -65,6 +66,8 @@ class RunStore:
         self.root = Path(root).expanduser().absolute()
         self.runs = self.root / "runs"
         self._swept = False
+        self._published: dict[str, Stamp] = {}
+        """Runs of this process that are in no index yet."""
 
     def folder(self, run_id: str) -> Path:
         """Folder of one run, whether it exists or not.
@@ -127,11 +130,13 @@ class RunStore:
         target = self.folder(record.run_id)
         try:
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
+            stamp = stamp_of(work / RUN_FILE)  # which a rename leaves as it is
             self._forget_metrics(record.run_id)  # those of an earlier run of the id
             replace_folder(work, target)
             self._forget_metrics(record.run_id)  # if they were written again between these two lines
         except OSError as error:
             raise InfrastructureError(f"cannot write {target}: {error.strerror}", "check the free space") from error
+        self._published[record.run_id] = stamp
         self._link_latest(target)
 
     def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
@@ -273,6 +278,9 @@ class RunStore:
             self.add_metrics(metrics)
         except DynslamError as error:  # a store that can only be read can be scored all the same
             LOGGER.info("the metrics of run %s are not kept: %s", record.run_id, error)
+        stamp = self._published.pop(record.run_id, None)
+        if stamp is not None:
+            add_line(index_file(self.root, protocol), make_line(stamp, record, metrics))
         return metrics
 
     def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL) -> pd.DataFrame:
