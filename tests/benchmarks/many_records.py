@@ -39,21 +39,35 @@ def fill(results: Path, records: int) -> None:
     track = (old / "trajectory_online.txt").read_text()
     record["settings"] = {f"group_{at % 12}.setting_{at}": 0.5 * at for at in range(SETTINGS)}
     record["identity"]["settings"] = record["settings"]
+    record |= {
+        "run_id": "<run>",
+        "seed": "<seed>",
+        "coverage": "<coverage>",
+        "started": "2026-01-<day>T<time>.000+00:00",
+    }
+    record["tracker"] |= {"id": "tracker-<tracker>", "label": "Tracker <tracker>"}
+    record["sequence"] |= {"id": "sequence/<sequence>", "content": "<digest>", "block": "<digest>"}
+    scored["run_id"] = "<run>"
+    scored["online"]["metrics"]["ate_rmse_m"] = "<error>"
+    patterns = [json.dumps(each, indent=2) + "\n" for each in (record, scored)]
     (results / "metrics" / metrics.name).mkdir(parents=True)
     for number in range(records):
         tracker, sequence, repeat = number % TRACKERS, number // TRACKERS % SEQUENCES, number // (TRACKERS * SEQUENCES)
         run = hashlib.sha256(str(number).encode()).hexdigest()[:16]
-        record["run_id"], record["seed"], record["coverage"] = run, repeat, 1 - repeat / 1000
-        record["started"] = f"2026-01-01T{number // 3600 % 24:02d}:{number // 60 % 60:02d}:{number % 60:02d}.000+00:00"
-        record["tracker"] |= {"id": f"tracker-{tracker}", "label": f"Tracker {tracker}"}
-        record["sequence"] |= {"id": f"sequence/{sequence}", "content": f"{sequence:012x}", "block": f"{sequence:016x}"}
-        scored["run_id"] = run
-        scored["online"]["metrics"]["ate_rmse_m"] = 0.01 * (1 + tracker) + 1e-3 * sequence + 1e-5 * repeat
+        values = {
+            **{"<run>": run, '"<seed>"': repeat, '"<coverage>"': 1 - repeat / 1000, "<tracker>": tracker},
+            **{"<sequence>": sequence, "<digest>": f"{sequence:016x}", "<day>": f"{1 + number // 86400:02d}"},
+            "<time>": f"{number // 3600 % 24:02d}:{number // 60 % 60:02d}:{number % 60:02d}",
+            '"<error>"': 0.01 * (1 + tracker) + 1e-3 * sequence + 1e-5 * repeat,
+        }
+        texts = list(patterns)
+        for name, value in values.items():
+            texts = [text.replace(name, str(value)) for text in texts]
         folder = results / "runs" / run
         folder.mkdir(parents=True)
-        (folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
+        (folder / "run.json").write_text(texts[0])
         (folder / "trajectory_online.txt").write_text(track)
-        (results / "metrics" / metrics.name / f"{run}.json").write_text(json.dumps(scored, indent=2) + "\n")
+        (results / "metrics" / metrics.name / f"{run}.json").write_text(texts[1])
 
 
 def timed(*arguments: str) -> tuple[float, float, float]:
