@@ -235,7 +235,13 @@ TARGETS = [
         (RunStore.read_whole, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
         mutate_json,
     ),
-    Target("list of runs", _read_list, lambda: [_index()], (run_list._list_runs, run_index), mutate_lines),
+    Target(
+        "list of runs",
+        _read_list,
+        lambda: [_index()],
+        (run_list._list_runs, run_index.read_index, run_index._parsed, run_index._is_line, run_index.run_row),
+        mutate_lines,
+    ),
     Target(
         "metric record", _read_metrics, lambda: [_stored(f"metrics/*/{RUN}.json")], (RunStore.metrics,), mutate_json
     ),
