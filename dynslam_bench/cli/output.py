@@ -75,11 +75,12 @@ def write_table(
         spare: Columns that are left out then if it is still too wide, the first one first; a line below names them.
     """
     named = zip(columns, zip(*rows, strict=True) if rows else ((),) * len(columns), strict=True)
-    cells = list(map(list, zip(*([_text(name), *_texts(values)] for name, values in named), strict=True)))
+    cells: list[Sequence[str]] = [[_text(name), *_texts(values)] for name, values in named]
     left_out: list[str] = []
     if sys.stdout.isatty():
-        cells, left_out = fitted(cells, shrink, spare, _terminal_width())
-    head, separator, body = aligned(cells).partition("\n")
+        rows_of_text, left_out = fitted(list(zip(*cells, strict=True)), shrink, spare, _terminal_width())
+        cells = list(zip(*rows_of_text, strict=True))
+    head, separator, body = _under_each_other(cells).partition("\n")
     sys.stdout.write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
     sys.stdout.write(f"{separator}{body}\n")  # harmless: `_text` has made every cell so
     if left_out:
@@ -156,11 +157,15 @@ def _terminal_width() -> int:
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Rows of text with their columns under each other."""
-    columns = []
-    for column in zip(*rows, strict=True):
+    return _under_each_other(list(zip(*rows, strict=True)))
+
+
+def _under_each_other(columns: Sequence[Sequence[str]]) -> str:
+    padded = []
+    for column in columns:
         width = max(map(len, column))
-        columns.append([cell.ljust(width) for cell in column])
-    return "\n".join([line.rstrip() for line in map("  ".join, zip(*columns, strict=True))])
+        padded.append([cell.ljust(width) for cell in column])
+    return "\n".join([line.rstrip() for line in map("  ".join, zip(*padded, strict=True))])
 
 
 def write_fields(fields: Mapping[str, object]) -> None:

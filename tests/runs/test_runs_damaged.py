@@ -126,7 +126,8 @@ def test_a_store_that_can_only_be_read_is_scored(store: RunStore, monkeypatch: p
      '{"index": 1, "timestamp": 2, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 0]}',
      '{"index": 1, "timestamp": 2, "state": "ok", "stats": {"a": ' + "9" * 400 + "}}",
      '{"index": 1, "timestamp": 2, "state": "flying"}', '{"index": 1, "timestamp": 0.5, "state": "ok"}',
-     '{"index": 1, "timestamp": 2, "state": "ok", "extra": 1}'],
+     '{"index": 1, "timestamp": 2, "state": "ok", "extra": 1}', '{"index": -1, "timestamp": 2, "state": "ok"}',
+     '{"index": 99999999999999999999, "timestamp": 2, "state": "ok"}'],
 )  # fmt: skip
 def test_a_damaged_log_of_frames_is_taken_up_to_the_damage(tmp_path: Path, line: str) -> None:
     good = '{"index": 0, "timestamp": 1.0, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 1], "stats": {"a": 1}}'
@@ -147,8 +148,10 @@ def test_stats_named_with_half_characters_are_stored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "table", ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n", "\xff", "index\n" + "x" * 200_000]
-)
+    "table",
+    ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n", "\xff", "index\n" + "x" * 200_000,
+     "index,timestamp,state,reward_m\n99999999999999999999,1.0,ok,0\n"],
+)  # fmt: skip
 def test_a_damaged_table_of_frames_is_one_clear_line(tmp_path: Path, table: str) -> None:
     path = tmp_path / "frames.csv"
     path.write_bytes(table.encode("latin-1"))
