@@ -119,8 +119,11 @@ def add_line(path: Path, line: Line) -> None:
     """Add a run's line to the file; one that cannot be written is left out: the next list reads that record."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab", buffering=0) as file:  # one write: lines of other processes come before or after it
-            file.write(_text([line]))
+        handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            os.write(handle, _text([line]))  # at once: lines of other processes come before or after it
+        finally:
+            os.close(handle)
 
 
 def write_index(path: Path, lines: Iterable[Line]) -> None:

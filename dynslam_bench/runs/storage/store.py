@@ -208,13 +208,23 @@ class RunStore:
         """The record of a run by its full id.
 
         Raises:
-            DynslamError: It is missing or damaged, or names itself otherwise.
+            DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more than plain files.
         """
         path = self.folder(run_id) / RUN_FILE
+        self._check_plain(path.parent)
         record = RunRecord.read(path)
         if record.run_id != run_id:
             raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
         return record
+
+    def _check_plain(self, folder: Path) -> None:
+        """A folder holds plain files of this store: no link to a file elsewhere, no pipe that is never written."""
+        with contextlib.suppress(OSError), os.scandir(folder) as entries:  # what reads it says that it is not there
+            for entry in entries:
+                if entry.is_symlink() and not Path(entry.path).resolve().is_relative_to(self.root.resolve()):
+                    raise RunError(f"{entry.path} is a link that leads out of {self.root}", "put the file in its place")
+                if not entry.is_file() and not entry.is_dir():
+                    raise RunError(f"{entry.path} is no plain file")
 
     def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
         """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
@@ -307,6 +317,7 @@ class RunStore:
     def ground_truth(self, part: str) -> Trajectory | None:
         """The ground truth of a sequence's part; None if it has none."""
         path = self._part(part) / "groundtruth.txt"
+        self._check_plain(path.parent)
         return _read_truth(path, path.stat().st_mtime_ns) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
@@ -316,6 +327,7 @@ class RunStore:
             RunError: They are not stored, or damaged.
         """
         path = self._part(part) / "timestamps.txt"
+        self._check_plain(path.parent)
         try:
             return _read_stamps(path, path.stat().st_mtime_ns)
         except OSError as error:
