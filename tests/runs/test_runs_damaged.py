@@ -199,4 +199,7 @@ def test_every_version_of_a_stored_record_loads() -> None:
         for version in range(1, newest + 1):
             found = cls.read(data / f"{kind}_v{version}.json")
             assert found.schema_version == version and cls.parse(found.to_json(), kind) == found  # type: ignore[attr-defined]
+        text = (data / f"{kind}_v{newest}.json").read_text().replace('schema_version": 1', 'schema_version": 99', 1)
+        with pytest.raises(DynslamError, match=r"schema_version.*a newer dynslam-bench wrote it"):
+            cls.parse(text, kind)
     assert json.loads((data / "metrics_v1.json").read_text())["online"]["schema_version"] == EVALUATION == 1
