@@ -128,9 +128,11 @@ def _open(run: LoadedRun) -> Sequence:
         DynslamError: It is not here, or not the one that was run on.
     """
     record = run.record
+    if not record.sequence.content:  # else a record could name any folder of images, and a published page show them
+        raise DynslamError(f"the record does not say what {record.sequence.id} held")
     start, stop = record.frames or (0, None)
     sequence = open_frames(record.place or record.sequence.id, None, None, (start + record.offset, stop), record.stride)
-    if record.sequence.content and part_of(sequence, record.offset).content != record.sequence.content:
+    if part_of(sequence, record.offset).content != record.sequence.content:
         raise DynslamError(f"the content of {record.sequence.id} has changed since the run")
     return sequence
 

@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 
 from dynslam_bench.core.machine import Machine
+from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum
@@ -101,7 +102,8 @@ def add_run(
         tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked),
         overrides=overrides or {}, seed=seed, device="cpu",
         sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
-                              content=content or "", block=block or "", noise=noise, ground_truth=ground_truth,
+                              content=content or "", block=digest(block, 16) if block else "", noise=noise,
+                              ground_truth=ground_truth,
                               tags=list(tags)),
         frames=frames, offset=offset, place=place, epipolar_skipped=skipped,
         identity=({"cache": True} if cached else {}) | ({"camera": camera} if camera else {}),

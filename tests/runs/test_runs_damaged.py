@@ -66,8 +66,9 @@ def test_a_record_whose_id_is_not_its_folders_name_is_unreadable(store: RunStore
 @pytest.mark.parametrize("part", ["../../../out", "/tmp/out", "x", ""])
 def test_a_record_whose_part_is_a_path_is_unreadable(store: RunStore, part: str) -> None:
     sequence = json.loads((store.folder(BAD) / "run.json").read_text())["sequence"]
-    edit(store, sequence=sequence | {"part": part})
-    assert [bad.path.name for bad in store.all()[1]] == [BAD]
+    for field in ("part", "block"):
+        edit(store, sequence=sequence | {field: part or "."})
+        assert [bad.path.name for bad in store.all()[1]] == [BAD]
 
 
 @pytest.mark.parametrize("name", ["../../x", "/etc", "latest", ".", "", "a7abe04996a79cc"])

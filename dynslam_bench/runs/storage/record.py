@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -56,7 +56,7 @@ class SequenceInfo(Record):
     id: str
     content: str = ""
     part: Digest
-    block: str = ""
+    block: Annotated[str, Field(pattern=r"^([0-9a-f]{16})?$")] = ""
     noise: int | None = None
     frames: int
     duration_s: float
