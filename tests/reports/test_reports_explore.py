@@ -60,7 +60,7 @@ def test_the_view_is_in_the_address(browser, report):
 
 
 def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
-    """ATE, relative and rotational errors, online and final, absolute and as ratios: each against the CSV of the runs."""
+    """ATE, relative and rotational errors, absolute and as ratios: each against the CSV of the runs."""
     runs = pd.read_csv(report.csv["runs"])
     mine = runs[(runs["label"] == "Mask R-CNN (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
     base = runs[(runs["label"] == "ORB-SLAM2 (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
@@ -81,8 +81,18 @@ def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
         press(browser, "explore-scale", "ratio")
         assert browser.run(cell) == pytest.approx(mine[column].median() / base[column].median(), rel=1e-3)
     press(browser, "explore-scale", "degrees")
-    browser.run("choose($('explore-metric'))")
+    browser.run("choose($('explore-metric'))")  # the absolute one
     assert browser.run(cell) == pytest.approx(mine["ape_rot_rmse_deg"].median(), rel=1e-3)
+
+
+def test_final_trajectories_are_a_switch(browser, report):
+    final = pd.read_csv(report.csv["runs"]).set_index(["label", "sequence"])["final_ate_m"]
+    explore(browser, report)
+    online = browser.run("one('#explore-table').innerText")
+    press(browser, "explore-which", "final")
+    assert "which=final" in browser.run("location.hash") and browser.run("one('#explore-table').innerText") != online
+    shown = browser.run("all('#explore-table td[data-v] a').map((link) => +link.parentElement.dataset.v)")
+    assert sorted(shown) == pytest.approx(sorted(1000 * final.dropna()), rel=1e-3) and len(shown) == 2
 
 
 def test_columns_are_chosen_one_by_one(browser, report):

@@ -85,6 +85,7 @@ class Explore {
     this.renderControls();
     const extra = this.view.extra.split(".").filter(Boolean), ratio = this.view.scale === "ratio";
     const columns = [...extra.map((name) => ({ extra: name })), ...sequences.map((sequence) => ({ sequence }))];
+    if (matchMedia("(max-width: 700px)").matches) columns.sort((a, b) => Boolean(a.extra) - Boolean(b.extra)); // errors in sight
     const heads = ["tracker", ...columns.map((column) => (column.extra ? EXTRA.find(([name]) => name === column.extra)[1] : column.sequence.short))];
     const table = $("explore-table");
     table.tHead.rows[0].replaceChildren(...heads.map((name, at) => this.head(name, at, columns[at - 1])));
