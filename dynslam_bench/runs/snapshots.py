@@ -31,13 +31,20 @@ class Snapshot:
         index: Index of the frame in the run's part of the sequence.
         points: int16 ``[N, 2]``, pixels of the features.
         kept: bool ``[N]``, which of them were kept.
-        mask: bool ``[H, W]``, pixels held for dynamic; None where the tracker gave no mask.
+        packed: uint8 ``[H, ceil(W / 8)]``, eight pixels of the mask a byte; None where the tracker gave no mask.
+        width: W, pixels of a line of the mask.
     """
 
     index: int
     points: NDArray[np.int16]
     kept: NDArray[np.bool_]
-    mask: NDArray[np.bool_] | None
+    packed: NDArray[np.uint8] | None
+    width: int
+
+    @property
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Pixels held for dynamic, bool ``[H, W]``; None where the tracker gave no mask."""
+        return None if self.packed is None else np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
 
 
 def spread(frames: int, count: int = SPREAD) -> list[int]:
@@ -76,7 +83,7 @@ class SnapshotWriter:
         shots = sorted([*self._even, *(shot for _, shot in self._worst)], key=lambda shot: shot.index)
         if not shots:
             return
-        masks = [np.zeros(self._size, bool) if shot.mask is None else shot.mask for shot in shots]
+        empty = np.zeros((self._size[0], -(-self._size[1] // 8)), np.uint8)
         np.savez_compressed(
             self._path,
             index=np.array([shot.index for shot in shots], np.int32),
@@ -84,8 +91,8 @@ class SnapshotWriter:
             points=np.concatenate([shot.points for shot in shots]),
             kept=np.concatenate([shot.kept for shot in shots]),
             size=np.array(self._size, np.int32),
-            masked=np.array([shot.mask is not None for shot in shots]),
-            masks=np.packbits(np.stack(masks), axis=2),
+            masked=np.array([shot.packed is not None for shot in shots]),
+            masks=np.stack([empty if shot.packed is None else shot.packed for shot in shots]),
         )
 
 
@@ -97,7 +104,8 @@ def _taken(index: int, result: TrackResult) -> Snapshot:
         index,
         np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
         np.ones(len(points), bool) if kept is None else np.array(kept, dtype=bool),
-        None if mask is None else np.array(mask, dtype=bool),
+        None if mask is None else np.packbits(np.asarray(mask, dtype=bool), axis=1),
+        0 if mask is None else mask.shape[1],
     )
 
 
@@ -123,9 +131,11 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
         height, width = found["size"].tolist()
         ends = np.cumsum(found["count"])[:-1]
         points, kept = np.split(found["points"], ends), np.split(found["kept"], ends)
-        masks = np.unpackbits(found["masks"], axis=2, count=width).astype(bool)
+        masks = found["masks"]
+        if masks.dtype != np.uint8 or masks.shape[1:] != (height, -(-width // 8)):
+            raise ValueError(f"masks of {masks.dtype} {masks.shape} do not fit {width} x {height} pixels")
         shots = [
-            Snapshot(int(index), points[at], kept[at], masks[at] if found["masked"][at] else None)
+            Snapshot(int(index), points[at], kept[at], masks[at] if found["masked"][at] else None, width)
             for at, index in enumerate(found["index"])
         ]
     except (OSError, EOFError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
