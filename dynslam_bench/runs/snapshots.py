@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.core.array_files import read_npz
 from dynslam_bench.core.errors import RunError
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 SNAPSHOTS_FILE = "snapshots.npz"
 SPREAD = 24
 """Frames that are kept evenly spread over a run."""
+MOST_FRAMES = 1000
+"""Of a file that is read."""
 WORST = 6
 """Frames that are kept besides, those with the largest frame-to-frame error."""
 
@@ -125,19 +127,28 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     path = folder / SNAPSHOTS_FILE
     if not path.is_file():
         return (0, 0), []
+    found = read_npz(path, kind=RunError)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            found = {name: stored[name] for name in stored.files}
-        height, width = found["size"].tolist()
-        ends = np.cumsum(found["count"])[:-1]
-        points, kept = np.split(found["points"], ends), np.split(found["kept"], ends)
-        masks = found["masks"]
+        height, width = map(int, found["size"])
+        index, count, points, kept = found["index"], found["count"], found["points"], found["kept"]
+        masks, masked = found["masks"], found["masked"]
         if masks.dtype != np.uint8 or masks.shape[1:] != (height, -(-width // 8)):
             raise ValueError(f"masks of {masks.dtype} {masks.shape} do not fit {width} x {height} pixels")
+        if not (
+            len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
+            and (count >= 0).all()
+            and points.shape == (count.sum(), 2)
+            and kept.shape == points.shape[:1]
+            and points.dtype == np.int16
+            and kept.dtype == masked.dtype == np.bool_
+        ):
+            raise ValueError("its arrays do not fit each other")
+        ends = np.cumsum(count)[:-1]
+        parts = zip(np.split(points, ends), np.split(kept, ends), strict=True)
         shots = [
-            Snapshot(int(index), points[at], kept[at], masks[at] if found["masked"][at] else None, width)
-            for at, index in enumerate(found["index"])
+            Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
+            for at, (place, keep) in enumerate(parts)
         ]
-    except (OSError, EOFError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
-        raise RunError(f"{path} holds no snapshots: {error}") from error
+    except (LookupError, ValueError, TypeError, ArithmeticError) as error:
+        raise RunError(f"{path} holds no snapshots: {' '.join(str(error).split())[:200]}") from error
     return (height, width), shots
