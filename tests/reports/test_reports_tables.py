@@ -1,5 +1,10 @@
 """Tables: the frames behind them, and the formats that they are written in."""
 
+import re
+from pathlib import Path
+
+import pytest
+
 from dynslam_bench.reports.tables.latex import to_latex
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_markdown
 
@@ -35,3 +40,13 @@ def test_a_table_is_two_frames():
     assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "Float64", "y": "Int64"}
     assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
     assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"
+
+
+def test_the_page_s_python_goes_as_it_stands(made, monkeypatch):
+    pytest.importorskip("matplotlib", reason="pandas draws with it")
+    page = Path(__file__).resolve().parents[2] / "docs" / "reports.md"
+    (text,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), flags=re.S | re.M)
+    monkeypatch.chdir(made[0].root.parent)
+    names = {}
+    exec(compile(text, "docs/reports.md", "exec"), names)
+    assert len(names["board"].frame()) == len(names["frame"]) > 5
