@@ -175,31 +175,9 @@ def gather_settings(assignments: list[str] | None, file: Path | None, preset: di
         SettingsError: The file cannot be read, or an assignment is none.
     """
     from dynslam_bench.core.settings import parse_assignments
+    from dynslam_bench.core.toml import read_settings
 
     merged = dict(preset)
     if file is not None:
         merged |= read_settings(file)
     return merged | parse_assignments(assignments or ())
-
-
-def read_settings(file: Path) -> dict[str, Any]:
-    """Overrides by dotted name from a TOML file; a table ``[settings]`` holds them if there is one.
-
-    Raises:
-        SettingsError: The file cannot be read, or is no TOML.
-    """
-    from dynslam_bench.core.errors import SettingsError
-    from dynslam_bench.core.toml import read_toml
-
-    document = read_toml(file.expanduser(), kind=SettingsError)
-    values = document.get("settings", document)
-    if not isinstance(values, dict):
-        raise SettingsError(f"'settings' in {file} is {values!r}, not a table")
-    return dict(_flatten(values))
-
-
-def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for key, value in values.items():
-        found += _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
-    return found

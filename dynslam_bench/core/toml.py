@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from .errors import DynslamError, SequenceError
+from .errors import DynslamError, SequenceError, SettingsError
 from .reading import read_text
 
 if sys.version_info >= (3, 11):
@@ -45,3 +45,23 @@ def parse_toml(text: str, where: str, *, kind: type[DynslamError] = SequenceErro
         raise kind(f"{where} is not valid TOML: {error}") from error
     except RecursionError as error:
         raise kind(f"{where} is not valid TOML: it is nested too deeply") from error
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Overrides of settings by dotted name, from a TOML file; a table ``[settings]`` holds them if there is one.
+
+    Raises:
+        SettingsError: The file cannot be read, or is no TOML.
+    """
+    document = read_toml(path.expanduser(), kind=SettingsError)
+    values = document.get("settings", document)
+    if not isinstance(values, dict):
+        raise SettingsError(f"'settings' in {path} is {values!r}, not a table")
+    return dict(_flatten(values))
+
+
+def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        found += _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
+    return found

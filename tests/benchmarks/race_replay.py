@@ -1,11 +1,13 @@
 """The race replayed on recorded runs: what share of the grid's runs it takes, and how much worse its choice is.
 
-    python tests/benchmarks/race_replay.py RESULTS... [--default orb-slam2] [--orders 200] [--best 0]
+    python tests/benchmarks/race_replay.py RESULTS... [--default orb-slam2] [--orders 200] [--best 0] [--unseen starts]
+                                             [--race halving none ...]
 
 The trials are the configurations of stored runs (systems, and their variants), the blocks what all of them ran on; each
-order of the trials is one study. Values, steps and rules are those of studies. A study runs on the blocks of one start;
-its choice is judged on the other starts, which none of its runs has seen: regret is the log ATE ratio there of the
-choice to the best. `--best N` keeps the N best alone, which lie closer together.
+order of the trials is one study. Values, steps and rules are those of studies. A study runs on the blocks of one start
+and is judged on the other starts; with `--unseen scene` it runs on all starts of all scenes but one, and is judged on
+that one. Regret is the log ATE ratio, on what none of its runs has seen, of the choice to the best. `--best N` keeps
+the N best alone, which lie closer together.
 """
 
 from __future__ import annotations
@@ -74,6 +76,15 @@ def _logs(errors: Mapping[Block, float]) -> dict[Block, float]:
     return {block: float(np.log(error)) for block, error in errors.items()}
 
 
+def unseen_blocks(blocks: list[Block], split: str, number: int) -> set[Block]:
+    """What the study of this number must not see."""
+    if split == "starts":
+        starts = sorted({block.offset for block in blocks})
+        return {block for block in blocks if block.offset != starts[number % len(starts)]}
+    found = list(scenes(blocks).values())
+    return set(found[number % len(found)])
+
+
 def main() -> None:
     """Replay every rule in many orders."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -81,24 +92,24 @@ def main() -> None:
     parser.add_argument("--default", default="orb-slam2")
     parser.add_argument("--orders", type=int, default=200)
     parser.add_argument("--best", type=int, default=0)
+    parser.add_argument("--race", nargs="+", choices=get_args(RaceName), default=get_args(RaceName))
+    parser.add_argument("--unseen", choices=("starts", "scene"), default="starts")
     options = parser.parse_args()
     grid = recorded(options.results)
     default = next(errors for name, errors in grid.items() if options.default in name)
     blocks = list(default)
     worth = {name: value(errors, default, blocks) for name, errors in grid.items()}
     kept = sorted(worth, key=lambda name: worth[name])[: options.best or len(worth)]
-    starts = sorted({block.offset for block in blocks})
     print(f"{len(kept)} configurations, {len(blocks)} blocks in {len(scenes(blocks))} scenes, {options.orders} orders")
     print("| race | runs | regret |\n| --- | --- | --- |")
-    for rule in get_args(RaceName):
+    for rule in options.race:
         found = []
         for number in range(options.orders):
-            start = starts[number % len(starts)]
-            seen = running_order([block for block in blocks if block.offset == start], number)
+            unseen = unseen_blocks(blocks, options.unseen, number)
+            seen = running_order([block for block in blocks if block not in unseen], number)
             order = [str(name) for name in np.random.default_rng(number).permutation(kept)]
             choice, runs = replay(grid, default, rule, order, seen)
-            unseen = [block for block in blocks if block.offset != start]
-            truth = {name: value(grid[name], default, unseen) for name in kept}
+            truth = {name: value(grid[name], default, sorted(unseen)) for name in kept}
             found.append((runs / (len(kept) * len(seen)), truth[choice] - min(truth.values())))
         runs, regret = np.mean(found, axis=0)
         error = np.std([each for _, each in found], ddof=1) / np.sqrt(len(found))

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dynslam_bench.cli import options
 from dynslam_bench.cli.output import _text  # how a cell of a table is written
 from dynslam_bench.core import address, harmless, reading, toml
 from dynslam_bench.core import settings as core_settings
@@ -133,7 +132,7 @@ def _override(text: str) -> None:
 
 
 def _read_settings(data: bytes | None, folder: Path) -> None:
-    core_settings.apply_overrides(FewSettings(), options.read_settings(at(folder, "s.toml", data)))
+    core_settings.apply_overrides(FewSettings(), toml.read_settings(at(folder, "s.toml", data)))
 
 
 def _harmless(text: str) -> None:
@@ -224,7 +223,7 @@ TARGETS = [
             *(b"a.b = 1\n", b"settings = 3\n", b'tracking.radius_px = "' + b"a" * 300 + b'"\n'),
             *(b"tracking.radius_px = 0x" + b"f" * 5000 + b"\n",),
         ],
-        (options.read_settings, options._flatten, core_settings._explain, core_settings._shown),
+        (toml.read_settings, toml._flatten, core_settings._explain, core_settings._shown),
     ),
     Target(
         "--set",

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from simulated import SimulatedTuner, make_spec
 
-from dynslam_bench.cli.options import read_settings
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning import Block, Outcome, finish, read_preset_text, write_page
 from dynslam_bench.tuning.evaluate import BlockFailedError
 from dynslam_bench.tuning.objectives import OBJECTIVES, find_objective, own_objective, together

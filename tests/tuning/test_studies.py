@@ -57,7 +57,7 @@ def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_p
     assert "Use them" not in page and "Not recommended" in page
     assert "would need 30 complete trials, there are 14" in page
     assert "from which nothing follows for others" in page and "https://" not in page.split("<script>")[0]
-    from dynslam_bench.cli.options import read_settings
+    from dynslam_bench.core.toml import read_settings
 
     preset = read_settings(tuner.folder / "best.toml")
     assert preset == {name: preset[name] for name in ("gain", "wobble")}
