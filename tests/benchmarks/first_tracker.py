@@ -1,12 +1,13 @@
 """How long does it take from nothing to one's own tracker on the leaderboard, by the documentation alone?
 
-    python tests/benchmarks/first_tracker.py                  # docs/start/tracker.md: a tracker in Python
-    python tests/benchmarks/first_tracker.py cpp              # docs/start/tracker_cpp.md: one in C++
-    python tests/benchmarks/first_tracker.py --install        # in a fresh virtual environment, whose making is timed apart
+    python tests/benchmarks/first_tracker.py            # docs/start/tracker.md: a tracker in Python
+    python tests/benchmarks/first_tracker.py cpp        # docs/start/tracker_cpp.md: one in C++
+    python tests/benchmarks/first_tracker.py --install  # in a fresh virtual environment, whose making is timed apart
 
-The commands are taken from the page's blocks up to its first `report`, in a new folder with empty caches (rendered frames,
-compiled kernels), and must all succeed; then the leaderboard is asked whether the tracker stands on it. The target is ten
-minutes; what pip downloads depends on the network and is printed by itself.
+The commands are taken from the page's blocks up to its first `report`, in a new folder with empty caches (rendered
+frames, compiled kernels), and must all succeed; then the leaderboard is asked whether the tracker is on it. The target
+is ten minutes; what pip downloads depends on the network and is printed by itself. Processor seconds are printed, too:
+on a loaded machine they alone mean something.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -40,14 +42,20 @@ def installation() -> list[str]:
     return [line for line in commands(BEGINNING) if "pip install" in line]
 
 
+def processor_s() -> float:
+    """Processor seconds of all commands so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def timed(line: str, folder: Path, environment: dict[str, str]) -> float:
     """Seconds that a command takes; a failing one ends everything."""
-    started = time.monotonic()
+    started, used = time.monotonic(), processor_s()
     done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
     seconds = time.monotonic() - started
     if done.returncode:
         sys.exit(f"{line}\nexit code {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-    print(f"{seconds:8.1f} s  {line}", flush=True)
+    print(f"{seconds:8.1f} s  {processor_s() - used:8.1f} s of processors  {line}", flush=True)
     return seconds
 
 
