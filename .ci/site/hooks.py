@@ -88,6 +88,11 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     return output.replace(SHIM, _relative("site/worker.js", page.file.src_uri))
 
 
+def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+    """Likewise on the page that servers show for missing ones."""
+    return output_content.replace(SHIM, "/site/worker.js")
+
+
 def _outside_of_fences(pattern: re.Pattern[str], change, text: str) -> str:
     parts = re.split(r"(^```.*?^```$)", text, flags=re.S | re.M)
     return "".join(part if part.startswith("```") else pattern.sub(change, part) for part in parts)

@@ -75,6 +75,7 @@ def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -
     assert len(loaded) > 100
     assert [(path.name, load) for path, load in loaded if urlsplit(load).netloc] == []
     assert [load for path, load in loaded if not load.startswith("data:") and not (path.parent / load).exists()] == []
+    assert [path.name for path in site.glob("*.html") if "unpkg.com" in path.read_text()] == []
     assert not re.search(r"url\(\s*['\"]?https?:", (site / "site" / "style.css").read_text())
 
 
