@@ -110,7 +110,7 @@ def better_half(costs: Longs) -> Longs:
     chosen = costs < threshold
     ties = np.flatnonzero(costs == threshold)
     chosen[ties[: half - np.count_nonzero(chosen)]] = True
-    return np.flatnonzero(chosen)
+    return np.flatnonzero(chosen).astype(np.int64)
 
 
 @kernel
