@@ -135,5 +135,5 @@ def commands() -> str:
 
 def _held_by(trackers: list[str]) -> str:
     if len(trackers) > MANY:
-        return f"Of {len(trackers)} [systems](systems.md)."
-    return "Of " + ", ".join(f"[`{name}`](systems.md#{name})" for name in trackers) + "."
+        return f"{len(trackers)} [systems](systems.md) have it."
+    return "Systems that have it: " + ", ".join(f"[`{name}`](systems.md#{name})" for name in trackers) + "."
