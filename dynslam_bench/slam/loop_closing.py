@@ -1,7 +1,8 @@
 """Loop closing, the last row of the paper's Figure 2: recognise a place, verify it, correct the map, fuse it.
 
-1. *Detect*: keyframes that are neither seen together with the newest one nor recent are ranked by what they have in
-   common with it (`places`: nothing is trained or downloaded); the best few are matched feature by feature.
+1. *Detect*: keyframes that share no point with the newest one nor with its neighbours, and are old, are ranked by how
+   much they look like it (`places`: nothing is trained or downloaded). Those that do so no less than its neighbours do,
+   the best few of them, are matched feature by feature.
 2. *Verify*: a pose by RANSAC, then by all points around the candidate, in metres since depth is known. It must explain
    most of what should be in view, agree with the keyframes before, and ask for no more correction than the way since
    the candidate may have drifted. The last condition is ours: rooms that look the same pass all others.
@@ -26,7 +27,7 @@ from .localisation.relocalisation import match_keyframe, ransac_pose
 from .localisation.tracking import Matches, match_map, solve
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
-from .places import most_alike
+from .places import likeness
 from .settings import BackendSettings
 
 Array = NDArray[np.float64]
@@ -49,7 +50,8 @@ class Loop:
     """A place that was recognised.
 
     Attributes:
-        keyframe: Slot of the keyframe that was seen again.
+        keyframe: Slot, at that time, of the keyframe that was seen again.
+        frame: Index of that keyframe's frame.
         T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
         inliers: Points that fit it.
         moved_m: How far the newest keyframe is from where it was believed to be, metres.
@@ -57,6 +59,7 @@ class Loop:
     """
 
     keyframe: int
+    frame: int
     T_cam_world: Array
     inliers: int
     moved_m: float
@@ -141,7 +144,7 @@ class LoopCloser:
         if not len(elsewhere):
             return None
         rng = stream(self._seed, "loop", int(self.world.kf_id[slot]))
-        for candidate in most_alike(self.world, elsewhere, seen, s.candidates):
+        for candidate in self._as_alike_as_neighbours(slot, elsewhere, seen):
             matches = match_keyframe(self.world, candidate, seen, self.settings.relocalisation.max_distance)
             if len(matches) < s.min_matches:
                 continue
@@ -149,6 +152,14 @@ class LoopCloser:
             if loop is not None:
                 return loop
         return None
+
+    def _as_alike_as_neighbours(self, slot: int, elsewhere: Slots, seen: Observations) -> list[int]:
+        near = self._around(slot)[1:]
+        score = likeness(self.world, np.concatenate([near, elsewhere]), seen)
+        least = score[: len(near)].min(initial=np.inf)
+        there = score[len(near) :]
+        best = np.argsort(-there, kind="stable")[: self.settings.loop_closing.candidates]
+        return [int(elsewhere[row]) for row in best if there[row] >= least]
 
     def _by_points_around(
         self, slot: int, candidate: int, seen: Observations, matches: Matches, rng: np.random.Generator
@@ -175,7 +186,8 @@ class LoopCloser:
         hit = np.isin(in_view, joined.point[estimate.inliers])
         moved = np.linalg.inv(estimate.T_cam_world)[:3, 3] - world.kf_centre[slot]
         turned = float(np.degrees(se3.rotation_angle(estimate.T_cam_world @ se3.inverse(world.kf_pose[slot]))))
-        loop = Loop(candidate, estimate.T_cam_world, estimate.count, float(np.linalg.norm(moved)), turned)
+        back = int(world.kf_frame[candidate])
+        loop = Loop(candidate, back, estimate.T_cam_world, estimate.count, float(np.linalg.norm(moved)), turned)
         share = np.count_nonzero(hit) / max(len(in_view), 1)
         return loop if share >= s.min_share and self._may_be_drift(loop) else None
 
