@@ -35,7 +35,7 @@ class RingWorld(PointWorld):
                 looks.append(look)
         self.side = side
         self.camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-        self._walls, self._looks = np.concatenate(walls), np.concatenate(looks)
+        self.walls, self._looks = np.concatenate(walls), np.concatenate(looks)
 
     def lap(self, count, step_m):
         """Camera-to-world poses along the centre line, looking ahead, y down; corners are quarter circles."""
@@ -55,10 +55,10 @@ class RingWorld(PointWorld):
     def see(self, T_world_cam, index, **noise):
         """As `PointWorld.see`, of the walls that no other wall hides."""
         centre = T_world_cam[:3, 3]
-        near = np.flatnonzero(np.linalg.norm(self._walls - centre, axis=1) < REACH)
-        sight = centre + (self._walls[near] - centre) * np.linspace(0.05, 0.95, 12)[:, None, None]
+        near = np.flatnonzero(np.linalg.norm(self.walls - centre, axis=1) < REACH)
+        sight = centre + (self.walls[near] - centre) * np.linspace(0.05, 0.95, 12)[:, None, None]
         inner, outer = (self.side - WIDTH) / 2 - 0.05, (self.side + WIDTH) / 2 + 0.05
         far = np.abs(sight[..., [0, 2]]).max(axis=-1)
         open_ = near[~((far < inner) | (far > outer)).any(axis=0)]
-        self.points, self.descriptors = self._walls[open_], self._looks[open_]
+        self.points, self.descriptors = self.walls[open_], self._looks[open_]
         return super().see(T_world_cam, index, **noise)
