@@ -81,7 +81,9 @@ def publish(
         path.unlink()
     pages = [("leaderboard/index.html", "Leaderboard", "Trackers, sequences, errors, speed and failures.")]
     if study is not None:
-        for source in sorted({path for pattern in _KEPT for path in study.glob(pattern) if path.is_file()}):
+        inside = study.resolve()
+        found = {path for pattern in _KEPT for path in study.glob(pattern) if path.is_file()}
+        for source in sorted(path for path in found if path.resolve().is_relative_to(inside)):  # no link to elsewhere
             target = output / "study" / source.relative_to(study)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)

@@ -32,6 +32,8 @@ class WholeLines(JournalFileBackend):
     """
 
     def __init__(self, path: Path) -> None:
+        if path.is_symlink():
+            raise StudyError(f"{path} is a link: a study is written in its own folder", "put the file in its place")
         with _clear(path):
             super().__init__(str(path))
         self.path = path

@@ -34,7 +34,7 @@ def history(trials: Sequence[FrozenTrial], what: str, chosen: int | None) -> Fig
     ]
     layout = layout_of(
         height=420,
-        xaxis=axis("trial"),
+        xaxis=axis("trial") | {"whole": True},
         yaxis=log_axis(f"ratio of {what} to the default (less is better)", [1.0, *found.values()]),
         shapes=[guide(y=1.0)],
     )

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from dynslam_bench.core.download_progress import Report
 from dynslam_bench.core.harmless import printable
@@ -74,11 +74,13 @@ def write_table(
         shrink: Columns that are shortened first to fit a terminal, one after the other; then all others.
         spare: Columns that are left out then if it is still too wide, the first one first; a line below names them.
     """
-    cells = [[_text(value) for value in row] for row in (columns, *rows)]
+    named = zip(columns, zip(*rows, strict=True) if rows else ((),) * len(columns), strict=True)
+    cells: list[Sequence[str]] = [[_text(name), *_texts(values)] for name, values in named]
     left_out: list[str] = []
     if sys.stdout.isatty():
-        cells, left_out = fitted(cells, shrink, spare, _terminal_width())
-    head, separator, body = aligned(cells).partition("\n")
+        rows_of_text, left_out = fitted(list(zip(*cells, strict=True)), shrink, spare, _terminal_width())
+        cells = list(zip(*rows_of_text, strict=True))
+    head, separator, body = _under_each_other(cells).partition("\n")
     sys.stdout.write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
     sys.stdout.write(f"{separator}{body}\n")  # harmless: `_text` has made every cell so
     if left_out:
@@ -155,9 +157,15 @@ def _terminal_width() -> int:
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Rows of text with their columns under each other."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    line = "  ".join(f"{{:{width}}}" for width in widths)
-    return "\n".join(line.format(*row).rstrip() for row in rows)
+    return _under_each_other(list(zip(*rows, strict=True)))
+
+
+def _under_each_other(columns: Sequence[Sequence[str]]) -> str:
+    padded = []
+    for column in columns:
+        width = max(map(len, column))
+        padded.append([cell.ljust(width) for cell in column])
+    return "\n".join([line.rstrip() for line in map("  ".join, zip(*padded, strict=True))])
 
 
 def write_fields(fields: Mapping[str, object]) -> None:
@@ -256,6 +264,16 @@ def drawn_download(name: str) -> Iterator[Report]:
     """`progress` of one file's download, for `core.download.show_downloads`."""
     with progress(name, unit="bytes") as advance:
         yield lambda state: advance(state.done, state.total)
+
+
+def _texts(values: Sequence[object]) -> Sequence[str]:
+    """The cells of a column: `_text` of each, a long column of plain words or numbers at once."""
+    kinds = set(map(type, values))
+    if kinds == {str} and "".join(cast("Sequence[str]", values)).isprintable():
+        return cast("Sequence[str]", values)
+    if kinds == {float}:
+        return [f"{value:.4g}" for value in values]
+    return [_text(value) for value in values]
 
 
 def _text(value: object) -> str:

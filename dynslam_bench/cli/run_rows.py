@@ -10,7 +10,7 @@ from .output import complain, write, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunStore
-    from dynslam_bench.runs.storage.run_list import Row
+    from dynslam_bench.runs.storage.run_index import Row
 
 TITLES = {
     "run": "run",
@@ -40,7 +40,7 @@ def show_runs(
     records: Sequence[RunRecord], store: RunStore, protocol: str, *, as_json: bool, reused: Collection[str] = ()
 ) -> None:
     """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are said to be from the store."""
-    from dynslam_bench.runs.storage.run_list import run_row
+    from dynslam_bench.runs.storage.run_index import run_row
 
     scored = [(record, None if record.status == "stopped" else store.score(record, protocol)) for record in records]
     rows = [run_row(*pair) | {"from_store": pair[0].run_id in reused} for pair in scored]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
@@ -297,6 +298,7 @@ def dask_executor(address: str) -> Any:
     except ImportError as error:
         raise RunError("--scheduler needs the package distributed", "pip install 'dynslam-bench[cluster]'") from error
     try:
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it tells of a lost scheduler by a traceback
         return Client(address, timeout="10s").get_executor()
     except (OSError, ValueError) as error:
         raise RunError(f"no Dask scheduler answers at {address}: {error}", "for example tcp://host:8786") from error

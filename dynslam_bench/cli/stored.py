@@ -28,6 +28,7 @@ def list_(
     """List the runs of a results folder, oldest first."""
     from typing import get_args
 
+    from dynslam_bench.core.collector import collector_paused
     from dynslam_bench.core.errors import RunError, did_you_mean
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.storage.record import Status
@@ -40,7 +41,8 @@ def list_(
         raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     with progress("reading runs") as advance:
         rows, unreadable = list_runs(store, protocol, on_progress=advance)
-    show_rows([row for row in rows if status in (None, row["status"])], store, protocol, as_json=as_json)
+    with collector_paused():
+        show_rows([row for row in rows if status in (None, row["status"])], store, protocol, as_json=as_json)
     for bad in unreadable:
         complain(f"unreadable: {bad.path}: {bad.reason}")
 
@@ -54,7 +56,7 @@ def show(
 ) -> None:
     """Show everything about a run."""
     from dynslam_bench.runs import RunStore, score
-    from dynslam_bench.runs.storage.run_list import part_words
+    from dynslam_bench.runs.storage.run_index import part_words
 
     store = RunStore(results)
     record = store.read(run)

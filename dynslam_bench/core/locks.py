@@ -30,7 +30,7 @@ def claimed(path: Path) -> Iterator[bool]:
         DynslamError: The file cannot be made.
     """
     try:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         raise DynslamError(f"cannot write {path}: {error.strerror}", "check the permissions and the disk") from error
     try:

@@ -15,11 +15,16 @@ from .harmless import storable
 from .passwords import without_passwords
 from .reading import RECORD_BYTES, read_text
 
-__all__ = ["Digest", "Record", "atomic_folder", "digest", "write_atomic"]
+__all__ = ["Digest", "Record", "atomic_folder", "digest", "schema", "write_atomic"]
 
 R = TypeVar("R", bound="Record")
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 """Sixteen hexadecimal digits, as `digest` makes them; nothing else names a file or folder."""
+
+
+def schema(newest: int) -> Any:
+    """The field that says of which version a record is: one of those that this package reads."""
+    return Field(default=newest, ge=1, le=newest)
 
 
 class Record(BaseModel):
@@ -59,7 +64,9 @@ class Record(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"])) or "file"
-            raise DynslamError(f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}") from error
+            newer = place.endswith("schema_version") and first["type"] == "less_than_equal"
+            hint = "a newer dynslam-bench wrote it: upgrade" if newer else ""
+            raise DynslamError(f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}", hint) from error
 
 
 def digest(value: Any, length: int = 12) -> str:

@@ -291,6 +291,8 @@ def _check_default(cls: type[Settings], p: Parameter) -> None:
 
 def _nested(field: FieldInfo) -> type[Settings] | None:
     annotation = field.annotation
+    if typing.get_origin(annotation) is not None:  # tuple[float, ...], which Python 3.10 takes for a class
+        return None
     return annotation if isinstance(annotation, type) and issubclass(annotation, Settings) else None
 
 

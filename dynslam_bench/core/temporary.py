@@ -43,11 +43,18 @@ def sweep() -> int:
         folder
         for base in {Path(tempfile.gettempdir()), SHARED_MEMORY}
         for folder in base.glob(f"{_PREFIX}*")
-        if folder.is_dir() and folder.stat().st_uid == os.getuid() and is_abandoned(folder)
+        if _is_mine(folder) and is_abandoned(folder)
     ]
     for folder in abandoned:
         shutil.rmtree(folder, ignore_errors=True)
     return len(abandoned)
+
+
+def _is_mine(folder: Path) -> bool:
+    try:
+        return folder.is_dir() and folder.stat().st_uid == os.getuid()
+    except OSError:  # its process has just removed it
+        return False
 
 
 def _remove(path: Path, lock: int, owner: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +28,20 @@ class Similarity:
         degenerate: Whether the positions did not determine the rotation (no motion, or motion on a line); it then
             follows from the orientations, which leaves translational errors at their minimum all the same. Of a
             camera that does not move the scale is 1.
-        uncertainty_deg: Standard error of the rotation, see `conditioning`; None where the rotation does not come from
-            the positions alone or there are too few of them.
+        fitted: Positions of the estimate and of the truth ``[N, 3]`` in metres that alone determined the rotation; None
+            where they did not.
     """
 
     rotation: Array
     translation: Array
     scale: float = 1.0
     degenerate: bool = False
-    uncertainty_deg: float | None = None
+    fitted: tuple[Array, Array] | None = None
+
+    @cached_property
+    def uncertainty_deg(self) -> float | None:
+        """Standard error of the rotation, see `conditioning`; None where it does not come from enough positions."""
+        return None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
 
     @property
     def rotation_reliable(self) -> bool:
@@ -75,7 +81,7 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
     centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
     covariance = (target - centre_target).T @ (source - centre_source) / len(source)
     # how far the estimate's orientations are turned, summed: decides only what the positions leave open
-    orientation = np.einsum("nij,nkj->ik", ground_truth[:, :3, :3], estimate[:, :3, :3]) / len(source)
+    orientation = np.tensordot(ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))) / len(source)
     if mode == "yaw":
         rotation, degenerate = _yaw(covariance, orientation)
         return Similarity(rotation, centre_target - rotation @ centre_source, 1.0, degenerate)
@@ -85,18 +91,16 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         variance = float(((source - centre_source) ** 2).sum() / len(source))
         moves = variance > np.finfo(float).eps * max(1.0, float((source**2).max()))
         scale = weighted / variance if moves else 1.0  # without motion every scale gives the same positions
-    uncertainty = None if degenerate else rotation_uncertainty_deg(source, target, rotation)
-    return Similarity(rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, uncertainty)
+    fitted = None if degenerate else (source, target)
+    return Similarity(rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, fitted)
 
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:
     """Rotation that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it."""
-    singular = np.linalg.svd(covariance, compute_uv=False)
+    u, singular, vt = np.linalg.svd(covariance)
     degenerate = bool(singular[1] <= 1e-12 * max(singular[0], 1e-12))
-    matrix = covariance
     if degenerate:
-        matrix = covariance + 1e-7 * max(singular[0], 1e-12) * orientation
-    u, _, vt = np.linalg.svd(matrix)
+        u, _, vt = np.linalg.svd(covariance + 1e-7 * max(singular[0], 1e-12) * orientation)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = u @ sign @ vt
     return rotation, float(np.trace(rotation.T @ covariance)), degenerate

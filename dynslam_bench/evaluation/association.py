@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 
 from .protocol import Protocol
 
+Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
@@ -68,34 +70,45 @@ class Association:
 def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> Association:
     """Associate two trajectories under a protocol.
 
+    Returns:
+        What was associated; nobody may write into it: all runs on one sequence share what is found for their stamps.
+
     Raises:
         EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
     """
     for name, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
         if not len(trajectory):
             raise EvaluationError(f"the {name} holds no poses")
-    if protocol.one_to_one:
-        index_gt, index_est = associate(
-            ground_truth.timestamps, estimate.timestamps, protocol.max_dt, strict=protocol.strict
-        )
+    rule = protocol.max_dt, protocol.strict, protocol.one_to_one
+    return _matched(estimate.timestamps.tobytes(), ground_truth.timestamps.tobytes(), *rule)
+
+
+@lru_cache(maxsize=256)
+def _matched(estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, one_to_one: bool) -> Association:
+    """`match`, once for equal stamps."""
+    t_est, t_gt = np.frombuffer(estimate), np.frombuffer(ground_truth)
+    if one_to_one:
+        index_gt, index_est = associate(t_gt, t_est, max_dt, strict=strict)
         order = np.argsort(index_est, kind="stable")
         index_gt, index_est = index_gt[order], index_est[order]
-    elif len(estimate) > len(ground_truth):  # evo starts from the shorter one, and from the second of equal ones
-        index_gt, index_est = nearest_match(ground_truth.timestamps, estimate.timestamps, protocol)
+    elif len(t_est) > len(t_gt):  # evo starts from the shorter one, and from the second of equal ones
+        index_gt, index_est = nearest_match(t_gt, t_est, max_dt, strict=strict)
     else:
-        index_est, index_gt = nearest_match(estimate.timestamps, ground_truth.timestamps, protocol)
+        index_est, index_gt = nearest_match(t_est, t_gt, max_dt, strict=strict)
     if not len(index_est):
-        raise _nothing_matched(estimate, ground_truth, protocol)
-    return _report(estimate, ground_truth, index_est, index_gt, protocol)
+        raise _nothing_matched(t_est, t_gt, max_dt)
+    index_est.flags.writeable = index_gt.flags.writeable = False
+    return _report(t_est, t_gt, index_est, index_gt, max_dt, strict=strict)
 
 
-def nearest_match(stamps: NDArray[np.float64], others: NDArray[np.float64], protocol: Protocol) -> tuple[Index, Index]:
+def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) -> tuple[Index, Index]:
     """For every stamp the nearest of the others, the earlier on a tie (evo's rule: stamps may be used repeatedly).
 
     Args:
         stamps: Seconds ``[N]``, ascending.
         others: Seconds ``[M]``, ascending, not empty.
-        protocol: Gives the tolerance and whether it is strict.
+        max_dt: Tolerance in seconds.
+        strict: Whether a difference that equals it is too much.
 
     Returns:
         Indices into both lists ``[K]``, in order of `stamps`.
@@ -106,20 +119,19 @@ def nearest_match(stamps: NDArray[np.float64], others: NDArray[np.float64], prot
     left_dt = np.where(right > 0, stamps - others[left], np.inf)
     chosen = np.where(right_dt < left_dt, right, left)
     dt = np.minimum(right_dt, left_dt)
-    keep = dt < protocol.max_dt if protocol.strict else dt <= protocol.max_dt
-    inside = (stamps >= others[0] - protocol.max_dt) & (stamps <= others[-1] + protocol.max_dt)
+    keep = dt < max_dt if strict else dt <= max_dt
+    inside = (stamps >= others[0] - max_dt) & (stamps <= others[-1] + max_dt)
     keep &= inside
     return np.flatnonzero(keep), chosen[keep]
 
 
 def _report(
-    estimate: Trajectory, ground_truth: Trajectory, index_est: Index, index_gt: Index, protocol: Protocol
+    t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> Association:
-    t_est, t_gt = estimate.timestamps, ground_truth.timestamps
     unmatched = np.ones(len(t_est), dtype=bool)
     unmatched[index_est] = False
     gap = nearest_gap(t_est, t_gt)
-    far = gap >= protocol.max_dt if protocol.strict else gap > protocol.max_dt
+    far = gap >= max_dt if strict else gap > max_dt
     outside = far & ((t_est < t_gt[0]) | (t_est > t_gt[-1]))
     hole, hole_at = largest_hole(t_gt, t_est[0], t_est[-1])
     return Association(
@@ -136,7 +148,7 @@ def _report(
     )
 
 
-def largest_hole(stamps: NDArray[np.float64], start: float, stop: float) -> tuple[float, float]:
+def largest_hole(stamps: Array, start: float, stop: float) -> tuple[float, float]:
     """Length and beginning, in seconds, of the largest gap between stamps within ``[start, stop]``."""
     inside = stamps[(stamps > start) & (stamps < stop)]
     edges = np.concatenate([[start], inside, [stop]])
@@ -145,11 +157,10 @@ def largest_hole(stamps: NDArray[np.float64], start: float, stop: float) -> tupl
     return float(gaps[at]), float(edges[at])
 
 
-def _nothing_matched(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> EvaluationError:
-    t_est, t_gt = estimate.timestamps, ground_truth.timestamps
+def _nothing_matched(t_est: Array, t_gt: Array, max_dt: float) -> EvaluationError:
     gap = nearest_gap(t_est, t_gt)
     message = (
-        f"none of {len(t_est)} poses has ground truth within {protocol.max_dt:g} s: the nearest is {gap.min():.3f} s "
+        f"none of {len(t_est)} poses has ground truth within {max_dt:g} s: the nearest is {gap.min():.3f} s "
         f"away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
         f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s"
     )

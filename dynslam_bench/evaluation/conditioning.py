@@ -39,14 +39,16 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
         return None
     if len(source) < 2 * BLOCKS:
         return _left_out(source, target, rotation)
-    blocks = np.array_split(np.arange(len(source)), BLOCKS)
+    size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even
+    starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
     source, target = source - source.mean(axis=0), target - target.mean(axis=0)
     weights = _HALVES.astype(np.float64)
-    count = weights @ [len(block) for block in blocks]
-    sums = weights @ np.array([source[block].sum(axis=0) for block in blocks])
-    target_sums = weights @ np.array([target[block].sum(axis=0) for block in blocks])
-    products = np.einsum("kb,bij->kij", weights, np.array([target[block].T @ source[block] for block in blocks]))
-    covariances = products - np.einsum("ki,kj->kij", target_sums, sums) / count[:, None, None]
+    count = weights @ np.diff(starts, append=len(source))
+    sums = weights @ np.add.reduceat(source, starts)
+    target_sums = weights @ np.add.reduceat(target, starts)
+    together = np.add.reduceat(target[:, :, None] * source[:, None, :], starts)
+    products = (weights @ together.reshape(BLOCKS, 9)).reshape(-1, 3, 3)
+    covariances = products - target_sums[:, :, None] * sums[:, None, :] / count[:, None, None]
     return float(np.sqrt((_turned_deg(covariances, rotation) ** 2).mean()))
 
 

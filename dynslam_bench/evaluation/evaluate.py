@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pydantic import field_validator
 
 from dynslam_bench.core.errors import EvaluationError
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, schema
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_file import load_trajectory
 
@@ -81,7 +81,7 @@ class Evaluation(Record):
         diagnostics: One line for everything that a reader of the numbers ought to know.
     """
 
-    schema_version: int = SCHEMA_VERSION
+    schema_version: int = schema(SCHEMA_VERSION)
     protocol_id: str
     protocol_digest: str
     protocol: str

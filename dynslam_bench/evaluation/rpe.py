@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,15 +54,23 @@ def tum_relative_errors(
     """
     pairs = select_pairs(estimate.timestamps, estimate.T_world_cam, spec)
     nearest = closest(ground_truth.timestamps, estimate.timestamps)
-    intervals = np.diff(ground_truth.timestamps)
-    tolerance = 2 * float(np.median(intervals)) if len(intervals) else 0.0
-    covered = nearest_gap(estimate.timestamps, ground_truth.timestamps) <= tolerance
-    keep = covered[pairs].all(axis=1)
-    kept = pairs[keep]
+    covered = _covered(estimate.timestamps.tobytes(), ground_truth.timestamps.tobytes())
+    kept = pairs[covered[pairs[:, 0]] & covered[pairs[:, 1]]]
     estimated = _relative(estimate.T_world_cam, kept)
     estimated[:, :3, 3] *= scale
     true = _relative(ground_truth.T_world_cam, nearest[kept])
     return _errors(kept, estimated @ se3.inverse(true), dropped=len(pairs) - len(kept))
+
+
+@lru_cache(maxsize=256)
+def _covered(estimate: bytes, ground_truth: bytes) -> NDArray[np.bool_]:
+    """Which stamps have a true pose near enough; once for equal stamps, so nobody may write into it."""
+    truth = np.frombuffer(ground_truth)
+    intervals = np.diff(truth)
+    tolerance = 2 * float(np.median(intervals)) if len(intervals) else 0.0
+    covered: NDArray[np.bool_] = np.asarray(nearest_gap(np.frombuffer(estimate), truth) <= tolerance)
+    covered.flags.writeable = False
+    return covered
 
 
 def evo_relative_errors(stamps: Array, estimate: Array, ground_truth: Array, spec: RPESpec) -> RelativeErrors:

@@ -94,10 +94,13 @@ def to_quaternion(pose: Array) -> tuple[Array, Array]:
 
 
 def rotation_angle(pose: Array) -> Array:
-    """Rotation angles ``[...]`` in rad, in [0, pi]; accurate for small angles too."""
+    """Rotation angles ``[...]`` in rad, in [0, pi], all of them accurate: by sine and cosine together."""
     pose = np.asarray(pose, dtype=np.float64)
-    angles = _rotations().from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).magnitude()
-    return np.asarray(angles).reshape(pose.shape[:-2])
+    x = pose[..., 2, 1] - pose[..., 1, 2]
+    y = pose[..., 0, 2] - pose[..., 2, 0]
+    z = pose[..., 1, 0] - pose[..., 0, 1]
+    trace = pose[..., 0, 0] + pose[..., 1, 1] + pose[..., 2, 2]
+    return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
 
 
 def transform(pose: Array, points: Array) -> Array:

@@ -28,6 +28,8 @@ FIXED = (
     *("reward_m", "mask_iou"),
 )
 """Columns of every ``frames.csv``; after them come ``<stage>_s``, seconds of every stage, and ``stat_<name>``."""
+MOST_FRAMES = 1 << 31
+"""No run has as many."""
 _SHARE = "dynamic_share"
 """A column of sequences with exact masks only."""
 _STAT = "stat_"
@@ -143,7 +145,7 @@ def _from_json(line: str) -> FrameRow:
     if not math.isfinite(timestamp):
         raise ValueError(f"stamp {timestamp}")
     return FrameRow(
-        index=int(values["index"]),
+        index=_index(values["index"]),
         timestamp=timestamp,
         state=_state(values["state"]),
         **numbers,
@@ -151,6 +153,13 @@ def _from_json(line: str) -> FrameRow:
         stats={str(name): _number(number) for name, number in dict(values.get("stats", {})).items()},
         pose=pose,
     )
+
+
+def _index(value: Any) -> int:
+    index = int(value)
+    if not 0 <= index < MOST_FRAMES:
+        raise ValueError(f"index {str(value)[:40]}")
+    return index
 
 
 def _number(value: Any) -> float:
@@ -203,7 +212,7 @@ def _parse(line: Mapping[str, str]) -> FrameRow:
         if name.endswith(_SECONDS) and not name.startswith(_STAT)
     }
     return FrameRow(
-        index=int(line["index"]),
+        index=_index(line["index"]),
         timestamp=float(line["timestamp"]),
         state=_state(line["state"]),
         frame_error_trans_m=cells.get("frame_error_trans_m"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.core.array_files import read_npz
 from dynslam_bench.core.errors import RunError
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 SNAPSHOTS_FILE = "snapshots.npz"
 SPREAD = 24
 """Frames that are kept evenly spread over a run."""
+MOST_FRAMES = 1000
+"""Of a file that is read."""
 WORST = 6
 """Frames that are kept besides, those with the largest frame-to-frame error."""
 
@@ -31,13 +33,20 @@ class Snapshot:
         index: Index of the frame in the run's part of the sequence.
         points: int16 ``[N, 2]``, pixels of the features.
         kept: bool ``[N]``, which of them were kept.
-        mask: bool ``[H, W]``, pixels held for dynamic; None where the tracker gave no mask.
+        packed: uint8 ``[H, ceil(W / 8)]``, eight pixels of the mask a byte; None where the tracker gave no mask.
+        width: W, pixels of a line of the mask.
     """
 
     index: int
     points: NDArray[np.int16]
     kept: NDArray[np.bool_]
-    mask: NDArray[np.bool_] | None
+    packed: NDArray[np.uint8] | None
+    width: int
+
+    @property
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Pixels held for dynamic, bool ``[H, W]``; None where the tracker gave no mask."""
+        return None if self.packed is None else np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
 
 
 def spread(frames: int, count: int = SPREAD) -> list[int]:
@@ -76,7 +85,7 @@ class SnapshotWriter:
         shots = sorted([*self._even, *(shot for _, shot in self._worst)], key=lambda shot: shot.index)
         if not shots:
             return
-        masks = [np.zeros(self._size, bool) if shot.mask is None else shot.mask for shot in shots]
+        empty = np.zeros((self._size[0], -(-self._size[1] // 8)), np.uint8)
         np.savez_compressed(
             self._path,
             index=np.array([shot.index for shot in shots], np.int32),
@@ -84,8 +93,8 @@ class SnapshotWriter:
             points=np.concatenate([shot.points for shot in shots]),
             kept=np.concatenate([shot.kept for shot in shots]),
             size=np.array(self._size, np.int32),
-            masked=np.array([shot.mask is not None for shot in shots]),
-            masks=np.packbits(np.stack(masks), axis=2),
+            masked=np.array([shot.packed is not None for shot in shots]),
+            masks=np.stack([empty if shot.packed is None else shot.packed for shot in shots]),
         )
 
 
@@ -98,7 +107,8 @@ def taken(index: int, result: TrackResult) -> Snapshot:
         index,
         np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
         np.ones(len(points), bool) if kept is None else np.array(kept, dtype=bool),
-        None if mask is None else np.array(mask, dtype=bool),
+        None if mask is None else np.packbits(np.asarray(mask, dtype=bool), axis=1),
+        0 if mask is None else mask.shape[1],
     )
 
 
@@ -118,17 +128,28 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     path = folder / SNAPSHOTS_FILE
     if not path.is_file():
         return (0, 0), []
+    found = read_npz(path, kind=RunError)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            found = {name: stored[name] for name in stored.files}
-        height, width = found["size"].tolist()
-        ends = np.cumsum(found["count"])[:-1]
-        points, kept = np.split(found["points"], ends), np.split(found["kept"], ends)
-        masks = np.unpackbits(found["masks"], axis=2, count=width).astype(bool)
+        height, width = map(int, found["size"])
+        index, count, points, kept = found["index"], found["count"], found["points"], found["kept"]
+        masks, masked = found["masks"], found["masked"]
+        if masks.dtype != np.uint8 or masks.shape[1:] != (height, -(-width // 8)):
+            raise ValueError(f"masks of {masks.dtype} {masks.shape} do not fit {width} x {height} pixels")
+        if not (
+            len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
+            and (count >= 0).all()
+            and points.shape == (count.sum(), 2)
+            and kept.shape == points.shape[:1]
+            and points.dtype == np.int16
+            and kept.dtype == masked.dtype == np.bool_
+        ):
+            raise ValueError("its arrays do not fit each other")
+        ends = np.cumsum(count)[:-1]
+        parts = zip(np.split(points, ends), np.split(kept, ends), strict=True)
         shots = [
-            Snapshot(int(index), points[at], kept[at], masks[at] if found["masked"][at] else None)
-            for at, index in enumerate(found["index"])
+            Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
+            for at, (place, keep) in enumerate(parts)
         ]
-    except (OSError, EOFError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
-        raise RunError(f"{path} holds no snapshots: {error}") from error
+    except (LookupError, ValueError, TypeError, ArithmeticError) as error:
+        raise RunError(f"{path} holds no snapshots: {' '.join(str(error).split())[:200]}") from error
     return (height, width), shots

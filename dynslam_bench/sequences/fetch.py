@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha256
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
@@ -15,7 +15,7 @@ from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.harmless import inside, is_inside
 from dynslam_bench.core.reading import read_lines
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, schema
 
 from . import first_use
 from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
@@ -41,7 +41,7 @@ class Receipt(Record):
         files: Number of files extracted; their checksums are in ``manifest.sha256``.
     """
 
-    schema_version: Literal[1] = 1
+    schema_version: int = schema(1)
     id: str
     url: str
     sha256: str

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import astuple, dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -138,14 +138,14 @@ def write_explore(
 
 def _written(
     pieces: Sequence[Sequence[LoadedRun]],
-    shown: Collection[str],
+    shown: Set[str],
     shares: Sequence[Mapping[int, float]],
     crew: Crew,
     told: Heard,
 ) -> list[Pages]:
     """What the helpers write."""
     jobs = [
-        {"runs": [run.as_job() for run in piece], "shown": [*shown], "share": share}
+        {"runs": [run.as_job() for run in piece], "shown": [*shown & {run.row.run_id for run in piece}], "share": share}
         for piece, share in zip(pieces, shares, strict=True)
     ]
     return [Pages.of(answer) for answer in crew.work("pages", jobs, told)]

@@ -29,7 +29,7 @@ FOLDER = "frames"
 EVEN, WORST = 16, 4
 """Frames of a run that are shown evenly spread, and those with the largest frame-to-frame error."""
 _WIDTH, _QUALITY = 480, 62
-_MASK_WIDTH, _LOSSLESS = 160, 101
+_MASK_WIDTH = 240
 
 
 @dataclass
@@ -103,7 +103,7 @@ class PictureBook:
             began = time.perf_counter()
             image = self._sequence(run)[index].rgb
             self._spent += time.perf_counter() - began
-            write_atomic(path, _webp(_shrunk(image[:, :, ::-1], _WIDTH), _QUALITY))
+            write_atomic(path, _coded(".webp", _shrunk(image[:, :, ::-1], _WIDTH), cv2.IMWRITE_WEBP_QUALITY, _QUALITY))
         return path.relative_to(self.output).as_posix()
 
     def _sequence(self, run: LoadedRun) -> Sequence:
@@ -134,24 +134,32 @@ def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
 def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
     """Features (two bytes each: x and y in 255ths of the image), which were kept, and the mask as a small image."""
     height, width = size
-    places = np.clip(shot.points * 255.0 / (width, height), 0, 255).round().astype(np.uint8)
+    places = np.clip(shot.points * np.float32((255 / width, 255 / height)), 0, 255).round().astype(np.uint8)
     order = np.argsort(shot.kept, kind="stable")  # culled ones first
     seen = {"points": base64.b64encode(places[order].tobytes()).decode(), "culled": int((~shot.kept).sum())}
     seen |= {"width": width, "height": height}
-    if shot.mask is None or not shot.mask.any():
-        return seen | {"share": None if shot.mask is None else 0.0}
-    mask = _shrunk(shot.mask.astype(np.uint8) * 255, _MASK_WIDTH)
-    coded = base64.b64encode(_webp(np.asarray(cv2.merge([mask, mask, mask]), np.uint8), _LOSSLESS)).decode()
-    return seen | {"mask": f"data:image/webp;base64,{coded}", "share": significant(100 * float(shot.mask.mean()), 3)}
+    mask = shot.mask
+    if mask is None:
+        return seen | {"share": None}
+    seen["share"] = significant(100 * np.count_nonzero(mask) / mask.size, 3)
+    if not seen["share"]:
+        return seen
+    small = cv2.resize(mask.view(np.uint8), _shrunk_size(mask, _MASK_WIDTH), interpolation=cv2.INTER_NEAREST)
+    coded = base64.b64encode(_coded(".png", np.asarray(small), cv2.IMWRITE_PNG_BILEVEL, 1)).decode()
+    return seen | {"mask": f"data:image/png;base64,{coded}"}
+
+
+def _shrunk_size(image: NDArray[Any], width: int) -> tuple[int, int]:
+    return width, max(round(image.shape[0] * width / image.shape[1]), 1)
 
 
 def _shrunk(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    height = round(image.shape[0] * width / image.shape[1])
-    return np.asarray(cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    size = _shrunk_size(image, width)
+    return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _webp(image: NDArray[np.uint8], quality: int) -> bytes:
-    done, coded = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+def _coded(kind: str, image: NDArray[Any], *options: int) -> bytes:
+    done, coded = cv2.imencode(kind, image, options)
     if not done:
-        raise DynslamError("this OpenCV cannot write WebP")
+        raise DynslamError(f"this OpenCV cannot write {kind} images")
     return bytes(coded)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -188,9 +189,11 @@ def _log(run: LoadedRun) -> str:
     path = run.store.folder(run.row.run_id) / "log.txt"
     if not path.is_file():
         return ""
-    text = path.read_bytes()
-    cut = f"... {len(text) - _LOG_BYTES} bytes before\n" if len(text) > _LOG_BYTES else ""
-    return cut + text[-_LOG_BYTES:].decode(errors="replace")
+    with path.open("rb") as file:
+        before = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
+        file.seek(before)
+        text = file.read(_LOG_BYTES)
+    return (f"... {before} bytes before\n" if before else "") + text.decode(errors="replace")
 
 
 def _series(frames: RunFrames, most: int) -> dict[str, Any]:

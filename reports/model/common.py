@@ -5,16 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import median
 
-import numpy as np
-
-from dynslam_bench.core.errors import DynslamError, EvaluationError
-from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.association import match
-from dynslam_bench.evaluation.error_statistics import statistics
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.evaluation.ate import ate_rmse_m
 from dynslam_bench.evaluation.frames import common_frames
-from dynslam_bench.evaluation.prepare import compared
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.trajectory import Trajectory
 
 from .board import Board
 from .crew import Crew, unheard_run
@@ -64,25 +58,10 @@ def common_of(runs: Sequence[LoadedRun], protocol: Protocol) -> tuple[dict[str, 
             continue
         truth = run.ground_truth()
         try:
-            errors[run.row.run_id] = None if truth is None else _ate(trajectory, truth, protocol)
+            errors[run.row.run_id] = None if truth is None else ate_rmse_m(trajectory, truth, protocol)
         except DynslamError:
             errors[run.row.run_id] = None
     return errors, len(reduced[0])
-
-
-def _ate(estimate: Trajectory, truth: Trajectory, protocol: Protocol) -> float:
-    """The ATE alone in metres, as `evaluate` takes it: there are as many of these as runs.
-
-    Raises:
-        EvaluationError: Fewer than two poses have ground truth.
-    """
-    estimate, truth = compared(estimate, truth, protocol)
-    association = match(estimate, truth, protocol)
-    if len(association) < 2:
-        raise EvaluationError("only one pose has ground truth")
-    matched, true = estimate.T_world_cam[association.estimate], truth.T_world_cam[association.ground_truth]
-    left = align(matched, true, protocol.alignment).apply(matched)[:, :3, 3] - true[:, :3, 3]
-    return statistics(np.linalg.norm(left, axis=1))["rmse"]
 
 
 def representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from dynslam_bench.core.reading import TABLE_BYTES
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, schema
 
 from .row import RunRow
 
@@ -29,7 +29,7 @@ class ReportData(Record):
 
     most_bytes: ClassVar[int] = TABLE_BYTES
 
-    schema_version: int = SCHEMA_VERSION
+    schema_version: int = schema(SCHEMA_VERSION)
     title: str
     protocol: str
     reference: str

@@ -8,7 +8,8 @@ from typing import Any
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.records import digest
-from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
+from dynslam_bench.evaluation.ate import ate_rmse_m
+from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.never_move import never_move
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.runs.storage.record import RunRecord
@@ -68,7 +69,6 @@ def held_error(
     if evaluation.coverage == 1.0:
         return error
     unheld = error if record.coverage >= 1.0 else max(error, still or 0.0)
-    held = protocol.model_copy(update={"lost_frames": "hold", "rpe": (), "segments_m": ()})
     try:
         trajectory, truth = (
             store.trajectory(record.run_id, protocol.trajectory),
@@ -77,7 +77,7 @@ def held_error(
         if trajectory is None or truth is None:
             return unheld
         stamps = store.timestamps(record.sequence.part)
-        return evaluate(trajectory, truth, held, input_timestamps=stamps).metrics["ate_rmse_m"]
+        return ate_rmse_m(trajectory, truth, protocol, held_at=stamps)
     except DynslamError:
         return unheld
 

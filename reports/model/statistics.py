@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 Array = NDArray[np.float64]
 Cells = Mapping[str, Mapping[str, Sequence[float]]]
@@ -113,7 +113,7 @@ def ratio_interval(log_ratios: Array) -> Interval:
     mean = float(values.mean())
     if len(values) < FEWEST:
         return Interval(float(np.exp(mean)), np.nan, np.nan)
-    half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+    half = float(scipy.stats.t.ppf(0.975, len(values) - 1) * scipy.stats.sem(values))
     return Interval(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
 
 
@@ -136,7 +136,7 @@ def separable(logs: Mapping[str, Array]) -> dict[tuple[str, str], bool]:
     p_values = np.ones(len(pairs))
     if differences.shape[1] >= FEWEST:
         varied = np.ptp(differences, axis=1) > 0
-        p_values[varied] = stats.ttest_1samp(differences[varied], 0.0, axis=1).pvalue
+        p_values[varied] = scipy.stats.ttest_1samp(differences[varied], 0.0, axis=1).pvalue
         p_values[~varied & (differences[:, 0] != 0)] = 0.0  # the same ratio on every sequence
     corrected = holm({str(at): float(p) for at, p in enumerate(p_values)})
     return {pair: corrected[str(at)] <= FAMILY_ERROR for at, pair in enumerate(pairs)}
@@ -163,7 +163,7 @@ def paired_p_value(log_a: Array, log_b: Array) -> float | None:
     difference = difference[difference != 0]
     if not len(difference):
         return None
-    return float(stats.wilcoxon(difference).pvalue)
+    return float(scipy.stats.wilcoxon(difference).pvalue)
 
 
 def attainable_p(sequences: int, tests: int = 1) -> float:
@@ -240,8 +240,8 @@ def _ranks(logs: Mapping[str, Array]) -> tuple[dict[str, int], dict[str, tuple[i
         return {}, {}, {}
     keys = list(logs)
     means = {key: float(np.mean(logs[key])) for key in keys}
-    order = stats.rankdata([round(means[key], 12) for key in keys], method="min")
-    per_sequence = stats.rankdata(np.stack([logs[key] for key in keys]), method="average", axis=0).mean(axis=1)
+    order = scipy.stats.rankdata([round(means[key], 12) for key in keys], method="min")
+    per_sequence = scipy.stats.rankdata(np.stack([logs[key] for key in keys]), method="average", axis=0).mean(axis=1)
     groups = rank_groups(logs)
     return (
         {key: int(order[i]) for i, key in enumerate(keys)},

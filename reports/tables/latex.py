@@ -47,6 +47,7 @@ def to_latex(table: Table, protocol: str = "") -> str:
         table: The table.
         protocol: Name of the protocol that its numbers were taken under, for the caption.
     """
+    table = table.displayed()
     parts = [part for columns in _blocks(table) for part in _parts(table, columns)]
     floats: list[list[str]] = [[]]
     used = 0
@@ -100,7 +101,7 @@ def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> s
 
 def _blocks(table: Table) -> list[list[int]]:
     """Which columns stand side by side; the names of the rows stand in every block."""
-    shown = [at for at, column in enumerate(table.columns) if column.latex and any(row[at].text for row in table.rows)]
+    shown = [at for at, column in enumerate(table.columns) if column.latex]
     names = next((at for at in shown if not table.columns[at].numeric), 0)
     widths = {at: _width_pt(table, at) for at in shown}
     room = COLUMN_PT - min(widths.get(names, 0.0), _NAMES_PT)

@@ -131,6 +131,14 @@ class Table:
         columns = [values.astype(object).where(values.notna(), shown.map(_words)) for (_, values), (_, shown) in pairs]
         return pd.concat(columns, axis=1)
 
+    def displayed(self) -> Table:
+        """The table as pages, Markdown and LaTeX show it: without columns in which nothing is written; CSV has all."""
+        kept = [at for at in range(len(self.columns)) if not self.rows or any(_words(row[at]) for row in self.rows)]
+        if len(kept) == len(self.columns):
+            return self
+        columns, rows = [self.columns[at] for at in kept], [[row[at] for at in kept] for row in self.rows]
+        return Table(self.id, self.title, self.caption, columns, rows, self.muted_rows, self.separators, self.brief)
+
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
         found: list[tuple[str, int]] = []
@@ -144,6 +152,7 @@ class Table:
 
 def to_markdown(table: Table) -> str:
     """The table as GitHub Markdown with its caption."""
+    table = table.displayed()
     names = [f"{column.group}: {column.name}" if column.group else column.name for column in table.columns]
     lines = [
         f"## {prose(table.title)}",

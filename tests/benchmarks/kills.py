@@ -8,8 +8,9 @@
 `files`: every fault at every file operation of the run store, the stage cache, a download, a study's journal and the
 files and folders beneath them, each gone on from (the surveys of `tests/core/test_core_faults.py`,
 `tests/runs/test_runs_faults.py` and `tests/tuning/test_study_journal.py`). `operations`: two runs through
-`dynslam-bench bench` with a fault at every file operation of the parent (by `tests/core/faults.py`). `moments`: `bench`
-and `tune run` killed (SIGKILL, to the whole group) and interrupted (SIGINT) after random times. `signals`: a foreign
+`dynslam-bench bench` with a fault at every file operation of the parent (by `tests/core/faults.py`); the command
+line is entered in a fork that has imported it before, and starts a fork server of its own. `moments`: `bench` and
+`tune run` killed (SIGKILL, to the whole group) and interrupted (SIGINT) after random times. `signals`: a foreign
 program that ignores signals and hides its children in sessions of their own, ended by each signal to the command line,
 its group, the fork server, a keeper; how long until nothing is left.
 
@@ -30,6 +31,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -39,21 +41,24 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / room) for room in ("core", "en
 
 import faults  # noqa: E402
 from envs_toys import write_folder  # noqa: E402
+from faults import Injector  # noqa: E402
 from test_runs_infrastructure import STRAYS  # noqa: E402
 
+from dynslam_bench.cli import main as main_of_the_command_line  # noqa: E402
 from dynslam_bench.core.temporary import SHARED_MEMORY  # noqa: E402
 from dynslam_bench.runs.process.family import children, family  # noqa: E402
+from dynslam_bench.runs.process.server import SERVER  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
 STUDY = (
     'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\nseeds = [0]\noffsets = [0]\nallow_overlap = true\n'
 )
-DISTURBED = (
-    "import atexit, sys; from pathlib import Path; from faults import Injector\n"
-    "injector = Injector(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]); injector.install()\n"
-    "atexit.register(lambda: sys.stderr.write(f'operations {injector.count}\\n'))\n"
-    "from dynslam_bench.cli import main; sys.argv[1:] = sys.argv[4:]; main()"
-)
+LIGHT_SERVER = """#!/bin/sh
+exec {python} -c "import sys; import dynslam_bench.runs.process.server as server
+server.PRELOADED = ('numpy', 'cv2', 'gymnasium', 'dynslam_bench.envs', 'dynslam_bench.runs.process.keeper')
+server.serve(int(sys.argv[-1]))" "$@"
+"""
+"""A fork server that has imported what the toys need, which is a third of what systems need."""
 
 
 def environment() -> dict[str, str]:
@@ -115,29 +120,70 @@ def files(work: Path) -> Counter[str]:
 def operations(work: Path, which: list[str], every: int) -> Counter[str]:
     """A fault at every file operation of the parent of two runs."""
     (work / "suite.toml").write_text(SUITE.format(folder=write_folder(work / "toy", 20)))
-    arguments = ["bench", "suite.toml"]
-    expected, wrong = go_on(work, arguments, None)
-    assert not wrong, wrong
+    (work / "python").write_text(LIGHT_SERVER.format(python=sys.executable))
+    (work / "python").chmod(0o755)
+    sys.executable = str(work / "python")
+    os.chdir(work)
+    bench()  # here, so that no fork has to import what it needs
+    SERVER.close()
+    expected = outcome(work / "results")
     counted: Counter[str] = Counter()
-    total = int(disturb(work, 0, "kill", arguments).stderr.rpartition("operations ")[2])
+    _, total, said = disturb(work, 0, "kill")
+    assert outcome(work / "results") == expected, said
     sys.stdout.write(f"{total} file operations\n")
     for fault in which:
         for at in range(1, total + 1, every):
-            first = disturb(work, at, fault, arguments)
-            if "Traceback" in first.stderr:
-                sys.stdout.write(f"{fault} at {at}: traceback: {first.stderr.strip()[-300:]}\n")
+            _, _, said = disturb(work, at, fault)
+            if "Traceback" in said:
+                sys.stdout.write(f"{fault} at {at}: traceback: {said.strip()[-300:]}\n")
                 counted["tracebacks"] += 1
-            _, wrong = go_on(work, arguments, expected)
+            code, _, said = in_fork(work, Injector(work / "results"))
+            left = [path.name for path in (work / "results" / "runs").glob(".*") if path.suffix in (".tmp", ".claim")]
+            wrong = f"exit code {code}: {said.strip()[-200:]}" if code else f"left: {left}" if left else ""
+            wrong = wrong or ("" if outcome(work / "results") == expected else "other runs than undisturbed")
             note(counted, f"{fault} at {at}", wrong)
     return counted
 
 
-def disturb(work: Path, at: int, fault: str, arguments: list[str]) -> subprocess.CompletedProcess[str]:
+def bench() -> int:
+    """The command line, in this process; its exit code."""
+    sys.argv = ["dynslam-bench", "bench", "suite.toml"]
+    try:
+        main_of_the_command_line()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def disturb(work: Path, at: int, fault: str) -> tuple[int, int, str]:
     """The command line on an empty results folder, with a fault at one file operation; 0 for none."""
     shutil.rmtree(work / "results")
     (work / "results").mkdir()
-    program = [sys.executable, "-c", DISTURBED, str(work / "results"), str(at), fault, *arguments]
-    return subprocess.run(program, cwd=work, env=environment(), capture_output=True, text=True)
+    return in_fork(work, Injector(work / "results", at, fault))
+
+
+def in_fork(work: Path, injector: Injector) -> tuple[int, int, str]:
+    """The command line in a fork: exit code, file operations, what it said on standard error."""
+    said, counted = work / "said", work / "counted"
+    counted.write_text("0")
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid == 0:
+        os.setsid()
+        os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        injector.install()
+        try:
+            code = bench()
+        except BaseException:
+            traceback.print_exc()
+            code = 99
+        sys.stdout.flush()
+        SERVER.close()
+        counted.write_text(str(injector.count))
+        os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    return code, int(counted.read_text()), said.read_text()
 
 
 def moments(work: Path, times: int) -> Counter[str]:

@@ -2,9 +2,9 @@
 
     python tests/benchmarks/many_records.py [--records 100000] [--report]
 
-Makes a results folder of so many runs, each stored as runs are (record, trajectory, errors), by giving the two runs of
-`tests/fixtures` other ids, trackers, sequences and seeds. A list is `dynslam-bench runs list`, the report
-`dynslam-bench report`; each runs in a process of its own, whose processor time is printed beside the wall time.
+Makes a results folder of so many runs, each stored as runs are (record, trajectory, errors), by giving a run of
+`tests/fixtures` other ids, trackers, sequences, seeds, errors and settings. A list is `dynslam-bench runs list`, the
+report `dynslam-bench report`; each runs in a process of its own, whose processor time is printed beside the wall time.
 
 Bars: 100,000 records are listed within 3 s once they are known, and reported within 60 s.
 """
@@ -12,6 +12,8 @@ Bars: 100,000 records are listed within 3 s once they are known, and reported wi
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import resource
 import shutil
@@ -24,6 +26,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 FIXTURE = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
 TRACKERS, SEQUENCES = 20, 50
+SETTINGS = 120
+"""As many as trackers have: a record of 12 KB."""
 
 
 def fill(results: Path, records: int) -> None:
@@ -31,22 +35,39 @@ def fill(results: Path, records: int) -> None:
     shutil.copytree(FIXTURE / "sequences", results / "sequences")
     (metrics,) = (FIXTURE / "metrics").iterdir()
     old = min((FIXTURE / "runs").iterdir())
-    record = (old / "run.json").read_text()
-    scored = (metrics / f"{old.name}.json").read_text()
+    record, scored = json.loads((old / "run.json").read_text()), json.loads((metrics / f"{old.name}.json").read_text())
     track = (old / "trajectory_online.txt").read_text()
-    tracker, sequence = ('"id": "never-move"', '"id": "synthetic/walking_xyz"')
+    record["settings"] = {f"group_{at % 12}.setting_{at}": 0.5 * at for at in range(SETTINGS)}
+    record["identity"]["settings"] = record["settings"]
+    record |= {
+        "run_id": "<run>",
+        "seed": "<seed>",
+        "coverage": "<coverage>",
+        "started": "2026-01-<day>T<time>.000+00:00",
+    }
+    record["tracker"] |= {"id": "tracker-<tracker>", "label": "Tracker <tracker>"}
+    record["sequence"] |= {"id": "sequence/<sequence>", "content": "<digest>", "block": "<digest>"}
+    scored["run_id"] = "<run>"
+    scored["online"]["metrics"]["ate_rmse_m"] = "<error>"
+    patterns = [json.dumps(each, indent=2) + "\n" for each in (record, scored)]
     (results / "metrics" / metrics.name).mkdir(parents=True)
     for number in range(records):
-        run = f"{number:016x}"
+        tracker, sequence, repeat = number % TRACKERS, number // TRACKERS % SEQUENCES, number // (TRACKERS * SEQUENCES)
+        run = hashlib.sha256(str(number).encode()).hexdigest()[:16]
+        values = {
+            **{"<run>": run, '"<seed>"': repeat, '"<coverage>"': 1 - repeat / 1000, "<tracker>": tracker},
+            **{"<sequence>": sequence, "<digest>": f"{sequence:016x}", "<day>": f"{1 + number // 86400:02d}"},
+            "<time>": f"{number // 3600 % 24:02d}:{number // 60 % 60:02d}:{number % 60:02d}",
+            '"<error>"': 0.01 * (1 + tracker) + 1e-3 * sequence + 1e-5 * repeat,
+        }
+        texts = list(patterns)
+        for name, value in values.items():
+            texts = [text.replace(name, str(value)) for text in texts]
         folder = results / "runs" / run
         folder.mkdir(parents=True)
-        seed = number // (TRACKERS * SEQUENCES)
-        text = record.replace(old.name, run).replace('"seed": 0', f'"seed": {seed}')
-        text = text.replace(tracker, f'"id": "tracker-{number % TRACKERS}"')
-        text = text.replace(sequence, f'"id": "sequence/{number // TRACKERS % SEQUENCES}"')
-        (folder / "run.json").write_text(text)
+        (folder / "run.json").write_text(texts[0])
         (folder / "trajectory_online.txt").write_text(track)
-        (results / "metrics" / metrics.name / f"{run}.json").write_text(scored.replace(old.name, run))
+        (results / "metrics" / metrics.name / f"{run}.json").write_text(texts[1])
 
 
 def timed(*arguments: str) -> tuple[float, float, float]:

@@ -65,7 +65,14 @@ def _odd_headers() -> list[bytes]:
 
 def _depths() -> list[bytes]:
     deep = np.arange(192, dtype=np.uint16).reshape(12, 16) * 90
-    return [*_encoded(".png", ".tiff", ".pgm", image=deep), *_encoded(".png", image=deep[:4]), *_colours()]
+    metres = _npy(np.full((12, 16), 1.5, np.float32))
+    return [metres, *_encoded(".png", ".tiff", ".pgm", image=deep), *_encoded(".png", image=deep[:4]), *_colours()]
+
+
+def _npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
 
 
 def _rendered() -> list[bytes]:
@@ -81,8 +88,8 @@ def _read_colour(data: bytes | None, folder: Path) -> None:
 
 
 def _read_depth(data: bytes | None, folder: Path) -> None:
-    path = at(folder, "1.png", data)
-    reader.read_depth(path, 5000.0)  # any size
+    path = at(folder, "1.npy" if data and data.startswith(b"\x93") else "1.png", data)
+    reader.read_depth(path, 5000.0, missing=90, furthest_m=2.0)  # any size
     image = reader.read_depth(path, 5000.0, size=(16, 12), mismatch="but the camera is 16x12")
     assert image.shape == (12, 16) and image.dtype == np.float32
 
@@ -237,12 +244,6 @@ def _read_prepared(data: bytes | None, folder: Path) -> None:
     PreparedImages(folder, ("person",))
 
 
-def _images_npy() -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, np.zeros((1, 4, 4, 3), np.uint8))
-    return buffer.getvalue()
-
-
 def _read_vocabulary(data: bytes | None, folder: Path) -> None:
     vocabulary._check(vocabulary._unpack(data or b""), folder / "voc.txt")
 
@@ -261,9 +262,10 @@ def _repressed(data: bytes, random: Random) -> bytes:
         return mutate(data, [data], random)
 
 
+IMAGES = _npy(np.zeros((1, 4, 4, 3), np.uint8))
 TARGETS = [
     Target("colour image", _read_colour, _colours, (reader.read_colour, images.read_image, image_header), mutate_png),
-    Target("depth image", _read_depth, _depths, (reader.read_depth, images.read_image), mutate_png),
+    Target("depth image", _read_depth, _depths, (reader.read_depth, reader._read_raw, images.read_image), mutate_png),
     Target(
         "recorded mask",
         _read_mask,
@@ -303,9 +305,7 @@ TARGETS = [
         lambda: [_onnx(), b"\x80" * 20],
         (onnx,),
     ),
-    Target(
-        "prepared images", _read_prepared, lambda: [_images_npy(), _images_npy() + b"x"], (PreparedImages.__init__,)
-    ),
+    Target("prepared images", _read_prepared, lambda: [IMAGES, IMAGES + b"x"], (PreparedImages.__init__,)),
     Target(
         "vocabulary",
         _read_vocabulary,

@@ -64,7 +64,7 @@ def attack(target: Target, *, seconds: float = float("inf"), inputs: float = flo
 
     Args:
         target: The reader.
-        seconds: Wall time.
+        seconds: Processor time.
         inputs: Number of inputs.
         seed: Of the damage.
     """
@@ -75,10 +75,10 @@ def attack(target: Target, *, seconds: float = float("inf"), inputs: float = flo
     try:
         corpus = target.seeds()
         first: list[bytes | None] = [*corpus, None, b"", b"\xff\xfe\x00", b"{}", b"[" * 100_000]
-        end = time.monotonic() + seconds
+        end = time.process_time() + seconds
         recent: list[bytes | None] = []
         peak = _peak_mb()
-        while result.inputs < inputs and (time.monotonic() < end or result.inputs < len(first)):
+        while result.inputs < inputs and (time.process_time() < end or result.inputs < len(first)):
             data = first[result.inputs] if result.inputs < len(first) else _damaged(target, corpus, random)
             watched = result.inputs < len(first) or result.inputs % WATCHED == 0
             new, fault, refused = _one(target, data, folder, result.coverage if watched else None)

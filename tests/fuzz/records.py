@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.core import reading
+from dynslam_bench.core import array_files, reading
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the cache reads
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.runs import RunRecord, RunStore
+from dynslam_bench.runs import RunRecord, RunStore, snapshots
 from dynslam_bench.runs import frame_row as rows
-from dynslam_bench.runs.storage import packing, run_list
+from dynslam_bench.runs.storage import packing, run_index, run_list
 from dynslam_bench.runs.storage.evaluating import evaluate_run
 from dynslam_bench.runs.storage.frame_table import load_frames
 from dynslam_bench.runs.storage.frames import FrameLog
@@ -35,6 +35,7 @@ FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / 
 RUN = "a7abe04996a79cc4"
 
 
+@cache
 def _stored(name: str) -> bytes:
     (path,) = FIXTURE.glob(name)
     return path.read_bytes()
@@ -71,7 +72,8 @@ def _read_list(data: bytes | None, folder: Path) -> None:
     store = _store(folder, _stored(f"runs/{RUN}/run.json"))
     at(store.runs / ("0" * 16), "run.json", b"{")
     at(store.root / "metrics" / get_protocol("tum-rgbd/v1").digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
-    at(store.root / "index", f"{get_protocol('tum-rgbd/v1').digest()}.json", data)
+    path = run_index.index_file(store.root, get_protocol("tum-rgbd/v1"))
+    at(path.parent, path.name, data)
     rows, unreadable = run_list.list_runs(store)
     assert [row["run"] for row in rows] == [RUN] and len(unreadable) == 1
 
@@ -80,7 +82,7 @@ def _read_list(data: bytes | None, folder: Path) -> None:
 def _index() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         _read_list(None, Path(folder))
-        (path,) = Path(folder).glob("results/index/*.json")
+        (path,) = Path(folder).glob("results/index/*.jsonl")
         return path.read_bytes()
 
 
@@ -219,6 +221,35 @@ def _receipt_seeds() -> list[bytes]:
     return [made.to_json().encode()]
 
 
+def _snapshot_seeds() -> list[bytes]:
+    """Two frames; arrays that do not fit each other; objects; 300 MB of zeros."""
+    sound = {"index": np.array([0, 5]), "count": np.array([3, 1]), "size": np.array([4, 10]),
+             "points": np.zeros((4, 2), np.int16), "kept": np.ones(4, bool), "masked": np.array([True, False]),
+             "masks": np.zeros((2, 4, 2), np.uint8)}  # fmt: skip
+    odd: list[dict[str, Any]] = [{}, {"count": np.array([3, 2])}, {"masks": np.zeros((2, 4, 3), np.uint8)}]
+    odd += [{"kept": np.array([None] * 4)}, {"points": np.zeros(0)}, {"size": np.zeros(300 << 20, np.uint8)}]
+    found = []
+    for each in odd:
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **sound | each)
+        found.append(buffer.getvalue())
+    return found
+
+
+def _rezipped(data: bytes, random: Random) -> bytes:
+    """A sound archive with one damaged array."""
+    buffer = io.BytesIO()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
+            chosen = random.choice(old.namelist())
+            for name in old.namelist():
+                content = old.read(name) if old.getinfo(name).file_size < 1 << 16 else b""
+                new.writestr(name, mutate(content, [content], random) if name == chosen else content)
+    except Exception:  # a seed that is no archive any more is damaged as bytes
+        return mutate(data, [data], random)
+    return buffer.getvalue()
+
+
 def _state_seeds() -> list[bytes]:
     """What such a state is made of, without the package that makes it."""
     state = {"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}
@@ -233,7 +264,13 @@ TARGETS = [
         (RunStore.read_whole, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
         mutate_json,
     ),
-    Target("list of runs", _read_list, lambda: [_index()], (run_list.list_runs, run_list._read), mutate_json),
+    Target(
+        "list of runs",
+        _read_list,
+        lambda: [_index()],
+        (run_list._list_runs, run_index.read_index, run_index._parsed, run_index._is_line, run_index.run_row),
+        mutate_lines,
+    ),
     Target(
         "metric record", _read_metrics, lambda: [_stored(f"metrics/*/{RUN}.json")], (RunStore.metrics,), mutate_json
     ),
@@ -278,6 +315,13 @@ TARGETS = [
         _receipt_seeds,
         (Record.read, Record.parse),
         mutate_json,
+    ),
+    Target(
+        "snapshots of a run",
+        lambda data, folder: snapshots.read_snapshots(at(folder, snapshots.SNAPSHOTS_FILE, data).parent),
+        _snapshot_seeds,
+        (snapshots.read_snapshots, array_files),
+        _rezipped,
     ),
     Target("stage cache entry", _read_entry, lambda: [_entry()], (StageCache.get, _unpack)),
     Target(

@@ -82,9 +82,15 @@ def _read_kitti(data: bytes | None, folder: Path) -> None:
 
 
 def _read_folder(data: bytes | None, folder: Path) -> None:
-    """A list names files: none of them may lie outside, whatever it says."""
-    at(folder, "rgb.txt", data)
-    at(folder, "depth.txt", None if data is None else data.replace(b"rgb/", b"depth/"))
+    """A list names files: none of them may lie outside, whatever it says; pairs and poses are told by their start."""
+    if data and data.startswith(PAIRS[:8]):
+        at(folder, "associations.txt", data)
+    else:
+        poses = bool(data) and data.startswith(POSES[:8])
+        colour = LIST if poses else data
+        at(folder, "groundtruth.txt", data if poses else None)
+        at(folder, "rgb.txt", colour)
+        at(folder, "depth.txt", None if colour is None else colour.replace(b"rgb/", b"depth/"))
     for name in ("1.png", "3.png", "4.png"):
         at(folder, f"rgb/{name}", _PNG)
         at(folder, f"depth/{name}", _DEPTH)
@@ -199,7 +205,7 @@ TARGETS = [
     Target(
         "folder in TUM layout",
         _read_folder,
-        lambda: [LIST, LIST.replace(b"rgb/2", b"../2")],
+        lambda: [LIST, LIST.replace(b"rgb/2", b"../2"), PAIRS, POSES, PAIRS.replace(b"rgb/2", b"../2")],
         (tum, recorded_sequence._existing, harmless.inside, harmless.is_inside),
     ),
     Target(

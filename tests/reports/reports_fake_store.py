@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 
 from dynslam_bench.core.machine import Machine
+from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum
@@ -71,6 +72,7 @@ def add_run(
     died_at=None,
     duration_s=None,
     masks="",
+    settings=None,
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -101,7 +103,8 @@ def add_run(
         tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked),
         overrides=overrides or {}, seed=seed, device="cpu",
         sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
-                              content=content or "", block=block or "", noise=noise, ground_truth=ground_truth,
+                              content=content or "", block=digest(block, 16) if block else "", noise=noise,
+                              ground_truth=ground_truth,
                               tags=list(tags)),
         frames=frames, offset=offset, place=place, epipolar_skipped=skipped,
         identity=({"cache": True} if cached else {}) | ({"camera": camera} if camera else {}),
@@ -109,7 +112,7 @@ def add_run(
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
         started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
-        mask_iou=mask_iou, segmentation=masks, command=list(command),
+        mask_iou=mask_iou, segmentation=masks, command=list(command), settings=settings or {},
     )  # fmt: skip
     with store.work_folder(run_id) as work:
         if ok.any() and online:

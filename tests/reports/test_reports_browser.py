@@ -48,7 +48,11 @@ def report(tmp_path_factory):
     store = fill(root / "results", seeds=(0, 1))
     place = write_folder(root / "toy", 40)
     for name, label in (("ours", "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN}"), ("orb-slam2", "ORB-SLAM2 (our back end)")):
-        run_id = add_run(store, name, "toy", n=40, label=label, place=str(place), lost=(20,), tags=("static",))
+        settings = {"features.options": "one long word after the other " * 40, "features.levels": 8}
+        run_id = add_run(
+            store, name, "toy", n=40, label=label, place=str(place), lost=(20,), tags=("static",),
+            final_error=0.004, settings=settings,
+        )  # fmt: skip
         add_frames(store.folder(run_id), 40)
     add_run(store, "elsewhere", "synthetic/walking_xyz", kind="imported", label="Elsewhere", frame_s=None)
     return build_report(store, root / "report")
@@ -98,6 +102,13 @@ def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report
         assert browser.run("document.documentElement.scrollWidth") == width
         figures = browser.run("[...all('.chart svg')].map((each) => each.getBoundingClientRect().right)")
         assert len(figures) >= 4 and max(figures) <= width
+
+
+def test_settings_are_read_without_scrolling(browser, report):
+    for width in WIDTHS:
+        open_page(browser, report, "run", width)
+        right = browser.run("all('#s-settings td').map((cell) => Math.round(cell.getBoundingClientRect().right))")
+        assert len(right) == 4 and max(right) <= width, (width, right)
 
 
 def test_no_word_of_a_figure_stands_outside_of_it(browser, report):

@@ -1,5 +1,7 @@
 """The exploring table and the pages of runs in a browser: filters, switches, the view in the address, the slider."""
 
+import pandas as pd
+import pytest
 from reports_browser import needs_browser
 from test_reports_browser import browser, open_page, report, run_of
 
@@ -32,9 +34,15 @@ def test_search_tags_and_ranked_only(browser, report):
     ranked = browser.run(ROWS)
     assert 2 <= len(ranked) < 7 and "constant velocity" not in ranked
     browser.run("$('explore-reset').click()")
-    press(browser, "explore-tags", "high dynamic")
-    assert [name for name in browser.run(HEADS) if "sitting" in name or "toy" in name] == []
-    assert len(browser.run(HEADS)) == 3 + 2
+    assert browser.run("all('#explore-tags button').map((each) => each.textContent)") == [
+        *("all", "static", "dynamic", "high dynamic", "low dynamic"),
+    ]
+    for tag, kinds in (("high dynamic", {"walking"}), ("dynamic", {"walking", "sitting"}), ("static", {"toy"})):
+        press(browser, "explore-tags", tag)
+        assert {name.rpartition("/")[2].partition("_")[0] for name in browser.run(HEADS)[3:]} == kinds
+    press(browser, "explore-tags", "dynamic")
+    browser.run("$('explore-ranked').click()")
+    assert browser.run(ROWS) == ranked and len(browser.run(HEADS)) == 3 + 4
 
 
 def test_the_view_is_in_the_address(browser, report):
@@ -49,6 +57,56 @@ def test_the_view_is_in_the_address(browser, report):
     assert "ATE ratio" in browser.run(HEADS)
     browser.run("one('nav a[href=\"#s-errors\"]').click()")
     assert browser.run("location.hash").startswith("#s-errors&") and "kind=rpe" in browser.run("location.hash")
+
+
+def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
+    """ATE, relative and rotational errors, absolute and as ratios: each against the CSV of the runs."""
+    runs = pd.read_csv(report.csv["runs"])
+    mine = runs[(runs["label"] == "Mask R-CNN (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
+    base = runs[(runs["label"] == "ORB-SLAM2 (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
+    cell = """(() => {
+      const at = all("#explore-table thead th").findIndex((head) => head.textContent.endsWith("walking_xyz"));
+      const row = all("#explore-table tbody tr").find((each) => each.cells[0].textContent.startsWith("Mask R-CNN"));
+      return +row.cells[at].dataset.v;
+    })()"""
+    explore(browser, report)
+    for kind, column, factor in (
+        ("ATE", "score_m", 1000.0),
+        ("RPE", "rpe_1s_trans_rmse_m", 1000.0),
+        ("Rotation", "rpe_1s_rot_rmse_deg", 1.0),
+    ):
+        press(browser, "explore-kind", kind)
+        press(browser, "explore-scale", "degrees" if kind == "Rotation" else "mm")
+        assert browser.run(cell) == pytest.approx(factor * mine[column].median(), rel=1e-3)
+        press(browser, "explore-scale", "ratio")
+        assert browser.run(cell) == pytest.approx(mine[column].median() / base[column].median(), rel=1e-3)
+    press(browser, "explore-scale", "degrees")
+    browser.run("choose($('explore-metric'))")  # the absolute one
+    assert browser.run(cell) == pytest.approx(mine["ape_rot_rmse_deg"].median(), rel=1e-3)
+
+
+def test_final_trajectories_are_a_switch(browser, report):
+    final = pd.read_csv(report.csv["runs"]).set_index(["label", "sequence"])["final_ate_m"]
+    explore(browser, report)
+    online = browser.run("one('#explore-table').innerText")
+    press(browser, "explore-which", "final")
+    assert "which=final" in browser.run("location.hash") and browser.run("one('#explore-table').innerText") != online
+    shown = browser.run("all('#explore-table td[data-v] a').map((link) => +link.parentElement.dataset.v)")
+    assert sorted(shown) == pytest.approx(sorted(1000 * final.dropna()), rel=1e-3) and len(shown) == 2
+
+
+def test_columns_are_chosen_one_by_one(browser, report):
+    explore(browser, report)
+    labels = browser.run("all('#explore-columns label').map((each) => each.textContent.trim())")
+    assert labels[:3] == ["rank", "ATE ratio", "success"] and "synthetic/walking_xyz" in labels
+    for label, shown in (("synthetic/walking_xyz", False), ("memory", None), ("MB", True), ("rank", False)):
+        found = f"all('#explore-columns label').find((each) => each.textContent.trim() === '{label}')"
+        if shown is None:
+            assert browser.run(f"{found} === undefined")  # a column is called as its heading
+            continue
+        browser.run(f"{found}.querySelector('input').click()")
+        assert (label in browser.run(HEADS)) == shown
+        assert browser.run("location.hash") != ""
 
 
 def test_numbers_are_those_of_the_table_below(browser, report):

@@ -66,8 +66,9 @@ def test_a_record_whose_id_is_not_its_folders_name_is_unreadable(store: RunStore
 @pytest.mark.parametrize("part", ["../../../out", "/tmp/out", "x", ""])
 def test_a_record_whose_part_is_a_path_is_unreadable(store: RunStore, part: str) -> None:
     sequence = json.loads((store.folder(BAD) / "run.json").read_text())["sequence"]
-    edit(store, sequence=sequence | {"part": part})
-    assert [bad.path.name for bad in store.all()[1]] == [BAD]
+    for field in ("part", "block"):
+        edit(store, sequence=sequence | {field: part or "."})
+        assert [bad.path.name for bad in store.all()[1]] == [BAD]
 
 
 @pytest.mark.parametrize("name", ["../../x", "/etc", "latest", ".", "", "a7abe04996a79cc"])
@@ -126,7 +127,8 @@ def test_a_store_that_can_only_be_read_is_scored(store: RunStore, monkeypatch: p
      '{"index": 1, "timestamp": 2, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 0]}',
      '{"index": 1, "timestamp": 2, "state": "ok", "stats": {"a": ' + "9" * 400 + "}}",
      '{"index": 1, "timestamp": 2, "state": "flying"}', '{"index": 1, "timestamp": 0.5, "state": "ok"}',
-     '{"index": 1, "timestamp": 2, "state": "ok", "extra": 1}'],
+     '{"index": 1, "timestamp": 2, "state": "ok", "extra": 1}', '{"index": -1, "timestamp": 2, "state": "ok"}',
+     '{"index": 99999999999999999999, "timestamp": 2, "state": "ok"}'],
 )  # fmt: skip
 def test_a_damaged_log_of_frames_is_taken_up_to_the_damage(tmp_path: Path, line: str) -> None:
     good = '{"index": 0, "timestamp": 1.0, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 1], "stats": {"a": 1}}'
@@ -147,8 +149,10 @@ def test_stats_named_with_half_characters_are_stored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "table", ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n", "\xff", "index\n" + "x" * 200_000]
-)
+    "table",
+    ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n", "\xff", "index\n" + "x" * 200_000,
+     "index,timestamp,state,reward_m\n99999999999999999999,1.0,ok,0\n"],
+)  # fmt: skip
 def test_a_damaged_table_of_frames_is_one_clear_line(tmp_path: Path, table: str) -> None:
     path = tmp_path / "frames.csv"
     path.write_bytes(table.encode("latin-1"))
@@ -196,4 +200,7 @@ def test_every_version_of_a_stored_record_loads() -> None:
         for version in range(1, newest + 1):
             found = cls.read(data / f"{kind}_v{version}.json")
             assert found.schema_version == version and cls.parse(found.to_json(), kind) == found  # type: ignore[attr-defined]
+        text = (data / f"{kind}_v{newest}.json").read_text().replace('schema_version": 1', 'schema_version": 99', 1)
+        with pytest.raises(DynslamError, match=r"schema_version.*a newer dynslam-bench wrote it"):
+            cls.parse(text, kind)
     assert json.loads((data / "metrics_v1.json").read_text())["online"]["schema_version"] == EVALUATION == 1

@@ -11,7 +11,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 from reports_fake_store import add_run
 
 from dynslam_bench.runs import RunStore
-from dynslam_bench.runs.storage.run_list import FIELDS, list_runs, run_row
+from dynslam_bench.runs.storage.run_index import FIELDS, run_row
+from dynslam_bench.runs.storage.run_list import list_runs
 
 
 @pytest.fixture
@@ -86,3 +87,54 @@ def test_a_store_that_cannot_be_written_is_listed(filled, monkeypatch):
     (store.root / "index").rmdir()
     (store.root / "index").write_text("a file in its place")
     assert list_runs(store) == (rows, [])
+
+
+def index_of(store):
+    (index,) = (store.root / "index").iterdir()
+    return index
+
+
+def test_a_run_joins_the_index_when_it_is_scored(filled, reads):
+    store, ids = filled
+    for run_id in ids:
+        store.score(store.read_whole(run_id))
+    reads.clear()
+    rows, _ = list_runs(store)
+    assert reads == [] and [row["run"] for row in rows] == ids[::-1]
+    assert rows == [run_row(record, store.score(record)) for record in store.all()[0]]
+    store.score(store.read_whole(ids[0]), again=True)
+    assert len(index_of(store).read_text().splitlines()) == 3
+
+
+def test_a_run_that_is_made_again_is_listed_as_it_is_now(filled, reads):
+    store, ids = filled
+    list_runs(store)
+    for reason in ("first", "second"):
+        record = store.read_whole(ids[0]).model_copy(update={"status": "lost", "reason": reason})
+        with store.work_folder(ids[0]) as work:
+            store.publish(work, record)
+        store.score(record)
+    reads.clear()
+    rows, _ = list_runs(store)
+    assert reads == [] and next(row for row in rows if row["run"] == ids[0])["reason"] == "second"
+    assert len(index_of(store).read_text().splitlines()) == 3
+
+
+def test_a_torn_line_costs_no_other(filled, reads):
+    store, ids = filled
+    rows, _ = list_runs(store)
+    index = index_of(store)
+    lines = index.read_bytes().splitlines(keepends=True)
+    index.write_bytes(lines[0] + lines[1][:40] + b"\n" + lines[2])
+    reads.clear()
+    assert list_runs(store) == (rows, []) and reads == [ids[1]]
+    assert sorted(index.read_bytes().splitlines(keepends=True)) == sorted(lines)
+
+
+def test_an_index_of_another_version_goes(filled, monkeypatch):
+    store, _ = filled
+    rows, _ = list_runs(store)
+    first = index_of(store)
+    monkeypatch.setattr("dynslam_bench.__version__", "99")
+    assert list_runs(store) == (rows, [])
+    assert index_of(store) != first

@@ -23,10 +23,12 @@ def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: 
     Raises:
         DynslamError: It is not here, or not the one that was run on.
     """
+    if not record.sequence.content:  # else a record could name any folder of images, and a page or a file show them
+        raise RunError(f"the record does not say what {record.sequence.id} held")
     start, stop = record.frames or (0, None)
     place = record.place or record.sequence.id
     sequence = open_frames(place, data_root, camera, (start + record.offset, stop), record.stride)
-    if record.sequence.content and part_of(sequence, record.offset).content != record.sequence.content:
+    if part_of(sequence, record.offset).content != record.sequence.content:
         raise RunError(f"the content of {record.sequence.id} has changed since the run")
     return sequence
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from dynslam_bench.core.machine import GitRevision, Machine
-from dynslam_bench.core.records import Digest, Record
+from dynslam_bench.core.records import Digest, Record, schema
 from dynslam_bench.evaluation.evaluate import Evaluation
 
 RUN_SCHEMA = 1
@@ -56,7 +56,7 @@ class SequenceInfo(Record):
     id: str
     content: str = ""
     part: Digest
-    block: str = ""
+    block: Annotated[str, Field(pattern=r"^([0-9a-f]{16})?$")] = ""
     noise: int | None = None
     frames: int
     duration_s: float
@@ -132,7 +132,7 @@ class RunRecord(Record):
         notes: Anything a reader should know, one line each.
     """
 
-    schema_version: int = RUN_SCHEMA
+    schema_version: int = schema(RUN_SCHEMA)
     kind: Literal["run", "imported"] = "run"
     run_id: Digest
     status: Status
@@ -230,7 +230,7 @@ class MetricRecord(Record):
         reasons: Why an evaluation is missing, by ``online`` and ``final``.
     """
 
-    schema_version: int = METRIC_SCHEMA
+    schema_version: int = schema(METRIC_SCHEMA)
     run_id: Digest
     protocol_id: str
     protocol_digest: str

@@ -27,6 +27,7 @@ from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
 from .evaluating import DEFAULT_PROTOCOL, evaluate_run
 from .record import MetricRecord, RunRecord
+from .run_index import Stamp, add_line, index_file, make_line, stamp_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,8 +51,8 @@ class RunStore:
 
     ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``, ``frames.csv``,
     ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``metrics/<protocol digest>/<run_id>.json`` the errors under a
-    protocol; ``sequences/<part>/`` stamps and ground truth, so that a run can be scored again without its data;
-    ``latest`` links the newest run.
+    protocol; ``index/`` what a list says of each run; ``sequences/<part>/`` stamps and ground truth, so that a run can
+    be scored again without its data; ``latest`` links the newest run.
 
     Args:
         root: The folder; it is made when something is written.
@@ -65,6 +66,8 @@ class RunStore:
         self.root = Path(root).expanduser().absolute()
         self.runs = self.root / "runs"
         self._swept = False
+        self._published: dict[str, Stamp] = {}
+        """Runs of this process that are in no index yet."""
 
     def folder(self, run_id: str) -> Path:
         """Folder of one run, whether it exists or not.
@@ -127,11 +130,13 @@ class RunStore:
         target = self.folder(record.run_id)
         try:
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
+            stamp = stamp_of(work / RUN_FILE)  # which a rename leaves as it is
             self._forget_metrics(record.run_id)  # those of an earlier run of the id
             replace_folder(work, target)
             self._forget_metrics(record.run_id)  # if they were written again between these two lines
         except OSError as error:
             raise InfrastructureError(f"cannot write {target}: {error.strerror}", "check the free space") from error
+        self._published[record.run_id] = stamp
         self._link_latest(target)
 
     def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
@@ -203,13 +208,23 @@ class RunStore:
         """The record of a run by its full id.
 
         Raises:
-            DynslamError: It is missing or damaged, or names itself otherwise.
+            DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more than plain files.
         """
         path = self.folder(run_id) / RUN_FILE
+        self._check_plain(path.parent)
         record = RunRecord.read(path)
         if record.run_id != run_id:
             raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
         return record
+
+    def _check_plain(self, folder: Path) -> None:
+        """A folder holds plain files of this store: no link to a file elsewhere, no pipe that is never written."""
+        with contextlib.suppress(OSError), os.scandir(folder) as entries:  # what reads it says that it is not there
+            for entry in entries:
+                if entry.is_symlink() and not Path(entry.path).resolve().is_relative_to(self.root.resolve()):
+                    raise RunError(f"{entry.path} is a link that leads out of {self.root}", "put the file in its place")
+                if not entry.is_file() and not entry.is_dir():
+                    raise RunError(f"{entry.path} is no plain file")
 
     def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
         """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
@@ -273,6 +288,9 @@ class RunStore:
             self.add_metrics(metrics)
         except DynslamError as error:  # a store that can only be read can be scored all the same
             LOGGER.info("the metrics of run %s are not kept: %s", record.run_id, error)
+        stamp = self._published.pop(record.run_id, None)
+        if stamp is not None:
+            add_line(index_file(self.root, protocol), make_line(stamp, record, metrics))
         return metrics
 
     def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL) -> pd.DataFrame:
@@ -299,6 +317,7 @@ class RunStore:
     def ground_truth(self, part: str) -> Trajectory | None:
         """The ground truth of a sequence's part; None if it has none."""
         path = self._part(part) / "groundtruth.txt"
+        self._check_plain(path.parent)
         return _read_truth(path, path.stat().st_mtime_ns) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
@@ -308,6 +327,7 @@ class RunStore:
             RunError: They are not stored, or damaged.
         """
         path = self._part(part) / "timestamps.txt"
+        self._check_plain(path.parent)
         try:
             return _read_stamps(path, path.stat().st_mtime_ns)
         except OSError as error:

@@ -14,7 +14,7 @@ from dynslam_bench.contracts.segmenter import Segmenter
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, schema
 
 from ..build_segmenter import build_segmenter, resolve_source, weights_digest
 from ..settings import SegmentationSettings
@@ -44,7 +44,7 @@ class SegmenterScore(Record):
 
     model_config = ConfigDict(extra="forbid", ser_json_inf_nan="null")
 
-    schema_version: int = 1
+    schema_version: int = schema(1)
     segmenter: str
     weights: str
     data: str

@@ -24,6 +24,17 @@ function cellsOf(data) {
   return cells;
 }
 
+/** The kinds of sequences to choose from: static, dynamic, and how dynamic where there are several of that. */
+function tagsOf(sequences) {
+  const known = [...new Set(sequences.flatMap((sequence) => sequence.tags))].sort();
+  const dynamic = known.filter((tag) => tag.endsWith("-dynamic")), others = known.filter((tag) => !dynamic.includes(tag));
+  const all = [...others, ...(dynamic.length ? ["dynamic"] : []), ...(dynamic.length > 1 ? dynamic : [])];
+  return all.length > 1 ? all : [];
+}
+
+/** Whether a sequence is of a kind; "dynamic" is any degree of it, and no kind is all. */
+const hasTag = (sequence, tag) => !tag || sequence.tags.some((own) => own === tag || own.endsWith(`-${tag}`));
+
 /** The run of a cell that stands for it: the successful one with the (lower) median of its errors. */
 function standing(cell, metric = 0) {
   const good = cell.runs.filter((run) => !run.ending && run.kept && run.values[metric] !== null).sort((a, b) => a.values[metric] - b.values[metric]);
@@ -54,7 +65,7 @@ class Explore {
 
   get sequences() {
     const hidden = new Set(this.view.hide.split(".").filter(Boolean)), query = this.view.q.toLowerCase();
-    const inGroup = this.data.sequences.map((sequence, at) => ({ ...sequence, at })).filter((sequence) => (!this.view.tag || sequence.group === this.view.tag) && !hidden.has(String(sequence.at)));
+    const inGroup = this.data.sequences.map((sequence, at) => ({ ...sequence, at })).filter((sequence) => hasTag(sequence, this.view.tag) && !hidden.has(String(sequence.at)));
     const found = inGroup.filter((sequence) => query && sequence.name.toLowerCase().includes(query));
     return found.length && found.length < inGroup.length ? found : inGroup;
   }
@@ -74,6 +85,7 @@ class Explore {
     this.renderControls();
     const extra = this.view.extra.split(".").filter(Boolean), ratio = this.view.scale === "ratio";
     const columns = [...extra.map((name) => ({ extra: name })), ...sequences.map((sequence) => ({ sequence }))];
+    if (matchMedia("(max-width: 700px)").matches) columns.sort((a, b) => Boolean(a.extra) - Boolean(b.extra)); // errors in sight
     const heads = ["tracker", ...columns.map((column) => (column.extra ? EXTRA.find(([name]) => name === column.extra)[1] : column.sequence.short))];
     const table = $("explore-table");
     table.tHead.rows[0].replaceChildren(...heads.map((name, at) => this.head(name, at, columns[at - 1])));
@@ -173,8 +185,8 @@ class Explore {
     }));
     if ($("explore-search").value !== view.q) $("explore-search").value = view.q;
     $("explore-ranked").checked = view.ranked === "1";
-    const groups = [...new Set(this.data.sequences.map((sequence) => sequence.group))].filter(Boolean);
-    segments("explore-tags", [["", "all"], ...groups.map((group) => [group, group])], "tag");
+    segments("explore-tags", [["", "all"], ...tagsOf(this.data.sequences).map((tag) => [tag, tag.replace("-", " ")])], "tag");
+    $("explore-tags").hidden = !tagsOf(this.data.sequences).length;
     segments("explore-kind", KINDS, "kind");
     const final = this.data.metrics.some((metric, at) => metric.which === "final" && [...this.cells.values()].some((cell) => cell.medians[at] !== null));
     segments("explore-which", [["online", "online"], ["final", "final", !final]], "which");

@@ -50,6 +50,7 @@ function drawExploreFigures(explore, trackers, sequences) {
     ["explore-boxes", boxFigure(explore, trackers, sequences), "No run shown has frames with ground truth."],
     ["explore-share", shareFigure(explore, trackers), "No run shown knows the exact share of dynamic pixels: the sequences have no exact masks, or the runs are older than this figure."],
   ]) {
+    $(id).nextElementSibling.hidden = !figure.data.length;
     if (figure.data.length) drawChart($(id), figure);
     else $(id).replaceChildren(make("p", { className: "waiting", textContent: why }));
   }

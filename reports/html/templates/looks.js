@@ -92,8 +92,9 @@ function addSlider(place, looks, run, space) {
   };
   slider.addEventListener("input", step);
   veil.addEventListener("change", step);
-  const keys = keyRow([[KEPT, "kept"], [CULLED, "culled"], [MASK, "mask"]]);
-  keys.append(make("label", { className: "check no-print" }, veil, "show the mask"));
+  const pointed = looks.some((look) => look.points), masked = looks.some((look) => look.mask);
+  const keys = keyRow([...(pointed ? [[KEPT, "kept"], [CULLED, "culled"]] : []), ...(masked ? [[MASK, "mask"]] : [])]);
+  if (masked) keys.append(make("label", { className: "check no-print" }, veil, "show the mask"));
   place.replaceChildren(view, slider, line, keys);
   step();
 }

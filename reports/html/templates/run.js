@@ -7,9 +7,9 @@ const figure = (id, caption) => {
   return make("figure", {}, place, make("figcaption", { textContent: caption }));
 };
 const show = (id, specification) => { FIGURES[id] = specification; inSight.observe($(id)); };
-const table = (heads, rows) => {
-  const made = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((name, at) => make("th", { className: at ? "n" : "", scope: "col", textContent: name })))),
-    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? "n" : "sticky", textContent: value }))))));
+const table = (heads, rows, kind = "n") => {
+  const made = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((name, at) => make("th", { className: at ? kind : "", scope: "col", textContent: name })))),
+    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? kind : "sticky", textContent: value }))))));
   return make("div", { className: "scroll", tabIndex: 0 }, made);
 };
 
@@ -45,7 +45,7 @@ function settingsOf(run) {
   const asked = new Set(run.overrides);
   const rows = Object.entries(run.settings).map(([name, value]) => [name + (asked.has(name) ? " *" : ""), String(value)]);
   if (!rows.length) return section("s-settings", "Settings", make("p", { className: "waiting", textContent: "None are recorded." }));
-  return section("s-settings", "Settings", table(["setting", "value"], rows), make("p", { className: "caption", textContent: "* asked for in place of the default." }));
+  return section("s-settings", "Settings", table(["setting", "value"], rows, "words"), make("p", { className: "caption", textContent: "* asked for in place of the default." }));
 }
 
 const logOf = (run) => section("s-log", "Log", make("pre", { tabIndex: 0, textContent: run.log || "The run wrote nothing." }),

@@ -57,7 +57,8 @@ function makeScale(spec, values, anchorZero) {
     at: (value) => ((log ? Math.log10(value) : value) - low) / (high - low),
     back: (share) => (log ? 10 ** (low + share * (high - low)) : low + share * (high - low)),
     ticks: (count) => {
-      const found = spec.tickvals?.filter((tick) => tick !== null) ?? (log ? logTicks : linearTicks)(low, high, count);
+      const all = spec.tickvals?.filter((tick) => tick !== null) ?? (log ? logTicks : linearTicks)(low, high, count);
+      const found = spec.whole ? all.filter((tick) => Number.isInteger(tick)) : all;
       const every = Math.ceil(found.length / Math.max(count + 2, 3));
       return found.filter((_, at) => at % every === 0);
     },

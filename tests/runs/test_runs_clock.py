@@ -1,0 +1,49 @@
+"""The wall's clock jumps, forwards and backwards, while runs are made, waited for and stored, and studies kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from itertools import cycle
+from pathlib import Path
+
+import optuna
+import pytest
+from envs_toys import TARGET
+
+from dynslam_bench.runs import RunSpec, RunStore, resolve, run_many
+from dynslam_bench.tuning.journal_file import WholeLines
+
+
+@pytest.fixture(autouse=True)
+def jumps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eleven days forwards, then backwards, at every look at the clock."""
+    now, away = time.time, cycle((1e6, -1e6))
+    monkeypatch.setattr(time, "time", lambda: now() + next(away))
+    assert abs(time.time() - time.time()) > 1e6
+
+
+def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> None:
+    specs = [RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(2)]
+    with store.work_folder("0" * 16) as work, store.claim(resolve(specs[0]).run_id) as mine:
+        assert mine
+        began = time.monotonic()
+        made: list = []
+        thread = threading.Thread(target=lambda: made.extend(run_many(specs, results=store)))
+        thread.start()
+        while len(store.ids()) < 1 and time.monotonic() - began < 300:
+            time.sleep(0.02)
+        RunStore(store.root).prepare()  # sweeps what nobody holds
+        assert work.is_dir() and store.ids() == [resolve(specs[1]).run_id]  # the other one is being made elsewhere
+    thread.join(300)
+    assert [record.status for record in made] == ["ok", "ok"]
+    assert all(0 < record.wall_s < 900 and 0 < record.timings["total"].mean_s < 900 for record in made)
+
+
+def test_a_study_is_kept(tmp_path: Path) -> None:
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    for _ in range(2):
+        storage = optuna.storages.JournalStorage(WholeLines(tmp_path / "journal.log"))
+        study = optuna.create_study(storage=storage, study_name="s", load_if_exists=True)
+        study.optimize(lambda trial: trial.suggest_float("x", 0, 1), n_trials=3)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 6
