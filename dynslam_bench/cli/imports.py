@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Literal, Optional
 
 import typer
 
@@ -90,7 +90,7 @@ def export(
     """Write a stored run in a format of other tools, with its provenance beside it."""
     from dynslam_bench.runs import export_run
 
-    which = None if online is None else ("online" if online else "final")
+    which: Literal["online", "final"] | None = None if online is None else ("online" if online else "final")
     done = export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
     if as_json:
         write_json({"folder": done.folder, "files": done.files, "which": done.which, "notes": done.notes})

@@ -134,7 +134,7 @@ def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
 def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
     """Features (two bytes each: x and y in 255ths of the image), which were kept, and the mask as a small image."""
     height, width = size
-    places = np.clip(shot.points * np.float32((255 / width, 255 / height)), 0, 255).round().astype(np.uint8)
+    places = np.clip(shot.points * np.array((255 / width, 255 / height), np.float32), 0, 255).round().astype(np.uint8)
     order = np.argsort(shot.kept, kind="stable")  # culled ones first
     seen = {"points": base64.b64encode(places[order].tobytes()).decode(), "culled": int((~shot.kept).sum())}
     seen |= {"width": width, "height": height}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def _scaled(shot: Snapshot, scale: NDArray[np.float64]) -> Snapshot:
     if (scale == 1).all():
         return shot
     points = ((shot.points + 0.5) * scale - 0.5).round().astype(np.int16)
-    return Snapshot(shot.index, points, shot.kept, shot.mask)
+    return replace(shot, points=points)
 
 
 def _pose_at(trajectory: Trajectory, stamp: float) -> NDArray[np.float64] | None:
