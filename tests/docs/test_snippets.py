@@ -30,12 +30,18 @@ RUN = {
     "README.md": 1,
     "docs/environments.md": 3,
     "docs/evaluation.md": 1,
+    "docs/exports.md": 1,
     "docs/sequences.md": 2,
     "docs/start/agent.md": 1,
     "docs/suites.md": 1,
     "docs/synthetic.md": 1,
 }
 """Pages, and how many of their first Python blocks are run here, one after the other in one namespace."""
+BEFORE = {
+    "docs/exports.md": "from dynslam_bench.runs import RunSpec, run_many\n"
+    "run_many([RunSpec(tracker='never-move', sequence='synthetic/walking_xyz', frames=(0, 4))])"
+}
+"""What a reader has done already: a run is stored."""
 ELSEWHERE = {
     "docs/environments.md": (2, "tests/runs/test_runs_tables.py"),
     "docs/plugins.md": (6, "tests/trackers/adapters/test_adapter_docs.py"),
@@ -72,7 +78,7 @@ def test_a_page_s_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Mon
     assert len(found) == RUN[page]
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"cache_root": tmp_path}
-    for text in found:
+    for text in [BEFORE.get(page, ""), *found]:
         for long, short in SHORTER.items():
             text = text.replace(long, short)
         exec(compile(text, page, "exec"), names)
