@@ -11,6 +11,7 @@ BoxFilter  # a rejection rule for systems of one's own, held to its paper by tes
 emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
 hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
+TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
 # called by name: specs name their factories as "module:name"
@@ -63,6 +64,7 @@ ap  # segmenter evaluate
 ap50  # segmenter evaluate
 frame_iou  # segmenter evaluate
 instance_iou  # segmenter evaluate
+tracker_provenance  # provenance.json of an export
 checked  # record of a fetched sequence
 improves  # a study's summary
 cost_before  # BundleResult, printed by tests/benchmarks/backend_bundle.py

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .core import moved
 
-__version__ = "0.1.0"
+__version__: str
 
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.py").is_file():
@@ -19,3 +19,12 @@ if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.
     __path__.append(str(_checkout))
 del _checkout
 moved.install()
+
+
+def __getattr__(name: str) -> str:
+    """``__version__``, looked up when somebody asks for it: that takes longer than all else here."""
+    if name == "__version__":
+        from .core.version import version
+
+        return version()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,6 +19,7 @@ from .registration import GENERIC_ID, env_id, register_envs
 from .reward import REWARDS
 from .sequence_sampler import SequenceSampler
 from .slam_env import SlamEnv
+from .small_images import SmallImages
 
 __all__ = [
     "GENERIC_ID",
@@ -32,6 +33,7 @@ __all__ = [
     "RecordTrajectory",
     "SequenceSampler",
     "SlamEnv",
+    "SmallImages",
     "TrackerContractError",
     "env_id",
     "register_envs",

@@ -95,7 +95,7 @@ def build_report(
     setup = {"protocol": protocol.model_dump_json(), "output": str(output), **shown}
     hired: AbstractContextManager[Crew | None] = Crew(count, setup) if count else nullcontext()
     with hired as crew:
-        loaded = load_runs(stores, protocol, on_progress, crew)
+        loaded = load_runs(stores, protocol, on_progress, crew, reference)
         board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
         again = command or _command([store.root for store in stores], output, board)
         explored = write_explore(

@@ -95,4 +95,7 @@ def main(source: TextIO, target: TextIO) -> None:
 if __name__ == "__main__":
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever else is printed is no answer
-    main(sys.stdin, answers)
+    try:
+        main(sys.stdin, answers)
+    except BrokenPipeError:  # whoever asked is gone, and with it everybody who could be told
+        os._exit(1)

@@ -8,7 +8,6 @@ from typing import Annotated, Optional
 
 import typer
 
-from dynslam_bench import __version__
 from dynslam_bench.core.download_progress import show_downloads
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.harmless import printable
@@ -57,7 +56,9 @@ doctor.add(app)
 
 def _version(asked: bool) -> None:
     if asked:
-        sys.stdout.write(f"dynslam-bench {__version__}\n")
+        from dynslam_bench.core.version import version
+
+        sys.stdout.write(f"dynslam-bench {version()}\n")
         raise typer.Exit
 
 

@@ -56,6 +56,13 @@ def suites(incomplete: str) -> list[str]:
     return _beginning(incomplete, [*suite_names(), *map(str, Path().glob("*.toml"))])
 
 
+def export_formats(incomplete: str) -> list[str]:
+    """Formats that `export` writes."""
+    from dynslam_bench.runs.exchange.export import FORMATS
+
+    return _beginning(incomplete, FORMATS)
+
+
 def protocols(incomplete: str) -> list[str]:
     """Protocols by their id."""
     from dynslam_bench.evaluation.protocol import PROTOCOLS

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .demo_story import tell
+from .kernels import compiled_ahead
 from .output import aligned, note, progress
 from .running import make_runs
 from .studies import hush_optuna, run_trials
@@ -74,7 +75,8 @@ def run_demo(results: Path | str = "results", *, frames: int = 150, jobs: int = 
     ]
     store = RunStore(results)
     store.prepare()  # before the rendering: an unwritable folder shows at once
-    render({spec.sequence for spec in specs})
+    with compiled_ahead():
+        render({spec.sequence for spec in specs})
     records = make_runs(specs, store, jobs=jobs)
     note("making the report")
     paths = build_report(store, store.root / "report", title="Demo: walking and sitting people, rendered")

@@ -11,6 +11,7 @@ from . import completion
 from .output import for_scripts
 
 FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
+TRAJECTORY_FORMATS = "TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP"
 MACHINE, OUTPUT = "The machine, and how much of it", "What is kept and shown"
 """Headings of the options' help."""
 
@@ -78,7 +79,9 @@ SettingsFile = Annotated[
 Timestamps = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option(
-        "--timestamps", metavar="FILE", help="Stamps of a trajectory in KITTI's format: a times.txt, or rgb.txt."
+        "--timestamps",
+        metavar="FILE",
+        help="Stamps where the format has none (KITTI, COLMAP): a times.txt, or rgb.txt.",
     ),
 ]
 ProtocolId = Annotated[
@@ -130,6 +133,9 @@ Sheet = Annotated[
     typer.Option(
         "--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.", rich_help_panel=OUTPUT
     ),
+]
+Recording = Annotated[
+    bool, typer.Option("--rrd", help="Write recording.rrd beside the run, for rerun's viewer.", rich_help_panel=OUTPUT)
 ]
 Label = Annotated[
     str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=SETTINGS)

@@ -27,6 +27,7 @@ from .options import (
     Preset,
     ProtocolId,
     Realtime,
+    Recording,
     Results,
     Retry,
     Scheduler,
@@ -87,6 +88,7 @@ def run(
     cache: Cache = False,
     video: Video = False,
     sheet: Sheet = False,
+    rrd: Recording = False,
     retry: Retry = None,
     label: Label = "",
     time_limit: TimeLimit = None,
@@ -103,7 +105,7 @@ def run(
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
     asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
-    asked |= {"video": video, "sheet": sheet, "label": label}
+    asked |= {"video": video, "sheet": sheet, "rrd": rrd, "label": label}
     asked |= {"limits": checked(Limits, time_s=time_limit, memory_mb=memory_limit)}
     specs = [
         checked(RunSpec, sequence=sequence, seed=number, offset=skipped, **asked)
@@ -226,15 +228,13 @@ def finish(
 ) -> None:
     """Make runs, show them, and exit with 3 if some failed."""
     from dynslam_bench.runs import RunStore
-    from dynslam_bench.runs.sheet_collector import SHEET_FILE
-    from dynslam_bench.runs.video import VIDEO_FILE
+    from dynslam_bench.runs.many import pictures_asked
 
     store = RunStore(results)
     reused: set[str] = set()
     records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
-    pictures = [name for name, asked in ((VIDEO_FILE, specs[0].video), (SHEET_FILE, specs[0].sheet)) if asked]
-    show_pictures(records, store, pictures, as_json=as_json)
+    show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
     if seen := seen_note(records):
         note(seen)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")

@@ -1,4 +1,4 @@
-"""``segmenter train|evaluate|record``."""
+"""``segmenter train|evaluate|record|export``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .options import (
 )
 from .output import progress, write, write_fields, write_json, write_table
 
-app = typer.Typer(help="Train and measure segmentation networks, record their masks.", no_args_is_help=True)
+app = typer.Typer(help="Train, measure and export segmentation networks, record their masks.", no_args_is_help=True)
 
 
 @app.command()
@@ -134,3 +134,31 @@ def record(
     with progress(f"masks of {opened.id}") as advance:
         made = record_masks(opened, output, settings, device=resolve_device(device), threads=threads, progress=advance)
     write(f"{made} of {len(opened)} frames segmented now; use them with --set segmentation.source=recorded:{output}")
+
+
+@app.command()
+def export(
+    source: Annotated[str, typer.Argument(help="embedded, coco or weights:PATH.")],
+    output: Annotated[Path, typer.Argument(help="ONNX file to write, for segmentation.source=onnx:FILE.")],
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images.")] = "640x480",
+    side: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=0, help="Shorter side at which the network works; default as in a run, 0 for its own."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write one of our networks as an ONNX file of fixed shapes, which lighter runtimes can serve."""
+    from dynslam_bench.segmentation.networks.onnx.export import export_network, parse_size, weights_of
+
+    chosen = weights_of(source, side)
+    done = export_network(chosen.path, output, size=parse_size(size), side=chosen.side)
+    facts = {
+        "file": str(done.path),
+        "megabytes": round(done.megabytes, 1),
+        "input": f"image [1, 3, {done.size[0]}, {done.size[1]}], RGB in [0, 1]",
+        "classes": len(done.classes),
+    }
+    if as_json:
+        write_json(facts)
+    else:
+        write_fields(facts)

@@ -18,6 +18,7 @@ from .provenance import Provenance as Provenance
 from .segmenter import Instances
 
 Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
+"""What a filter asks for: `FilterState` and `FrameBundle` hold it."""
 
 
 @dataclass(eq=False)

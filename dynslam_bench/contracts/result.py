@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 TrackingState = Literal["initialising", "ok", "lost"]
+"""A pose that is given with `lost` is a prediction and enters no trajectory."""
 
 
 @dataclass(frozen=True, eq=False)

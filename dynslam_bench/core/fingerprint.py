@@ -25,6 +25,7 @@ import dynslam_bench
 from .errors import PluginError
 from .records import digest
 from .settings import Settings, flatten, named
+from .version import release
 
 OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 """The distributions that bring OpenCV; more than one may be installed, over each other."""
@@ -234,7 +235,7 @@ def distribution_version(name: str) -> str:
 def machine_digest() -> str:
     """Short digest of the machine and the versions that change a stage's result or its cost."""
     versions = {name: distribution_version(name) for name in _STAGES_NEED}
-    found = {"dynslam-bench": dynslam_bench.__version__, "opencv": opencv_version(), **versions}
+    found = {"dynslam-bench": release(), "opencv": opencv_version(), **versions}
     return digest({"node": platform.node(), "cpu": _cpu_name(), "versions": found})
 
 

@@ -7,10 +7,12 @@ import importlib.abc
 import importlib.machinery
 import sys
 import types
-import warnings
 from collections.abc import Sequence
 
+from .deprecated import warn_deprecated
+
 CONTRACTS = "dynslam_bench.contracts"
+GONE_IN = "0.2"
 MOVED: dict[str, tuple[str, ...]] = {
     "dynslam_bench.culling.filter": ("dynslam_bench.contracts.filter",),
     "dynslam_bench.features.keypoints": ("dynslam_bench.contracts.features",),
@@ -41,8 +43,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """Fill the old module."""
         homes = MOVED[module.__name__]
         room = CONTRACTS if homes[0].startswith(f"{CONTRACTS}.") else homes[0]
-        message = f"'{module.__name__}' has moved and will be gone in 0.2; import from '{room}'"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        warn_deprecated(f"'{module.__name__}' has moved", f"import from '{room}'", gone_in=GONE_IN, stacklevel=0)
         for home in reversed(homes):
             found = importlib.import_module(home)
             module.__dict__.update({name: value for name, value in vars(found).items() if not name.startswith("__")})

@@ -1,7 +1,8 @@
 """Runs: a child process that steps an environment; the run store; parallel execution.
 
 `run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol, `RunStore.frame` and
-`load_frames` give them as pandas frames, and `import_trajectory` puts trajectories from elsewhere beside them.
+`load_frames` give them as pandas frames, `import_trajectory` puts trajectories from elsewhere beside them, and
+`export_run` writes them in the formats of others.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .exchange.export import Exported, export_run
+    from .exchange.reading import read_trajectory
     from .identity import ResolvedRun, resolve
     from .many import RunEvent, run_many
     from .one import run_one
@@ -21,11 +24,14 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "DEFAULT_PROTOCOL": "storage.scoring",
+    "export_run": "exchange.export",
+    "Exported": "exchange.export",
     "FAILED": "storage.record",
     "import_trajectory": "storage.imported",
     "Limits": "spec",
     "load_frames": "storage.frame_table",
     "MetricRecord": "storage.record",
+    "read_trajectory": "exchange.reading",
     "resolve": "identity",
     "ResolvedRun": "identity",
     "run_many": "many",
@@ -40,6 +46,7 @@ _HOMES = {
 __all__ = [
     "DEFAULT_PROTOCOL",
     "FAILED",
+    "Exported",
     "Limits",
     "MetricRecord",
     "ResolvedRun",
@@ -47,8 +54,10 @@ __all__ = [
     "RunRecord",
     "RunSpec",
     "RunStore",
+    "export_run",
     "import_trajectory",
     "load_frames",
+    "read_trajectory",
     "resolve",
     "run_many",
     "run_one",

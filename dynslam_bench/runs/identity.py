@@ -7,7 +7,6 @@ from functools import cache
 from importlib.metadata import packages_distributions, version
 from typing import Any
 
-import dynslam_bench
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.errors import RunError, SequenceError
@@ -16,6 +15,7 @@ from dynslam_bench.core.machine import versions
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
+from dynslam_bench.core.version import release
 from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
 from dynslam_bench.envs.source import open_frames, preprocessing_of
@@ -121,7 +121,7 @@ def distribution_of(tracker: TrackerSpec) -> str:
     """Name and version of the distribution that the tracker's code comes from, e.g. ``dynslam-bench 0.1.0``."""
     top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
     if top == "dynslam_bench":
-        return f"dynslam-bench {dynslam_bench.__version__}"
+        return f"dynslam-bench {release()}"
     names = _distributions().get(top, [])
     return f"{names[0]} {version(names[0])}" if names else ""
 

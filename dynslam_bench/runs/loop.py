@@ -18,11 +18,13 @@ from dynslam_bench.evaluation.masks import compare_masks
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.tum_file import write_tum
 
+from .exchange.recording import RECORDING_FILE, RecordingWriter
 from .frame_row import FRAMES_FILE, FrameRow
 from .process.failures import at
 from .sheet_collector import SHEET_FILE, SheetWriter
-from .snapshots import SnapshotWriter
+from .snapshots import SnapshotWriter, taken
 from .spec import RunSpec
+from .truth import aligned_truth
 from .video import VideoWriter
 
 Send = Callable[[dict[str, Any]], None]
@@ -70,9 +72,9 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             with at(position):
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
-    with at("after the last frame"):
-        outcome = _finish(base, folder, recorder.sheet)
-        env.close()
+        with at("after the last frame"):
+            outcome = _finish(base, folder, recorder)
+            env.close()
     return {"type": "done", **outcome}
 
 
@@ -103,7 +105,7 @@ def _spoiled(env: gym.Env[Any, Any], spec: RunSpec) -> gym.Env[Any, Any]:
 
 
 class _Recorder:
-    """Everything that is kept of a run frame by frame: the log, and the video and the sheet if they were asked for."""
+    """Everything that is kept of a run frame by frame: the log, and the pictures that were asked for."""
 
     def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
         self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
@@ -111,6 +113,8 @@ class _Recorder:
         self._env = env
         self._video = VideoWriter(folder, env) if spec.video else None
         self.sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
+        title = f"{env.tracker_spec.label} on {env.sequence.id}"
+        self.recording = RecordingWriter(folder / RECORDING_FILE, env.sequence.camera, title) if spec.rrd else None
 
     def add(self) -> None:
         self._frames.write()
@@ -119,12 +123,31 @@ class _Recorder:
             self._video.add()
         if self.sheet is not None:
             self.sheet.add()
+        if self.recording is not None:
+            _record(self.recording, self._env)
 
     def close(self) -> None:
         self._frames.close()
         self._snapshots.write()
         if self._video is not None:
             self._video.close()
+        if self.recording is not None:
+            self.recording.close()
+
+
+def _record(recording: RecordingWriter, env: SlamEnv) -> None:
+    """Add the current frame to a recording."""
+    outcome, result, frame = env.episode.outcomes[-1], env.result, env.frame
+    seen = result.keypoints_xy is not None or result.dynamic_mask is not None
+    recording.add(
+        outcome.index,
+        outcome.timestamp,
+        frame.rgb,
+        outcome.T_world_cam,
+        taken(outcome.index, result) if seen else None,
+        state=outcome.state,
+        error_m=None if outcome.error is None else outcome.error.trans_m,
+    )
 
 
 class _Position:
@@ -150,7 +173,8 @@ def _partial(env: SlamEnv) -> dict[str, Any]:
     return partial if last is None else partial | {"pose_error_trans_m": last.trans_m}
 
 
-def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, Any]:
+def _finish(env: SlamEnv, folder: Path, recorder: _Recorder) -> dict[str, Any]:
+    sheet = recorder.sheet
     began = time.perf_counter()
     final = env.final_trajectory()
     outcome: dict[str, Any] = {"finalize_s": None, "keyframes": None, "map_points": None, "gpu_memory_mb": None}
@@ -169,6 +193,11 @@ def _finish(env: SlamEnv, folder: Path, sheet: SheetWriter | None) -> dict[str, 
         outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
     elif sheet is not None:
         notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
+    if recorder.recording is not None:
+        track = env.online_trajectory() if final is None else final
+        truth = aligned_truth(env.sequence.ground_truth, track)[0] if len(track) else None
+        cloud = (None, None) if outputs is None else (outputs.positions, outputs.colours)
+        recorder.recording.finish(track, truth, *cloud)
     if env.device.startswith("cuda"):
         import torch
 

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
+from .exchange.recording import RECORDING_FILE
 from .identity import ResolvedRun, resolve
 from .one import OnProgress, run_one
 from .sheet_collector import SHEET_FILE
@@ -252,10 +253,16 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
         ) from error
 
 
+def pictures_asked(spec: RunSpec) -> list[str]:
+    """The files beside a run that it was asked for."""
+    asked = ((VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet), (RECORDING_FILE, spec.rrd))
+    return [name for name, wanted in asked if wanted]
+
+
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
-    """Whether a stored run has to be made again for a video or a sheet that is asked for now."""
+    """Whether a stored run has to be made again for a video, a sheet or a recording that is asked for now."""
     folder = store.folder(stored.run_id)
-    wanted = [name for name, asked in ((VIDEO_FILE, run.spec.video), (SHEET_FILE, run.spec.sheet)) if asked]
+    wanted = pictures_asked(run.spec)
     excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
     if stored.failed:  # what ends early has no map to draw, and what saw no frame nothing at all
         excused |= {SHEET_FILE} if stored.n_processed else set(wanted)

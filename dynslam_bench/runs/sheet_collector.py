@@ -9,11 +9,10 @@ import numpy as np
 from dynslam_bench.contracts.map_outputs import MapOutputs
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image
 from dynslam_bench.envs.slam_env import SlamEnv
-from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.online import OnlineError
-from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.outputs.sheet_panels import draw_sheet, write_sheet
+
+from .truth import aligned_truth
 
 SHOWN = 9
 """Frames, and keyframes, on a sheet."""
@@ -51,7 +50,7 @@ class SheetWriter:
         shown = [outputs.keyframes[row].frame for row in _spread(len(outputs.keyframes))]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
-        truth, ate_m = _aligned_truth(sequence.ground_truth, track)
+        truth, ate_m = aligned_truth(sequence.ground_truth, track)
         sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES)
         write_sheet(self._path, sheet)
 
@@ -59,24 +58,3 @@ class SheetWriter:
 def _spread(count: int) -> list[int]:
     """At most `SHOWN` indices spread over `count` things, the first and the last among them."""
     return sorted({int(index) for index in np.linspace(0, max(count - 1, 0), min(SHOWN, count)).round()})
-
-
-def _aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajectory | None, float | None]:
-    """The ground truth at the track's stamps, moved onto the track by least squares, and what is left in metres (RMSE).
-
-    Both are None without enough of it.
-    """
-    if truth is None:
-        return None, None
-    errors = OnlineError(truth)
-    poses = [errors.truth_at(float(stamp)) for stamp in track.timestamps]
-    known = [row for row, pose in enumerate(poses) if pose is not None]
-    if len(known) < 3:
-        return None, None
-    true = np.array([poses[row] for row in known])
-    fit = align(track.T_world_cam[known], true, "se3")
-    move = np.eye(4)
-    move[:3, :3], move[:3, 3] = fit.rotation, fit.translation
-    moved = Trajectory(track.timestamps[known], se3.inverse(move) @ true)
-    left = moved.positions - track.positions[known]
-    return moved, float(np.sqrt(np.square(left).sum(axis=1).mean()))

@@ -75,9 +75,9 @@ class SnapshotWriter:
         self._size = (shape[0], shape[1])
         error = None if outcome.error is None else outcome.error.frame_trans_m
         if outcome.index in self._spread:
-            self._even.append(_taken(outcome.index, result))
+            self._even.append(taken(outcome.index, result))
         elif error is not None and (len(self._worst) < WORST or error > self._worst[-1][0]):
-            self._worst.append((error, _taken(outcome.index, result)))
+            self._worst.append((error, taken(outcome.index, result)))
             self._worst = sorted(self._worst, key=lambda pair: -pair[0])[:WORST]
 
     def write(self) -> None:
@@ -98,7 +98,8 @@ class SnapshotWriter:
         )
 
 
-def _taken(index: int, result: TrackResult) -> Snapshot:
+def taken(index: int, result: TrackResult) -> Snapshot:
+    """What a tracker saw on a frame."""
     points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
     kept = result.keypoints_keep
     mask = result.dynamic_mask

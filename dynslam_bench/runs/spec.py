@@ -54,6 +54,7 @@ class RunSpec(Record):
         camera: Camera of a folder that does not say its own.
         video: Whether to write ``video.webm``.
         sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
+        rrd: Whether to write ``recording.rrd`` for rerun's viewer.
         label: Name in tables, in place of the tracker's; no part of the run's identity.
         limits: What it may take.
     """
@@ -77,6 +78,7 @@ class RunSpec(Record):
     camera: str | None = None
     video: bool = False
     sheet: bool = False
+    rrd: bool = False
     label: str = ""
     limits: Limits = Field(default_factory=Limits)
 

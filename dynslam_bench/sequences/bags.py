@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.core.files import atomic_folder
@@ -101,6 +102,30 @@ def unpack_bag(
     return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, tuple(notes))
 
 
+def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Stamps in seconds ``[N]`` and rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` of a bag's topic of poses, as they come.
+
+    Args:
+        bag: A ROS 1 ``.bag``, a ROS 2 folder, an ``.mcap`` or ``.db3`` file.
+        topic: Which one; needed where there are several.
+
+    Raises:
+        SequenceError: `rosbags` is not installed, the bag is damaged, or the topic is missing or one of several.
+    """
+    source = Path(bag).expanduser()
+    try:
+        with _opened(source) as reader:
+            topics = _Topics(reader, source)
+            chosen = topics.pose(topic, "--topic")
+            lines = [messages.pose_line(found) for found in _read(reader, topics.connection(chosen))] if chosen else []
+    except OSError as error:  # e.g. a file that its metadata name is missing
+        raise SequenceError(f"bag {source} cannot be read: {error.strerror or error}") from error
+    table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
+    if not np.isfinite(table).all():
+        raise SequenceError(f"{source} holds poses that are not finite")
+    return table[:, 0], table[:, 1:]
+
+
 class _Topics:
     """The topics of a bag, and which of them to take."""
 
@@ -122,11 +147,11 @@ class _Topics:
             candidates = [topic for topic in candidates if messages.kind_of(self._first(topic)) == kind]
         return self._one(f"{kind} images", candidates, wanted, f"--{kind}")
 
-    def pose(self, wanted: str | None) -> str:
+    def pose(self, wanted: str | None, option: str = "--truth (or --truth none)") -> str:
         candidates = self.of_types(POSES)
         if wanted == NONE or (wanted is None and not candidates):
             return ""
-        return self._one("poses", candidates, wanted, "--truth (or --truth none)")
+        return self._one("poses", candidates, wanted, option)
 
     def camera(self, colour: str) -> Any:
         namespace = colour.rpartition("/")[0]

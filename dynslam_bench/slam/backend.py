@@ -21,6 +21,7 @@ from .localisation.localised import Localised
 from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
 from .localisation.tracking import MapFit, Tracked, fit_to_map
+from .loop_closing import LoopCloser
 from .mapping.history import History
 from .mapping.keyframes import KeyframeRule
 from .mapping.local_mapping import LocalMapper
@@ -53,6 +54,7 @@ class RgbdBackend:
         self.settings = settings
         if self._ready:
             self.mapper.settings = settings
+            self.loops.settings = settings
             self._keyframes.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
@@ -72,6 +74,7 @@ class RgbdBackend:
         self._motion = CameraMotion()
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
+        self.loops = LoopCloser(self.world, self.mapper, self.settings, self.seed)
         self._views = MapViews(self.world)
         self._ready = True
 
@@ -157,7 +160,7 @@ class RgbdBackend:
         pose = fit.estimate.T_cam_world
         if self._keyframes.wants(self.world, tracked, frame.index, self._reference):
             spent = self._make_keyframe(frame, tracked)
-            if self.settings.bundle_adjustment.enabled:
+            if self.settings.bundle_adjustment.enabled or self.settings.loop_closing.enabled:
                 pose = tracked.T_cam_world
                 self._motion.relocated(pose)
         relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
@@ -167,6 +170,10 @@ class RgbdBackend:
     def _make_keyframe(self, frame: FrameBundle, tracked: Tracked) -> dict[str, float]:
         slot, spent = self.mapper.insert(tracked.seen, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp)
         self._reference = slot
+        if self.settings.loop_closing.enabled:
+            begin = perf_counter()
+            self.loops.close(slot, tracked.seen)
+            spent["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
         for dropped, heir, relative in self.mapper.dropped:
             self.history.inherit(dropped, heir, relative)

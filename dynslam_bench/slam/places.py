@@ -39,15 +39,19 @@ def most_alike(world: Map, keyframes: NDArray[np.int64], seen: Observations, cou
     """
     if len(keyframes) <= count or not len(seen):
         return [int(slot) for slot in keyframes[:count]]
+    order = np.lexsort((-world.kf_id[keyframes], -likeness(world, keyframes, seen)))
+    return [int(slot) for slot in keyframes[order[:count]]]
+
+
+def likeness(world: Map, keyframes: NDArray[np.int64], seen: Observations) -> NDArray[np.float64]:
+    """How much each of the keyframes ``[S]`` looks like a frame; comparable within one call alone."""
     pieces = world.kf_words.view(np.uint16)[:, :, ::EVERY]
     own = np.ascontiguousarray(seen.words).view(np.uint16)[:, ::EVERY]
     wanted = np.full((own.shape[1], VALUES), -1, np.int32)
     wanted[np.arange(own.shape[1])[None, :], own] = 0
     frequency = _count(pieces, world.kf_point, world.kf_count, keyframes, wanted)
     weight = np.where(wanted > 0, np.log(max(frequency, 1) / np.maximum(wanted, 1)), 0.0).astype(np.float32)
-    score = _scores(pieces, world.kf_point, world.kf_count, keyframes, weight)
-    order = np.lexsort((-world.kf_id[keyframes], -score))
-    return [int(slot) for slot in keyframes[order[:count]]]
+    return _scores(pieces, world.kf_point, world.kf_count, keyframes, weight)
 
 
 @kernel

@@ -245,6 +245,34 @@ class RelocalisationSettings(Settings):
     )
 
 
+class LoopClosingSettings(Settings):
+    """Recognising a place that was left, and correcting the drift since; needs gtsam."""
+
+    enabled: bool = Field(False, description="whether to close loops")
+    away: int = Field(
+        20, ge=2, le=100000, description="keyframes at least between the newest and one that it closes a loop to"
+    )
+    candidates: int = Field(
+        3, ge=1, le=100, description="keyframes that are matched feature by feature: those that look most alike"
+    )
+    min_matches: int = Field(20, ge=6, le=1000, description="descriptor matches that a candidate needs")
+    min_inliers: int = Field(
+        50, ge=10, le=1000, description="points around the candidate that must fit the newest keyframe's pose there"
+    )
+    min_share: float = Field(
+        0.3, ge=0, le=1, description="share of the candidate's own points in view that must be among them"
+    )
+    confirmations: int = Field(3, ge=1, le=20, description="keyframes in a row that must agree on the correction")
+    drift_share: float = Field(
+        0.03,
+        gt=0,
+        le=1,
+        description="largest correction that is believed, as a share of the way since: places that only look the same "
+        "are farther away than drift explains",
+    )
+    drift_deg: float = Field(0.5, gt=0, le=90, description="largest rotation that is believed, degrees a metre")
+
+
 class MotionModelSettings(Settings):
     """White-noise acceleration as motion model: prediction and filter while tracking, smoother afterwards."""
 
@@ -302,3 +330,4 @@ class BackendSettings(Settings):
     mapping: MappingSettings = MappingSettings()
     bundle_adjustment: BundleAdjustmentSettings = BundleAdjustmentSettings()
     relocalisation: RelocalisationSettings = RelocalisationSettings()
+    loop_closing: LoopClosingSettings = LoopClosingSettings()

@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass
 from importlib import metadata
 
-from dynslam_bench import __version__
 from dynslam_bench.core.folders import find_data_root, is_writable, stage_cache_folder, weights_folder
+from dynslam_bench.core.version import version
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
 from dynslam_bench.sequences.listing import summaries
 
@@ -41,7 +41,7 @@ class Finding:
 def examine() -> list[Finding]:
     """Everything that decides what can be run on this machine; nothing is downloaded or loaded for it."""
     system = f"{platform.system()} {platform.machine()}"
-    found = [Finding("program", DISTRIBUTION, f"{__version__}, Python {platform.python_version()}, {system}")]
+    found = [Finding("program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}")]
     found += _packages()
     found += _weights()
     here = [each for each in summaries() if each.here and not each.id.startswith("synthetic/")]

@@ -21,7 +21,7 @@ OPTIONS = {
     "flow": "an optical flow: id, module:Attr or file.py:Attr of a FlowSpec",
     "features": "a feature extractor: id, module:Attr or file.py:Attr of a FeatureSpec",
     "filter": "a dynamic filter: module:Attr or file.py:Attr of a class or function that constructs it",
-    "sequence": "a sequence: an id or a folder",
+    "sequence": "a sequence: id, folder, or module:Attr or file.py:Attr of a DatasetSpec (the first that it lists)",
 }
 """What can be checked: the end of the option's name, and its help."""
 
@@ -95,14 +95,30 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
     if kind == "tracker":
         return testing.isolated_tracker_report(subject)
     if kind == "sequence":
-        from dynslam_bench.sequences.catalogue import open_sequence
-
-        return testing.sequence_report(open_sequence(subject))
+        return _sequence(subject)
     if kind == "filter":
         from dynslam_bench.core.plugins import load_object
 
         return testing.filter_report(load_object(subject))
     return _REPORTS[kind](subject)
+
+
+def _sequence(subject: str) -> ConformanceReport:
+    from dynslam_bench.core.errors import PluginError
+    from dynslam_bench.core.folders import find_data_root
+    from dynslam_bench.core.plugins import load_object
+    from dynslam_bench.sequences.published.datasets import DATASETS
+
+    from . import sequence_report
+
+    head, _, attribute = subject.rpartition(":")
+    if not attribute.isidentifier() or not (head.endswith(".py") or head.replace(".", "").isidentifier()):
+        return sequence_report(subject)
+    spec = DATASETS.get(subject)
+    if not spec.sequences:
+        raise PluginError(f"the data set '{spec.id}' lists no sequence", "name one in DatasetSpec.sequences")
+    factory = load_object(spec.entry_point)
+    return sequence_report(factory(spec.sequences[0], data_root=find_data_root()))
 
 
 def _segmenter(subject: str) -> ConformanceReport:

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.records import write_atomic
-from dynslam_bench.envs.source import open_frames
+from dynslam_bench.runs.exchange.stored_sequence import open_stored
 from dynslam_bench.runs.snapshots import Snapshot, read_snapshots, spread
-from dynslam_bench.sequences.part import part_of
 
 from ..figures.style import significant
 from ..model.rows import LoadedRun
@@ -112,29 +111,13 @@ class PictureBook:
         key = (record.place or record.sequence.id, record.frames, record.offset, record.stride, record.sequence.content)
         if key not in self._opened:
             try:
-                self._opened[key] = _open(run)
+                self._opened[key] = open_stored(run.record)
             except DynslamError as error:
                 self._opened[key] = str(error)
         found = self._opened[key]
         if isinstance(found, str):
             raise DynslamError(found)
         return found
-
-
-def _open(run: LoadedRun) -> Sequence:
-    """The sequence of a run as its tracker saw it, before any preprocessing.
-
-    Raises:
-        DynslamError: It is not here, or not the one that was run on.
-    """
-    record = run.record
-    if not record.sequence.content:  # else a record could name any folder of images, and a published page show them
-        raise DynslamError(f"the record does not say what {record.sequence.id} held")
-    start, stop = record.frames or (0, None)
-    sequence = open_frames(record.place or record.sequence.id, None, None, (start + record.offset, stop), record.stride)
-    if part_of(sequence, record.offset).content != record.sequence.content:
-        raise DynslamError(f"the content of {record.sequence.id} has changed since the run")
-    return sequence
 
 
 def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
@@ -151,7 +134,7 @@ def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
 def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
     """Features (two bytes each: x and y in 255ths of the image), which were kept, and the mask as a small image."""
     height, width = size
-    places = np.clip(shot.points * np.float32((255 / width, 255 / height)), 0, 255).round().astype(np.uint8)
+    places = np.clip(shot.points * np.array((255 / width, 255 / height), np.float32), 0, 255).round().astype(np.uint8)
     order = np.argsort(shot.kept, kind="stable")  # culled ones first
     seen = {"points": base64.b64encode(places[order].tobytes()).decode(), "culled": int((~shot.kept).sum())}
     seen |= {"width": width, "height": height}

@@ -8,14 +8,14 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Literal
 
-from dynslam_bench.core.errors import ReportError, did_you_mean
+from dynslam_bench.core.errors import ReportError
 
 from .cell import Cell, make_cell
 from .columns import name_columns, shortened
 from .frame import rows_frame
 from .labels import make_labels
 from .row import RunRow
-from .rows import check_one_protocol
+from .rows import check_one_protocol, check_reference
 from .statistics import Standing, standings
 
 if TYPE_CHECKING:
@@ -154,9 +154,7 @@ def make_board(
     if not rows:
         raise ReportError("there are no runs to report")
     check_one_protocol(rows)
-    known = sorted({row.tracker for row in rows})
-    if reference is not None and reference not in known:
-        raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, known))
+    check_reference(reference, [row.tracker for row in rows])
     board = Board(list(rows), on, rank_seen, name_columns(rows), asked_reference=reference or "")
     board.labels = make_labels(rows)
     _order_sequences(board)

@@ -58,5 +58,5 @@ def load_board(
     Raises:
         ReportError: As `make_board`.
     """
-    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
+    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol), reference=reference).runs]
     return make_board(rows, reference, on, rank_seen=rank_seen)

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError, ReportError
+from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
@@ -92,6 +92,7 @@ def load_runs(
     protocol: Protocol,
     on_progress: OnProgress = unheard,
     crew: Crew | None = None,
+    reference: str | None = None,
 ) -> Loaded:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
 
@@ -100,9 +101,10 @@ def load_runs(
         protocol: How to evaluate.
         on_progress: As in `build_report`.
         crew: Helpers that score the runs; None to score them here.
+        reference: Id of a tracker of which there must be runs, looked for before anything is scored; None for any.
 
     Raises:
-        ReportError: There is no run at all.
+        ReportError: There is no run at all, or none of the reference.
     """
     loaded = Loaded()
     kept: list[tuple[RunStore, RunRecord]] = []
@@ -111,6 +113,8 @@ def load_runs(
         loaded.unreadable += [f"{bad.path}: {bad.reason}" for bad in unreadable]
         kept += [(store, record) for record in records if record.status != "stopped"]
         loaded.stopped += sum(record.status == "stopped" for record in records)
+    if kept:
+        check_reference(reference, [record.tracker.id for _, record in kept])
     rows = _rows(kept, protocol, on_progress, crew)
     found = [LoadedRun(row, record, store) for row, (store, record) in zip(rows, kept, strict=True)]
     _join_old_imports(found)
@@ -235,6 +239,17 @@ def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple
     if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
         return which, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
     return which, failed, record.reason
+
+
+def check_reference(reference: str | None, trackers: Sequence[str]) -> None:
+    """Refuse a reference that none of some runs' trackers is; None is none.
+
+    Raises:
+        ReportError: Names the reference, and the tracker that may have been meant.
+    """
+    known = sorted(set(trackers))
+    if reference is not None and reference not in known:
+        raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, known))
 
 
 def check_one_protocol(rows: Sequence[RunRow]) -> None:

@@ -15,7 +15,7 @@ from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.trackers import TRACKERS
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MADE_UP = ("path/", "./", "/", "grey/")
 """How names begin that stand for a reader's own files and plug-ins."""
 
@@ -24,7 +24,7 @@ def documented() -> list[str]:
     """The program's command lines in the fenced blocks of all pages, without comments."""
     lines = []
     for page in PAGES:
-        for block in re.findall(r"^```(?:bash|sh)\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+        for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
             joined = block.replace("\\\n", " ")
             lines += [line for line in joined.splitlines() if line.startswith("dynslam-bench ")]
     return lines

@@ -51,6 +51,8 @@ FOREIGN_FILES = {
     "associate.py": "a script of the TUM benchmark",
     "evaluate_rpe.py": "a script of the TUM benchmark",
     "masks.txt": "written below the name of each kind of image",
+    "mine.toml": "the reader's",
+    "my_slam.py": "the reader's",
     "my_tracker.py": "the reader's",
 }
 """File names that are not ours, and those that the code puts together."""

@@ -1,4 +1,4 @@
-"""The pages' Python, run as it stands but for the lengths of sequences."""
+"""The pages' blocks of code: Python is run as it stands but for the lengths of sequences, TOML is read by readers."""
 
 from __future__ import annotations
 
@@ -6,40 +6,117 @@ import re
 from pathlib import Path
 
 import pytest
-from documented_names import ROOT
+from documented_names import PAGES, ROOT
 
-SHORTER = {"frames=(0, 60)": "frames=(0, 4)", "frames=[0, 150]": "frames=[0, 4]"}
-RUN = {"README.md": 1, "docs/evaluation.md": 1, "docs/suites.md": 1, "docs/environments.md": 2}
-"""Pages, and how many of their blocks are run here: those that need nothing from elsewhere."""
+from dynslam_bench.core.settings import flatten
+from dynslam_bench.core.toml import parse_toml
+from dynslam_bench.sequences.published.cameras import read_camera
+from dynslam_bench.suites import load_suite
+from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.tuning import read_study
+
+SHORTER = {
+    "frames=(0, 60)": "frames=(0, 4)",
+    "frames=[0, 150]": "frames=[0, 4]",
+    "offset=n) for n in range(3)": "offset=n, frames=(0, 4)) for n in range(2)",
+    '"bonn/crowd",\n    frames="0:300"': '"synthetic/walking_xyz?frames=4",\n    frames="0:3"',
+    "@3?frames=150": "@3?frames=4",
+    "[40]": "[2]",
+    "(40)": "(2)",
+    '"synthetic/walking_xyz", cache_root': '"synthetic/walking_xyz?frames=2", cache_root',
+}
+"""What stands in the pages, and what is run in its place."""
+RUN = {
+    "README.md": 1,
+    "docs/environments.md": 3,
+    "docs/evaluation.md": 1,
+    "docs/sequences.md": 2,
+    "docs/start/agent.md": 1,
+    "docs/suites.md": 1,
+    "docs/synthetic.md": 1,
+}
+"""Pages, and how many of their first Python blocks are run here, one after the other in one namespace."""
+ELSEWHERE = {
+    "docs/environments.md": (2, "tests/runs/test_runs_tables.py"),
+    "docs/plugins.md": (6, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/reports.md": (1, "tests/reports/test_reports_tables.py"),
+    "docs/tuning.md": (2, "tests/tuning/test_python_study.py"),
+}
+"""Pages with blocks of Python that another test runs, how many, and which."""
+LANGUAGES = {"bash", "python", "text", "toml"}
 
 
-def blocks(page: str) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
+def blocks(page: Path | str, language: str = "python") -> list[str]:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.S | re.M)
+
+
+def test_every_block_of_python_is_run_by_some_test() -> None:
+    held = {str(page.relative_to(ROOT)): len(blocks(page)) for page in PAGES if blocks(page)}
+    assert held == {page: RUN.get(page, 0) + ELSEWHERE.get(page, (0, ""))[0] for page in {*RUN, *ELSEWHERE}}
+    for page, (_, test) in ELSEWHERE.items():
+        assert Path(page).name in (ROOT / test).read_text(), f"{test} does not read {page}"
+
+
+def test_every_block_names_its_language() -> None:
+    """Those in bash are tested by `tests/cli/test_cli_documented_commands.py`; ``text`` is nothing to run."""
+    fences = {(page.name, name) for page in PAGES for name in re.findall(r"^```(.*)$", page.read_text(), flags=re.M)}
+    assert len(fences) > 20 and {name for _, name in fences} == LANGUAGES | {""}
+    opened = [(page.name, re.findall(r"^```(.*)$", page.read_text(), flags=re.M)[::2]) for page in PAGES]
+    assert [page for page, names in opened if "" in names] == []
 
 
 @pytest.mark.parametrize("page", RUN)
-def test_a_page_s_python_runs(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_page_s_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = blocks(page)[: RUN[page]]
     assert len(found) == RUN[page]
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
+    names: dict[str, object] = {"cache_root": tmp_path}
     for text in found:
         for long, short in SHORTER.items():
             text = text.replace(long, short)
         exec(compile(text, page, "exec"), names)
-    assert capsys.readouterr().out.strip(), "what a page computes it prints"
+    assert len(names) > 3, "it did something"
+
+
+def test_what_is_shortened_stands_in_the_pages() -> None:
+    everything = "".join(text for page in RUN for text in blocks(page))
+    assert [long for long in SHORTER if long not in everything] == []
 
 
 def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
-    from dynslam_bench.suites import load_suite
-
-    page = (ROOT / "docs" / "suites.md").read_text(encoding="utf-8")
-    (text,) = re.findall(r"^```toml\n(.*?)^```", page, flags=re.S | re.M)
+    (text,) = blocks("docs/suites.md", "toml")
     (tmp_path / "mine.toml").write_text(text)
     suite = load_suite(tmp_path / "mine.toml")
     trackers = {"orb-slam2", "emfoa-oft", "never-move"}
     specs = suite.specs(trackers=tuple(sorted(trackers)))
     assert len(specs) == 4 * 2 * 2 * 3, "three trackers and a row, two sequences, two variants, three offsets"
     assert {spec.tracker for spec in specs} == trackers
+
+
+@pytest.mark.parametrize("page", ["docs/tuning.md", "docs/start/study.md"])
+def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
+    (text,) = blocks(page, "toml")
+    (tmp_path / "study.toml").write_text(text)
+    spec = read_study(tmp_path / "study.toml")
+    settings = flatten(TRACKERS.get(spec.tracker).settings())
+    assert spec.blocks(*spec.tune) and spec.blocks(*spec.held_out) and spec.space.include
+    for pattern in (*spec.space.include, *spec.space.fixed):
+        assert any(name.startswith(pattern.rstrip("*")) for name in settings), pattern
+
+
+def test_the_camera_on_the_page_is_one(tmp_path: Path) -> None:
+    (text,) = blocks("docs/sequences.md", "toml")
+    (tmp_path / "camera.toml").write_text(text)
+    assert read_camera(tmp_path / "camera.toml").fx == 535.4
+
+
+def test_the_entry_point_on_the_page_is_of_a_group_that_is_read() -> None:
+    (text,) = blocks("docs/plugins.md", "toml")
+    (group,) = parse_toml(text, "docs/plugins.md")["project"]["entry-points"]
+    assert group == f"dynslam_bench.{TRACKERS.kind}"
+
+
+def test_there_is_no_toml_beside() -> None:
+    pages = {page.relative_to(ROOT).as_posix() for page in PAGES if blocks(page, "toml")}
+    assert pages == {"docs/suites.md", "docs/tuning.md", "docs/start/study.md", "docs/sequences.md", "docs/plugins.md"}

@@ -205,6 +205,15 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     assert float(board[0]["ATE ratio"]) < 0.2
 
 
+def test_an_unknown_reference_is_refused_before_anything_is_scored(tmp_path):
+    store, told = RunStore(tmp_path / "results"), []
+    add_run(store, "orb-slam2", "s/a")
+    with pytest.raises(ReportError, match="no run of the reference 'orb-slam3'") as caught:
+        build_report(store, tmp_path / "r", reference="orb-slam3", on_progress=lambda *what: told.append(what))
+    assert caught.value.hint == "did you mean 'orb-slam2'?" and told == []
+    assert not (tmp_path / "r").exists() and not (store.root / "metrics").exists()
+
+
 def test_variants_of_a_tracker_are_rows_of_their_own(tmp_path):
     store = RunStore(tmp_path / "r")
     for seed in (0, 1):

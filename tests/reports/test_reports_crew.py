@@ -1,5 +1,9 @@
 """Helper processes of a report: the same report as without them, and one line where one of them fails."""
 
+import json
+import subprocess
+import sys
+
 import pytest
 from reports_fake_store import add_run, fill
 
@@ -7,6 +11,7 @@ from dynslam_bench.core.errors import InfrastructureError, ReportError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report
 from dynslam_bench.reports.model import crew
+from dynslam_bench.runs.process.server import child_environment
 
 
 def contents(folder):
@@ -56,3 +61,18 @@ def test_few_runs_need_no_helpers(monkeypatch):
     assert (crew.helpers_for(crew.MANY - 1), crew.helpers_for(crew.MANY)) == (0, 3)
     monkeypatch.setattr(crew.os, "sched_getaffinity", lambda _: {0}, raising=False)
     assert crew.helpers_for(10_000) == 0
+
+
+def test_a_helper_whose_report_is_gone_ends_without_a_word():
+    helper = subprocess.Popen(
+        [sys.executable, "-m", crew.MODULE],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=child_environment(),
+    )  # fmt: skip
+    helper.stdout.close()
+    setup = {"protocol": get_protocol("tum-rgbd/v1").model_dump_json(), "output": "x", "picture_seconds": 0}
+    setup |= {"most_frames": 1}
+    helper.stdin.write(json.dumps(setup) + "\n" + json.dumps({"kind": "rows", "job": {"runs": []}}) + "\n")
+    helper.stdin.close()
+    said = helper.stderr.read()
+    helper.stderr.close()
+    assert helper.wait(60) == 1 and said == ""

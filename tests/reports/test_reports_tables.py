@@ -1,5 +1,10 @@
 """Tables: the frames behind them, and the formats that they are written in."""
 
+import re
+from pathlib import Path
+
+import pytest
+
 from dynslam_bench.reports.tables.latex import to_latex
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_markdown
 
@@ -49,3 +54,13 @@ def test_a_column_in_which_nothing_is_written_is_in_the_csv_only():
     full = Table("t", "Title", "Caption.", columns, [*rows, [TableCell("b"), TableCell("0.04"), TableCell("2.0")]])
     assert "| tracker | p | ATE |" in to_markdown(full)
     assert "| tracker | p | ATE |" in to_markdown(Table("t", "Title", "Caption.", columns, []))
+
+
+def test_the_page_s_python_goes_as_it_stands(made, monkeypatch):
+    pytest.importorskip("matplotlib", reason="pandas draws with it")
+    page = Path(__file__).resolve().parents[2] / "docs" / "reports.md"
+    (text,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), flags=re.S | re.M)
+    monkeypatch.chdir(made[0].root.parent)
+    names = {}
+    exec(compile(text, "docs/reports.md", "exec"), names)
+    assert len(names["board"].frame()) == len(names["frame"]) > 5

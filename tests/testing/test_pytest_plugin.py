@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts import FlowResult, Keypoints
+from dynslam_bench.core.errors import PluginError
 from dynslam_bench.features.build_extractor import build_extractor
 from dynslam_bench.flow.build_flow import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.testing import ConformanceError, check_features, check_flow, features_report, flow_report
+from dynslam_bench.testing.pytest_plugin import report_on
 
 FLOW = """
 import numpy as np
@@ -54,6 +56,27 @@ def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
     assert re.search(r"still\.py:SPEC::a small shift is found FAILED", out), out
     assert "xy are positions in the target, x first, not displacements" in out
     assert "1 failed" in out and "INTERNALERROR" not in out
+
+
+DATASET = """
+from dynslam_bench.contracts import DatasetSpec
+from dynslam_bench.testing import CornerSequence
+
+def build(name, *, data_root):
+    assert name == "corners/one"
+    return CornerSequence(3)
+
+SPEC = DatasetSpec("corners", f"{__file__}:build", ("corners/one",))
+EMPTY = DatasetSpec("nothing", f"{__file__}:build")
+"""
+
+
+def test_a_data_set_is_checked_by_the_sequence_that_it_lists(tmp_path: Path) -> None:
+    (tmp_path / "corners.py").write_text(DATASET)
+    report = report_on("sequence", f"{tmp_path / 'corners.py'}:SPEC")
+    assert {"protocol", "timestamps", "frames", "reading twice"} <= {each.name for each in report.checks}
+    with pytest.raises(PluginError, match="the data set 'nothing' lists no sequence"):
+        report_on("sequence", f"{tmp_path / 'corners.py'}:EMPTY")
 
 
 def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:

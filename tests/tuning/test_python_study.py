@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from dynslam_bench.tuning.old_form import converted
 from dynslam_bench.tuning.storage import open_storage
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
+DOCS = EXAMPLE.parents[1] / "docs"
 FIELDS: dict[str, Any] = {
     "name": "py", "tracker": TRACKER, "tune": [TUNE], "held_out": [HELD_OUT], "recorded": (), "trials": 8,
     "space": {"include": ["gain", "wobble"]}, "min_coverage": None, "pilot": False,
@@ -127,3 +129,31 @@ def test_the_example_goes_as_it_stands_but_for_its_runs(tmp_path: Path, capsys: 
     told = capsys.readouterr().out
     assert "trial 0: {'frames': 5}" in told and "trial 1: {'frames': 2}" in told
     assert "default" in told.splitlines()[-1], "nothing can be gained there"
+
+
+def test_the_notebook_goes_as_it_stands_but_for_its_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    cells = json.loads((EXAMPLE.parent / "notebooks" / "study.ipynb").read_text())["cells"]
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), "study.ipynb", "exec"), names)
+    assert len(names["trials"]) == 12 and names["summary"].conclusion in capsys.readouterr().out
+
+
+def test_the_page_s_python_goes_as_it_stands_but_for_its_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib", reason="pandas draws with it")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fast.toml").write_text('"backend.keyframes.tracked_share" = 0.8\n')
+    first, second = re.findall(r"^```python\n(.*?)^```", (DOCS / "tuning.md").read_text(), flags=re.S | re.M)
+    exec(compile(first.replace("trials=30", "trials=6"), "docs/tuning.md", "exec"), {})
+    assert "default" in capsys.readouterr().out.splitlines()[-1]
+    tuned = "params.backend.keyframes.tracked_share"
+    second = second.replace("studies/thresholds", "studies/mine").replace("params.epipolar.threshold_px", tuned)
+    names: dict[str, Any] = {}
+    exec(compile(second, "docs/tuning.md", "exec"), names)
+    assert len(names["frame"]) == 6

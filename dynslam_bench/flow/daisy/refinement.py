@@ -45,17 +45,12 @@ class Window(NamedTuple):
     tolerance: np.float32
 
 
-@kernel
 def pad_image(image: Bytes, margin: int, out: Bytes) -> None:
-    """Copy a uint8 image into the middle of `out` and repeat its edges over `margin` pixels."""
-    height, width = image.shape
-    for y in range(height + 2 * margin):
-        row = image[min(max(y - margin, 0), height - 1)]
-        line = out[y]
-        for x in range(margin):
-            line[x] = row[0]
-            line[margin + width + x] = row[width - 1]
-        line[margin : margin + width] = row
+    """Copy a uint8 image into the middle of `out`, unless it lies there, and repeat its edges over `margin` pixels."""
+    rows = out[margin:-margin]
+    rows[:, margin:-margin] = image
+    rows[:, :margin], rows[:, -margin:] = image[:, :1], image[:, -1:]
+    out[:margin], out[-margin:] = rows[0], rows[-1]
 
 
 @inlined

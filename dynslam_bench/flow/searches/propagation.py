@@ -81,7 +81,6 @@ def label_turns(labels: Floats) -> Floats:
     return turns
 
 
-@kernel
 def common_motions(
     points: Floats, labels: Floats, costs: Longs, hypotheses: int, tolerance: Scalar, seed: Scalar, out: Floats
 ) -> None:
@@ -97,11 +96,29 @@ def common_motions(
         out: float32 ``[2, 4]``, ``(a, b, tx, ty)``; NaN where fewer than 6 points agree.
     """
     out[:] = np.nan
-    n = len(points)
-    if n < 4:
-        return
-    half = max(n // 2, 4)
-    good = better_half(costs, half)
+    if len(points) >= 4:
+        motions_of(points, labels, better_half(costs), hypotheses, tolerance, seed, out)
+
+
+def better_half(costs: Longs) -> Longs:
+    """Indices of the lower half of the costs, four at least, ascending; of equal ones the first.
+
+    By numpy: in a kernel, ``np.partition`` would take a tenth of the time in which all kernels compile.
+    """
+    half = max(len(costs) // 2, 4)
+    threshold = np.partition(costs, half - 1)[half - 1]
+    chosen = costs < threshold
+    ties = np.flatnonzero(costs == threshold)
+    chosen[ties[: half - np.count_nonzero(chosen)]] = True
+    return np.flatnonzero(chosen).astype(np.int64)
+
+
+@kernel
+def motions_of(
+    points: Floats, labels: Floats, good: Longs, hypotheses: int, tolerance: Scalar, seed: Scalar, out: Floats
+) -> None:
+    """`common_motions` of the points with indices `good`; `out` holds NaN."""
+    half = len(good)
     # where the good points lie and where their labels take them, one coordinate after the other for vector code
     x, y = np.empty(half, dtype=np.float32), np.empty(half, dtype=np.float32)
     to_x, to_y = np.empty(half, dtype=np.float32), np.empty(half, dtype=np.float32)
@@ -179,21 +196,3 @@ def drop_followers(
             x[left], y[left], to_x[left], to_y[left] = x[k], y[k], to_x[k], to_y[k]
             left += 1
     return left
-
-
-@inlined
-def better_half(costs: Longs, half: int) -> Longs:
-    """Indices of the `half` lowest costs, ascending; of equal ones the first."""
-    threshold = np.partition(costs, half - 1)[half - 1]
-    below = 0
-    for cost in costs:
-        below += cost < threshold
-    ties, count = half - below, 0
-    chosen = np.empty(half, dtype=np.int64)
-    for i in range(len(costs)):
-        tie = costs[i] == threshold and ties > 0
-        if costs[i] < threshold or tie:
-            chosen[count] = i
-            count += 1
-            ties -= tie
-    return chosen

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import datetime, timezone
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,11 +17,12 @@ from dynslam_bench.envs.source import Frames, open_frames
 from dynslam_bench.evaluation.frames import STAMP_TOLERANCE
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_file import load_trajectory
 from dynslam_bench.geometry.tum_file import write_tum
 from dynslam_bench.sequences.catalogue import parse_frames
 from dynslam_bench.sequences.part import part_of
 
+from ..exchange.provenance import digest_of, stated_provenance
+from ..exchange.reading import read_trajectory
 from ..one import part_digest, sequence_info
 from ..spec import place_of
 from .record import RunRecord, TrackerInfo
@@ -45,35 +45,38 @@ def import_trajectory(
     data_root: str | Path | None = None,
     camera: str | Path | None = None,
     timestamps: str | Path | None = None,
+    topic: str | None = None,
 ) -> RunRecord:
     """Store an external trajectory as a record of kind ``imported``.
 
     Args:
-        path: Trajectory file in TUM format, or in KITTI's where `timestamps` are given.
+        path: A trajectory in any of the formats that `read_trajectory` knows.
         tracker: Name of the system that made it.
         sequence: The sequence that it was made on; its ground truth is needed to score it.
         results: The results folder, or a store.
         label: Name for tables; default is ``<tracker> (imported)``.
-        provenance: Where it came from, e.g. a URL or "authors' repository".
+        provenance: Where it came from, e.g. a URL; by default what ``provenance.json`` beside it says, else its name.
         which: Whether its poses are the causal ones or those after the final optimisation.
         frames: Part of the sequence it covers; None for all.
         stride: Every so many frames.
         data_root: Folder of the recorded sequences.
         camera: Camera of a folder that does not say its own.
-        timestamps: A file whose lines begin with the stamps of the poses in KITTI's format, in seconds.
+        timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, in seconds, for
+            COLMAP a list of stamps and images.
+        topic: Of a bag with several topics of poses, the one to take.
 
     Returns:
         The record. Poses whose stamps are no input frame's are kept, and said so in its notes.
 
     Raises:
-        TrajectoryError: The file cannot be read.
+        DynslamError: The trajectory cannot be read.
         RunError: It shares no time with the sequence (with the measured gap), or the name is empty.
         DynslamError: The sequence cannot be opened, or the store not be written.
     """
     if not tracker.strip():
         raise RunError("an imported trajectory needs the name of its tracker")
     file = Path(path).expanduser()
-    loaded = load_trajectory(file, timestamps)
+    loaded = read_trajectory(file, timestamps, topic)
     opened = open_frames(sequence, data_root, camera, frames, stride)
     covered, odd = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
     notes = loaded.notes.describe()
@@ -82,9 +85,9 @@ def import_trajectory(
     asked = {
         "tracker": TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
         **{"frames": _pair(frames), "stride": stride, "place": place_of(sequence)},
-        **{"stamps_match": not odd, "provenance": provenance or str(file), "notes": notes},
+        **{"stamps_match": not odd, "provenance": provenance or stated_provenance(file) or str(file), "notes": notes},
     }
-    record = _record(_identity(file, tracker, which, opened, timestamps), opened, covered, asked)
+    record = _record(_identity(file, tracker, which, opened, timestamps, topic), opened, covered, asked)
     store = results if isinstance(results, RunStore) else RunStore(results)
     _keep(store, record, opened, loaded.trajectory, which)
     return record
@@ -136,20 +139,21 @@ def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name
 
 
 def _identity(
-    file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None
+    file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None, topic: str | None
 ) -> dict[str, Any]:
     seen = part_of(sequence)
     return {
         "kind": "imported",
         "tracker": tracker,
         "which": which,
-        "file": sha256(file.read_bytes()).hexdigest(),
+        "file": digest_of(file),
         "sequence": seen.id,
         "content": seen.content,
         "frames": [seen.start, seen.stop],
         "offset": 0,
         "stride": seen.stride,
-        **({} if timestamps is None else {"timestamps": sha256(Path(timestamps).read_bytes()).hexdigest()}),
+        **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
+        **({} if topic is None else {"topic": topic}),
     }
 
 

@@ -79,6 +79,9 @@ def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> 
     try:
         download(checkpoint.url, path, sha256=checkpoint.sha256_prefix, progress=progress, attempts=ATTEMPTS)
     except DownloadError as error:
-        by_hand = f"put the file of {checkpoint.url} ({checkpoint.megabytes} MB) at {path}"
+        by_hand = (
+            f"put the file of {checkpoint.url} ({checkpoint.megabytes} MB, its SHA-256 begins with "
+            f"{checkpoint.sha256_prefix}) at {path}"
+        )
         raise SegmentationError(f"cannot fetch the checkpoint '{checkpoint.id}': {error.args[0]}", by_hand) from error
     return path

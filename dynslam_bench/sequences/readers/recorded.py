@@ -143,6 +143,11 @@ class RecordedSequence:
         return self._timestamps
 
     @property
+    def colour_files(self) -> dict[float, str]:
+        """The colour image of each stamp, relative to `folder`."""
+        return dict(zip(self._timestamps.tolist(), self._colour, strict=True))
+
+    @property
     def ground_truth(self) -> Trajectory | None:
         """Camera-to-world poses in the frame of the motion capture, at their own stamps; None if there are none."""
         return self._ground_truth

@@ -25,7 +25,7 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     Raises:
         TrackerError: gtsam is not installed.
     """
-    gtsam = _load_gtsam()
+    gtsam = load_gtsam("backend.bundle_adjustment.solver = gtsam")
     camera = problem.camera
     mono = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
     stereo = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
@@ -66,12 +66,20 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     return BundleResult(poses, points, chi2 <= limit, before, after)
 
 
-def _load_gtsam() -> Any:
+def load_gtsam(wanted_by: str) -> Any:
+    """The module.
+
+    Args:
+        wanted_by: The setting that needs it.
+
+    Raises:
+        TrackerError: It is not installed.
+    """
     try:
         import gtsam
     except ImportError as error:
-        message = f"bundle_adjustment.solver 'gtsam' needs a package that cannot be imported: {error}"
-        raise TrackerError(message, "pip install 'dynslam-bench[gtsam]', or use the solver 'schur'") from error
+        message = f"{wanted_by} needs a package that cannot be imported: {error}"
+        raise TrackerError(message, "pip install 'dynslam-bench[gtsam]', or leave the setting") from error
     return gtsam
 
 

@@ -78,7 +78,7 @@ class LocalMapper:
             self._fuse(slot, neighbours)
             start = perf_counter()
             if self.settings.bundle_adjustment.enabled:
-                self._adjust(slot)
+                self.adjust(slot)
             adjusted = perf_counter() - start
             self._cull_keyframes(slot)
         return slot, {"mapping": perf_counter() - begin - adjusted, "bundle_adjustment": adjusted}
@@ -132,13 +132,14 @@ class LocalMapper:
         n = int(world.kf_count[slot])
         for other in neighbours.tolist():
             own = world.kf_point[slot, :n]
-            self._fuse_into(other, np.unique(own[own >= 0]).astype(np.int64))
+            self.fuse_into(other, np.unique(own[own >= 0]).astype(np.int64))
         theirs = world.kf_point[neighbours]
-        self._fuse_into(slot, np.unique(theirs[theirs >= 0]).astype(np.int64))
+        self.fuse_into(slot, np.unique(theirs[theirs >= 0]).astype(np.int64))
         own = world.kf_point[slot, :n]
         world.refresh(np.unique(own[own >= 0]).astype(np.int64))
 
-    def _fuse_into(self, keyframe: int, candidates: Slots) -> None:
+    def fuse_into(self, keyframe: int, candidates: Slots) -> None:
+        """Look for points in a keyframe: new observations of them, and points of its own that are the same thing."""
         world = self.world
         n = int(world.kf_count[keyframe])
         seen_here = np.zeros(world.alive.size, bool)
@@ -177,7 +178,8 @@ class LocalMapper:
 
     # ------------------------------------------------------------------ bundle adjustment
 
-    def _adjust(self, slot: int) -> None:
+    def adjust(self, slot: int) -> None:
+        """Refine the window around a keyframe."""
         world = self.world
         chosen = choose_bundle(world, slot, self.settings.bundle_adjustment)
         if chosen is None:

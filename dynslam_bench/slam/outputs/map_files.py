@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.contracts.map_outputs import MapOutputs
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.geometry import se3
+
+_COLOURS = ("red", "green", "blue")
+_LAYOUT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("n", "<i4")]
+)
 
 
 def write_keyframes_csv(path: Path, outputs: MapOutputs) -> None:
@@ -31,6 +40,47 @@ def write_keyframes_csv(path: Path, outputs: MapOutputs) -> None:
     write_atomic(path, text.getvalue())
 
 
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Map points of a stored run.
+
+    Attributes:
+        positions: float32 ``[M, 3]``, world coordinates, metres.
+        colours: uint8 ``[M, 3]``, red, green, blue.
+        observations: int32 ``[M]``, keyframes that observe each point.
+    """
+
+    positions: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    observations: NDArray[np.int32]
+
+
+def read_ply(path: Path) -> Cloud:
+    """Read a map that `write_ply` wrote in binary.
+
+    Raises:
+        RunError: It cannot be read, or is no such file.
+    """
+    data = read_bytes(path, limit=TABLE_BYTES, kind=RunError)
+    head, _, body = data.partition(b"end_header\n")
+    rows = len(body) // _LAYOUT.itemsize
+    if head + b"end_header\n" != _header(rows, "binary_little_endian") or len(body) != rows * _LAYOUT.itemsize:
+        raise RunError(f"{path} is no map of this package: expected {_LAYOUT.itemsize} bytes a point, little-endian")
+    found = np.frombuffer(body, _LAYOUT)
+    positions = np.stack([found[name] for name in "xyz"], axis=1)
+    if not np.isfinite(positions).all():
+        raise RunError(f"{path} holds points that are not finite")
+    colours = np.stack([found[name] for name in _COLOURS], axis=1)
+    return Cloud(positions, colours, found["n"])
+
+
+def _header(rows: int, coding: str) -> bytes:
+    kinds = {"float": ("x", "y", "z"), "uchar": _COLOURS, "int": ("observations",)}
+    properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
+    header = ["ply", f"format {coding} 1.0", f"element vertex {rows}", *properties, "end_header"]
+    return ("\n".join(header) + "\n").encode()
+
+
 def write_ply(path: Path, outputs: MapOutputs, *, binary: bool = True) -> None:
     """Write the map points as a PLY cloud: float x y z in metres, uchar red green blue, int observations.
 
@@ -42,20 +92,13 @@ def write_ply(path: Path, outputs: MapOutputs, *, binary: bool = True) -> None:
     Raises:
         DynslamError: The folder cannot be written.
     """
-    layout = np.dtype(
-        [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("n", "<i4")]
-    )
-    rows = np.zeros(len(outputs.positions), layout)
+    rows = np.zeros(len(outputs.positions), _LAYOUT)
     for i, name in enumerate("xyz"):
         rows[name] = outputs.positions[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
+    for i, name in enumerate(_COLOURS):
         rows[name] = outputs.colours[:, i]
     rows["n"] = outputs.observations
-    kinds = {"float": ("x", "y", "z"), "uchar": ("red", "green", "blue"), "int": ("observations",)}
-    properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
-    coding = "binary_little_endian" if binary else "ascii"
-    header = ["ply", f"format {coding} 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
-    head = ("\n".join(header) + "\n").encode()
+    head = _header(len(rows), "binary_little_endian" if binary else "ascii")
     if binary:
         write_atomic(path, head + rows.tobytes())
         return

@@ -41,7 +41,7 @@ SPEC = TrackerSpec(
     license="MIT (our code; ORB-SLAM2 itself is GPL-3.0 and not used)",
     citation="Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017",
     assumptions=(
-        "no loop closing and no global bundle adjustment",
+        "no loop closing unless asked for (backend.loop_closing.enabled), and no global bundle adjustment",
         "features spread by the cells of a grid, not by a quadtree",
         "relocalisation and matching without a bag of words",
         "mapping in step with tracking, in one thread",

@@ -1,0 +1,139 @@
+"""Reference pages that are made of the code: its docstrings, settings, command line, trackers and protocols."""
+
+from __future__ import annotations
+
+from dynslam_bench.contracts import TrackerSpec
+from dynslam_bench.core.settings import Settings, flatten, settings_table
+from dynslam_bench.evaluation import PROTOCOLS
+from dynslam_bench.trackers import TRACKERS
+
+ROOMS = {
+    "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.steering", "core.errors"]),
+    "sequences": (
+        "Sequences and geometry",
+        ["sequences", "sequences.synthetic", "geometry.camera", "geometry.trajectory", "geometry.se3"],
+    ),
+    "evaluation": ("Evaluation", ["evaluation"]),
+    "trackers": (
+        "Trackers",
+        ["trackers", "trackers.systems.composition", "trackers.adapters.serve", "slam.pipeline"],
+    ),
+    "environments": ("Environments", ["envs"]),
+    "runs": ("Runs and suites", ["runs", "suites"]),
+    "reports": ("Reports", ["reports"]),
+    "tuning": ("Studies", ["tuning"]),
+    "testing": ("Checks for plug-ins", ["testing"]),
+}
+"""Pages, with their titles and the modules on them."""
+
+MANY = 6
+"""More trackers than this that share a group of settings are counted, not named."""
+
+
+def reference_pages() -> dict[str, str]:
+    """Markdown of every page below ``reference/``, by its path on the site."""
+    pages = {"settings": settings(), "commands": commands(), "systems": systems(), "protocols": protocols()}
+    for name, (title, modules) in ROOMS.items():
+        pages[name] = f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
+    return {f"reference/{name}.md": text for name, text in pages.items()}
+
+
+def settings() -> str:
+    """Every group of settings that some tracker has, once, with the defaults in which trackers differ."""
+    groups: dict[tuple[str, type[Settings]], dict[str, Settings]] = {}
+    for found in TRACKERS.all():
+        root = found.spec.settings()
+        for name, value in root:
+            if isinstance(value, Settings):
+                groups.setdefault((name, type(value)), {})[found.spec.id] = value
+    text = [
+        "# Settings\n\nEvery group of settings that a built-in tracker has. On the command line a setting is "
+        "`--set GROUP.NAME=VALUE`, in a file `GROUP.NAME = VALUE`; a study draws those that have a range, an agent "
+        "steers those that are *online*. What a tracker has: [Systems](systems.md), or "
+        "`dynslam-bench trackers info ID`.\n"
+    ]
+    last = ""
+    for (name, cls), held in sorted(
+        groups.items(), key=lambda group: (group[0][0], -len(group[1]), group[0][1].__name__)
+    ):
+        text += [f"## {name}\n"] if name != last else []
+        last = name
+        text.append(f"### {cls.__name__} {{ #{anchor(name, cls)} }}\n\n{(cls.__doc__ or '').strip()}\n")
+        text.append(f"{_held_by(sorted(held))}\n\n{settings_table(cls)}")
+        text += _other_defaults(cls, held)
+    return "\n".join(text)
+
+
+def _other_defaults(cls: type[Settings], held: dict[str, Settings]) -> list[str]:
+    usual = flatten(cls())
+    lines = [
+        f"- `{tracker}`: "
+        + ", ".join(f"`{name}` is `{value}`" for name, value in flatten(group).items() if usual[name] != value)
+        for tracker, group in sorted(held.items())
+        if flatten(group) != usual
+    ]
+    return ["Other defaults:\n\n" + "\n".join(lines) + "\n"] if lines else []
+
+
+def anchor(name: str, cls: type[Settings]) -> str:
+    """Where a group's table stands on the page of settings."""
+    return f"{name}-{cls.__name__.lower()}"
+
+
+def systems() -> str:
+    """Every built-in tracker: what it is, whose it is, what was assumed, which settings it has."""
+    specs = [found.spec for found in TRACKERS.all()]
+    rows = [
+        f"| [`{s.id}`](#{s.id}) | {s.label} | {s.provenance} | {'yes' if s.ranked else 'no'} | {s.summary} |"
+        for s in specs
+    ]
+    table = "\n".join(["| id | label | provenance | ranked | what it does |", "| --- | --- | --- | --- | --- |", *rows])
+    intro = "What their tags mean, and how they were measured: [Baselines](../baselines.md)."
+    return f"# Systems\n\n{intro}\n\n{table}\n\n" + "\n".join(_system(spec) for spec in specs)
+
+
+def _system(spec: TrackerSpec) -> str:
+    root = spec.settings()
+    groups = [
+        f"[{name}](settings.md#{anchor(name, type(value))})" for name, value in root if isinstance(value, Settings)
+    ]
+    alone = [f"`{name}`" for name, value in root if not isinstance(value, Settings)]
+    facts = {
+        "Source": spec.citation,
+        "Licence": spec.license,
+        "Needs": ", ".join(f"`{hint}`" for hint in spec.requires.values()),
+        "Settings": ", ".join([*groups, *alone]),
+        "Presets": ", ".join(f"`{preset}`" for preset in spec.presets),
+        "Assumed": "; ".join(spec.assumptions),
+        "Remarks": spec.remarks,
+    }
+    lines = "\n".join(f"- **{name}.** {value}" for name, value in facts.items() if value)
+    return f"## {spec.label} {{ #{spec.id} }}\n\n`{spec.id}`: {spec.summary}.\n\n{lines}\n"
+
+
+def protocols() -> str:
+    """Every named protocol with all of its fields."""
+    text = ["# Protocols\n\nHow errors are measured; a metric is stored with its protocol. [Why](../evaluation.md)\n"]
+    for name, protocol in PROTOCOLS.items():
+        values = protocol.model_dump(mode="json")
+        lines = "\n".join(f"| `{field}` | `{value}` |" for field, value in values.items())
+        text.append(f"## {name}\n\n| field | value |\n| --- | --- |\n{lines}\n")
+    return "\n".join(text)
+
+
+def commands() -> str:
+    """The whole command line, as its help says it."""
+    import typer.cli
+    import typer.main
+
+    from dynslam_bench.cli.app import app
+
+    command = typer.main.get_command(app)
+    with command.make_context("dynslam-bench", [], resilient_parsing=True) as context:
+        return typer.cli.get_docs_for_click(obj=command, ctx=context, name="dynslam-bench", title="Commands")
+
+
+def _held_by(trackers: list[str]) -> str:
+    if len(trackers) > MANY:
+        return f"{len(trackers)} [systems](systems.md) have it."
+    return "Systems that have it: " + ", ".join(f"[`{name}`](systems.md#{name})" for name in trackers) + "."

@@ -1,0 +1,28 @@
+"""The version of this package: that of the installed distribution, which its build takes from git's tags."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import metadata
+
+UNKNOWN = "0+unknown"
+"""What a checkout that is not installed is; `core.machine.git_revision` says more of it."""
+
+
+@cache
+def version() -> str:
+    """For example ``0.1.0``, or ``0.1.1.dev5+g1a2b3c4`` five commits after the tag ``v0.1.0``."""
+    try:
+        return metadata.version("dynslam-bench")
+    except metadata.PackageNotFoundError:
+        return UNKNOWN
+
+
+def release() -> str:
+    """The release that the version belongs to, three numbers such as ``0.1.0``: the same for all its development.
+
+    Runs and cached stages are identified by it and by the code itself, not by the number of commits.
+    """
+    numbers = re.match(r"\d+(?:\.\d+)*", version())
+    return ".".join([*(numbers[0].split(".") if numbers else []), "0", "0", "0"][:3])

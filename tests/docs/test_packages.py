@@ -1,0 +1,46 @@
+"""What the distribution holds: every package, and nothing that is none."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_every_package_is_listed(project: dict) -> None:
+    """A package that is forgotten is missing from the wheel, and nothing says so."""
+    homes = {"": "dynslam_bench", ".envs": "envs", ".tuning": "tuning", ".reports": "reports"}
+    found = {
+        "dynslam_bench" + prefix + "".join(f".{part}" for part in init.parent.relative_to(ROOT / home).parts)
+        for prefix, home in homes.items()
+        for init in (ROOT / home).rglob("__init__.py")
+    }
+    assert set(project["tool"]["setuptools"]["packages"]) == found
+
+
+def test_every_extra_says_what_it_is_for_or_is_known(project: dict) -> None:
+    extras = project["project"]["optional-dependencies"]
+    assert {"rerun", "onnx", "bags", "tensorboard", "mlflow"} <= set(extras)
+
+
+def test_the_recipe_names_what_the_package_needs(project: dict) -> None:
+    recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
+    other = {"opencv-python-headless": "py-opencv", "torch": "pytorch"}
+    needed = [line.partition(">=")[0].strip() for line in project["project"]["dependencies"]]
+    versions = [line.partition(";")[0].partition(">=")[2].strip() for line in project["project"]["dependencies"]]
+    assert len(needed) > 10
+    wanted = [f"- {other.get(name, name)} >={number}" for name, number in zip(needed, versions, strict=True)]
+    assert [line for line in wanted if f"    {line}\n" not in recipe] == []

@@ -1,0 +1,121 @@
+"""The documentation site: built strictly, complete, and nothing in it is fetched from elsewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+from documented_names import ROOT
+
+pytest.importorskip("mkdocstrings", reason="the extra [docs] is not installed")
+sys.path.append(str(ROOT / "tests" / "reports"))
+from reports_browser import Browser, needs_browser
+
+LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
+
+
+class Page(HTMLParser):
+    """What a page links to, what it loads, and its anchors."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.loads: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attributes}
+        self.anchors |= {given[name] for name in ("id", "name") if name in given}
+        if tag == "a" and "href" in given:
+            self.links.append(given["href"])
+        if LOADING.get(tag) in given and given.get("rel") != "canonical":
+            self.loads.append(given[LOADING[tag]])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", ROOT / "mkdocs.yml", "-d", folder]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert built.returncode == 0, built.stderr[-4000:]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[Path, Page]:
+    written = [path for path in site.rglob("*.html") if "example" not in path.relative_to(site).parts]
+    return {path: Page(path.read_text(encoding="utf-8")) for path in written if path.name != "404.html"}
+
+
+def test_every_link_leads_somewhere_anchors_too(site: Path, pages: dict[Path, Page]) -> None:
+    assert len(pages) > 40
+    asked, lost = 0, []
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            asked += 1
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            there = target.is_file() and target.is_relative_to(site)
+            anchored = target not in pages or parts.fragment in {"", "__tabbed", *pages[target].anchors}
+            if not (there and anchored):
+                lost.append(f"{path.relative_to(site)}: {link}")
+    assert asked > 2000 and lost == []
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -> None:
+    loaded = [(path, load) for path, page in pages.items() for load in page.loads]
+    assert len(loaded) > 100
+    assert [(path.name, load) for path, load in loaded if urlsplit(load).netloc] == []
+    assert [load for path, load in loaded if not load.startswith("data:") and not (path.parent / load).exists()] == []
+    assert [path.name for path in site.glob("*.html") if "unpkg.com" in path.read_text()] == []
+    assert not re.search(r"url\(\s*['\"]?https?:", (site / "site" / "style.css").read_text())
+
+
+def test_every_door_setting_command_and_tracker_is_on_a_page(site: Path, pages: dict[Path, Page]) -> None:
+    from dynslam_bench import contracts
+    from dynslam_bench.core.settings import flatten
+    from dynslam_bench.trackers import TRACKERS
+
+    contracts_page = pages[site / "reference" / "contracts.html"].anchors
+    assert [name for name in contracts.__all__ if f"dynslam_bench.contracts.{name}" not in contracts_page] == []
+    specs = [found.spec for found in TRACKERS.all()]
+    assert [spec.id for spec in specs if spec.id not in pages[site / "reference" / "systems.html"].anchors] == []
+    settings = (site / "reference" / "settings.html").read_text()
+    leaves = {name.partition(".")[2] for spec in specs for name in flatten(spec.settings()) if "." in name}
+    assert len(leaves) > 100 and [name for name in leaves if f"<code>{name}</code>" not in settings] == []
+    commands = pages[site / "reference" / "commands.html"].anchors
+    assert {"dynslam-bench-demo", "dynslam-bench-tune-run", "dynslam-bench-report"} <= commands
+
+
+def test_the_published_example_is_part_of_it(site: Path) -> None:
+    made = {path.relative_to(ROOT / "docs") for path in (ROOT / "docs" / "example").rglob("*") if path.suffix}
+    assert len(made) > 100 and [path for path in made if not (site / path).exists()] == []
+
+
+@needs_browser
+def test_a_page_opens_from_its_folder_fetches_nothing_and_can_be_searched(
+    site: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    browser = Browser(tmp_path_factory.mktemp("browser"))
+    try:
+        for page in ("index.html", "start/tracker.html", "reference/contracts.html"):
+            for width in (1400, 360):
+                browser.open(site / page, width=width)
+                fetched = {urlsplit(address).scheme for address in browser.fetched}
+                assert fetched <= {"file", "data", "blob"} and "file" in fetched and browser.faults == [], page
+                assert browser.run("document.documentElement.scrollWidth <= innerWidth"), f"{page} at {width}"
+        browser.size(1400)
+        browser.run("one('.md-search__input').focus()")
+        browser.run("(q => { q.value = 'moth flame'; q.dispatchEvent(new Event('keyup')) })(one('.md-search__input'))")
+        browser.until("all('.md-search-result__item').length > 2", tries=200)
+        assert browser.faults == []
+    finally:
+        browser.close()

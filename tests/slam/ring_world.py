@@ -1,0 +1,64 @@
+"""Four corridors around a block, as points with known descriptors: a lap comes back to where it began."""
+
+from __future__ import annotations
+
+import numpy as np
+from conftest import PointWorld
+
+from dynslam_bench.geometry.camera import Camera
+
+WIDTH = 2.0
+CORNER = 1.0
+REACH = 6.0
+
+
+def turned(quarters):
+    angle = quarters * np.pi / 2
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+class RingWorld(PointWorld):
+    """A ring with centre lines of `side` metres; with `alike` half of the points are the same in all four corridors."""
+
+    def __init__(self, side=6.0, density=24, seed=0, *, alike=False):
+        rng = np.random.default_rng(seed)
+        walls, looks, same = [], [], {}
+        for r in (side / 2 + WIDTH / 2, side / 2 - WIDTH / 2):
+            for quarter in range(4):
+                n = int(density * 5 * r)
+                wall = np.stack([rng.uniform(-r, r, n), rng.uniform(-1.2, 1.3, n), np.full(n, r)], axis=1)
+                look = rng.integers(0, 256, (n, 32), dtype=np.uint8)
+                if alike:
+                    wall[: n // 2], look[: n // 2] = same.setdefault(r, (wall[: n // 2], look[: n // 2]))
+                walls.append(wall @ turned(quarter).T)
+                looks.append(look)
+        self.side = side
+        self.camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+        self.walls, self._looks = np.concatenate(walls), np.concatenate(looks)
+
+    def lap(self, count, step_m):
+        """Camera-to-world poses along the centre line, looking ahead, y down; corners are quarter circles."""
+        straight, arc = self.side - 2 * CORNER, np.pi / 2 * CORNER
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        for pose, way in zip(poses, np.arange(count) * step_m, strict=True):
+            quarter, along = divmod(way, straight + arc)
+            bend = max(0.0, along - straight) / CORNER
+            before = min(along, straight) - straight / 2
+            spot = [before + CORNER * np.sin(bend), 0.0, self.side / 2 - CORNER * (1 - np.cos(bend))]
+            ahead = turned(quarter + bend / (np.pi / 2)) @ [1.0, 0.0, 0.0]
+            down = np.array([0.0, 1.0, 0.0])
+            pose[:3, :3] = np.column_stack([np.cross(down, ahead), down, ahead])
+            pose[:3, 3] = turned(quarter) @ spot
+        return poses
+
+    def see(self, T_world_cam, index, **noise):
+        """As `PointWorld.see`, of the walls that no other wall hides."""
+        centre = T_world_cam[:3, 3]
+        near = np.flatnonzero(np.linalg.norm(self.walls - centre, axis=1) < REACH)
+        sight = centre + (self.walls[near] - centre) * np.linspace(0.05, 0.95, 12)[:, None, None]
+        inner, outer = (self.side - WIDTH) / 2 - 0.05, (self.side + WIDTH) / 2 + 0.05
+        far = np.abs(sight[..., [0, 2]]).max(axis=-1)
+        open_ = near[~((far < inner) | (far > outer)).any(axis=0)]
+        self.points, self.descriptors = self.walls[open_], self._looks[open_]
+        return super().see(T_world_cam, index, **noise)

@@ -1,0 +1,70 @@
+"""Loops: drift goes where a place is recognised, and nothing moves where places only look the same."""
+
+import numpy as np
+import pytest
+from ring_world import RingWorld
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.bundle.pose_graph import Edge, optimise_poses
+from dynslam_bench.slam.settings import BackendSettings, LoopClosingSettings
+
+pytest.importorskip("gtsam", reason="loop closing needs the extra gtsam")
+
+NOISE = dict(noise_px=1.2, depth_noise=0.01, limit=500)
+STEP = 0.15
+
+
+def drive(world, frames, *, closing):
+    """A back end that has driven around, and the error of each online position in metres."""
+    settings = BackendSettings(loop_closing=LoopClosingSettings(enabled=closing))
+    backend, poses = RgbdBackend(settings), world.lap(frames, STEP)
+    backend.reset(world.camera, 0)
+    errors = []
+    for index, pose in enumerate(poses):
+        frame = world.see(pose, index, **NOISE)
+        found = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
+        assert found.state == "ok"
+        errors.append(np.linalg.norm(found.T_world_cam[:3, 3] - (se3.inverse(poses[0]) @ pose)[:3, 3]))
+    return backend, poses, np.array(errors)
+
+
+def test_a_lap_comes_back_to_where_it_began():
+    world = RingWorld(side=9.0)
+    lap = int(np.ceil((4 * (world.side - 2) + 2 * np.pi) / STEP))
+    backend, poses, errors = drive(world, lap + 15, closing=True)
+    drift = errors[lap - 5 : lap + 5].max()
+    assert drift > 0.1, "one turn drifts so far that the old points are not found by projecting them"
+    assert errors[-1] < 0.3 * drift
+    loop = backend.loops.closed[0]
+    assert loop.frame < 20, "to the lap's beginning"
+    assert loop.moved_m == pytest.approx(drift, rel=0.5)
+    final = backend.finalize().positions - se3.transform(se3.inverse(poses[0]), poses[:, :3, 3])
+    assert np.linalg.norm(final, axis=1).max() < drift, "the whole path is corrected, not its end alone"
+    index = backend.world.points
+    assert (backend.world.n_obs[index] > 0).all() and np.isfinite(backend.world.position[index]).all()
+
+
+def test_corridors_that_look_the_same_are_not_taken_for_one():
+    backend, _, errors = drive(RingWorld(alike=True), 70, closing=True)
+    assert not backend.loops.closed and errors.max() < 0.2
+
+
+def test_it_changes_nothing_where_no_place_is_seen_again():
+    world = RingWorld()
+    _, _, without = drive(world, 30, closing=False)
+    _, _, errors = drive(world, 30, closing=True)
+    assert (errors == without).all()
+
+
+def test_a_pose_graph_spreads_what_one_tie_contradicts():
+    ids = np.arange(5) * 10
+    true = np.tile(np.eye(4), (5, 1, 1))
+    true[:, 0, 3] = np.arange(5)
+    drifted = true.copy()
+    drifted[:, 0, 3] *= 1.1
+    steps = [Edge(int(a), int(a + 10), drifted[i + 1] @ se3.inverse(drifted[i])) for i, a in enumerate(ids[:-1])]
+    ring = Edge(0, 40, true[4] @ se3.inverse(true[0]))
+    found = optimise_poses(ids, drifted, [*steps, ring])
+    np.testing.assert_allclose(found[:, 0, 3], np.arange(5) * 1.02, atol=1e-6, err_msg="five ties share 0.4 m equally")
+    np.testing.assert_allclose(optimise_poses(ids, drifted, steps), drifted, atol=1e-9)
