@@ -31,7 +31,7 @@ SOURCES = ("dynslam_bench", "envs", "tuning", "reports", "tests")
 
 TOY = "import sys; from pathlib import Path; from envs_toys import write_folder; write_folder(Path('toy'), 20)"
 STUDY = """name = "s"
-tracker = "opencv-odometry"
+tracker = "orb-slam2"
 tune = ["toy"]
 trials = 2
 seeds = [0]
@@ -41,7 +41,7 @@ allow_overlap = true
 STEPS = {
     "import": ["python", "-c", "from dynslam_bench import envs, tuning, reports, runs"],
     "toy sequence": ["python", "-c", TOY],
-    "run": ["dynslam-bench", "run", "opencv-odometry", "toy", "--frames", "0:16"],
+    "run": ["dynslam-bench", "run", "constant-velocity", "toy", "--frames", "0:16"],
     "rendered run": ["dynslam-bench", "run", "orb-slam2", "synthetic/walking_xyz?frames=8"],
     "list": ["dynslam-bench", "runs", "list"],
     "study": ["dynslam-bench", "tune", "run", "study.toml"],
