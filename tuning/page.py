@@ -20,7 +20,7 @@ from dynslam_bench.reports.tables.table import Column, Table, TableCell, number,
 
 from .blocks import Block, scenes
 from .importance import FEWEST_TRIALS, importances, inert_parameters
-from .page_figures import MOST_SLICES, front, history, settings_table, slices
+from .page_figures import MOST_SLICES, Star, front, history, settings_table, slices
 from .preset import preset_text
 from .ratio import Ratio
 from .samplers import is_feasible
@@ -163,28 +163,30 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     """Ratios with their intervals, trials in their order, the front, settings against the objective."""
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     whats = [each.what for each in tuner.objectives]
-    chosen = _best_trial(summary)
+    star = _star(summary)
     figures: dict[str, dict[str, Any]] = {}
     ratio = _ratio_figure(summary)
     if ratio is not None:
         figures["ratios"] = ratio
     if finished:
-        figures["history"] = history(finished, whats[0], chosen)
+        figures["history"] = history(finished, whats[0], star)
         used = [each for each in tuner.space if any(each.name in trial.params for trial in finished)]
         if used:
             ranked = sorted(used, key=lambda each: -summary.importances.get(each.name, 0.0))[:MOST_SLICES]
-            figures["slices"] = slices(finished, ranked, tuner.base, whats[0], chosen)
+            figures["slices"] = slices(finished, ranked, tuner.base, whats[0], star)
         if len(whats) > 1:
             best = {trial.number for trial in best_trials(tuner.study, len(finished))}
-            figures["front"] = front(finished, best, whats, chosen)
+            figures["front"] = front(finished, best, whats, star)
     if summary.importances:
         figures["importances"] = _importance_figure(summary)
     return figures
 
 
-def _best_trial(summary: StudySummary) -> int | None:
+def _star(summary: StudySummary) -> Star | None:
     """The trial that the page is about: the chosen one, else the first candidate; None without any."""
-    return summary.candidates[0].trial if summary.candidates else None
+    if not summary.candidates:
+        return None
+    return summary.candidates[0].trial, "best trial" if summary.chosen is None else "chosen"
 
 
 def _settings(tuner: Tuner, summary: StudySummary) -> Table:

@@ -18,19 +18,23 @@ MOST_SLICES = 5
 _TRIAL, _BEST, _DEFAULT, _CHOSEN = "#1f6fb4", "#8a8f98", "#2a9d6f", "#d9542b"
 
 
+Star = tuple[int, str]
+"""The trial that a page is about, and its name there: ``chosen`` only if it was."""
+
+
 def ratios(trial: FrozenTrial) -> list[float]:
     """The objectives of a complete trial as ratios to the default settings, less is better."""
     return [math.exp(value) for value in trial.values]
 
 
-def history(trials: Sequence[FrozenTrial], what: str, chosen: int | None) -> Figure:
+def history(trials: Sequence[FrozenTrial], what: str, star: Star | None) -> Figure:
     """The first objective of every complete trial, in their order, and the best so far."""
     found = {trial.number: ratios(trial)[0] for trial in trials}
     best = [min(list(found.values())[: at + 1]) for at in range(len(found))]
     line = {"mode": "lines", "name": "best so far", "x": list(found), "y": [significant(value) for value in best]}
     data = [
         line | {"line": {"color": _BEST, "width": 2}},
-        *_marked([(number, number, value) for number, value in found.items()], chosen),
+        *_marked([(number, number, value) for number, value in found.items()], star),
     ]
     layout = layout_of(
         height=420,
@@ -46,7 +50,7 @@ def slices(
     space: Sequence[Parameter],
     default: Mapping[str, Any],
     what: str,
-    chosen: int | None,
+    star: Star | None,
 ) -> Figure:
     """The first objective against each of some settings, a panel each; trial 0 stands at the default value."""
     data: list[Figure] = []
@@ -62,12 +66,12 @@ def slices(
         layout[f"xaxis{tag}"] = axis(parameter.name, type=kind)
         title = f"ratio of {what} to the default" if at == 0 else ""
         layout[f"yaxis{tag}"] = log_axis(title, [1.0, *(y for _, _, y in points)])
-        for trace in _marked(points, chosen):
+        for trace in _marked(points, star):
             data.append(trace | {"xaxis": f"x{tag}", "yaxis": f"y{tag}", "showlegend": at == 0})
     return {"data": data, "layout": layout}
 
 
-def front(trials: Sequence[FrozenTrial], best: set[int], whats: Sequence[str], chosen: int | None) -> Figure:
+def front(trials: Sequence[FrozenTrial], best: set[int], whats: Sequence[str], star: Star | None) -> Figure:
     """The first objective against the second; a line joins the `best`, which no other beats in all."""
     found = {trial.number: ratios(trial)[:2] for trial in trials}
     joined = sorted(found[number] for number in best if number in found)
@@ -81,7 +85,7 @@ def front(trials: Sequence[FrozenTrial], best: set[int], whats: Sequence[str], c
         shapes=[guide(x=1.0), guide(y=1.0)],
     )
     return {
-        "data": [line, *_marked([(key, pair[0], pair[1]) for key, pair in found.items()], chosen)],
+        "data": [line, *_marked([(key, pair[0], pair[1]) for key, pair in found.items()], star)],
         "layout": layout,
     }
 
@@ -107,12 +111,13 @@ def settings_table(
     return Table("settings", "Default, chosen and range", caption, columns, rows)
 
 
-def _marked(points: Sequence[tuple[int, Any, float]], chosen: int | None) -> list[Figure]:
-    """The trials ``(number, x, y)`` as points; the default (trial 0) and the chosen one are marked."""
+def _marked(points: Sequence[tuple[int, Any, float]], star: Star | None) -> list[Figure]:
+    """The trials ``(number, x, y)`` as points; the default (trial 0) and the star are marked."""
+    special, name = star or (0, "")
     kinds = [
-        ("trial", [point for point in points if point[0] not in (0, chosen)], _TRIAL, "circle", 9),
+        ("trial", [point for point in points if point[0] not in (0, special)], _TRIAL, "circle", 9),
         ("default", [point for point in points if point[0] == 0], _DEFAULT, "diamond", 13),
-        ("chosen", [point for point in points if point[0] == chosen and chosen != 0], _CHOSEN, "star", 14),
+        (name, [point for point in points if point[0] == special != 0], _CHOSEN, "star", 14),
     ]
     return [
         {

@@ -111,6 +111,18 @@ def test_settings_are_read_without_scrolling(browser, report):
         assert len(right) == 4 and max(right) <= width, (width, right)
 
 
+def test_the_button_for_the_theme_covers_no_tab(browser, report):
+    for page in PAGES:
+        for width in WIDTHS:
+            open_page(browser, report, page, width)
+            beside = """[one('nav .tabs'), one('nav .theme')].map((each) => each.getBoundingClientRect())
+              .flatMap(({left, right}) => [left, right])"""
+            tabs_left, tabs_right, left, right = browser.run(beside)
+            assert 0 <= tabs_left < tabs_right <= left < right <= width, (page, width)
+            reach = browser.run("(({scrollWidth, clientWidth}) => [scrollWidth, clientWidth])(one('nav'))")
+            assert reach[0] <= reach[1], "the tabs scroll, not the bar"
+
+
 def test_no_word_of_a_figure_stands_outside_of_it(browser, report):
     """Names of sequences below a narrow figure neither run out of it nor over its legend."""
     for width in WIDTHS:

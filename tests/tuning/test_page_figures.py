@@ -1,13 +1,17 @@
 """The study page's figures: ratios instead of logarithms, default and chosen marked, every setting with its range."""
 
 import math
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import FrozenTrial, create_trial
 
 from dynslam_bench.core.settings import Parameter
+from dynslam_bench.tuning.page import _star
 from dynslam_bench.tuning.page_figures import front, history, settings_table, slices
+from dynslam_bench.tuning.summary import StudySummary
 
 SPACE = [
     Parameter("a.threshold", "float", 1.0, 0.1, 10.0, "log", unit="px"),
@@ -33,23 +37,30 @@ def by_name(figure: dict, axis: str = "x") -> dict:
 
 
 def test_axes_are_ratios_and_default_and_chosen_are_marked(trials: list[FrozenTrial]) -> None:
-    shown = by_name(history(trials, "ATE", 1))
+    shown = by_name(history(trials, "ATE", (1, "chosen")))
     assert shown["best so far"]["y"] == [1.0, 0.5, 0.5]
     assert [(shown[name]["x"], shown[name]["y"]) for name in ("default", "chosen", "trial")] == [
         ([0], [1.0]), ([1], [0.5]), ([2], [2.0])
     ]  # fmt: skip
-    assert "ratio of ATE" in history(trials, "ATE", 1)["layout"]["yaxis"]["title"]["text"]
+    assert "ratio of ATE" in history(trials, "ATE", (1, "chosen"))["layout"]["yaxis"]["title"]["text"]
 
 
 def test_every_setting_has_a_panel_of_its_own_scale(trials: list[FrozenTrial]) -> None:
-    figure = slices(trials, SPACE, {"a.threshold": 1.0, "a.mode": "fast"}, "ATE", 1)
+    figure = slices(trials, SPACE, {"a.threshold": 1.0, "a.mode": "fast"}, "ATE", (1, "chosen"))
     assert (figure["layout"]["xaxis"]["type"], figure["layout"]["xaxis2"]["type"]) == ("log", "category")
     assert by_name(figure)["chosen"]["x"] == [3.0] and by_name(figure, "x2")["chosen"]["x"] == ["slow"]
     assert by_name(figure)["default"]["x"] == [1.0] and by_name(figure, "x2")["default"]["x"] == ["fast"]
 
 
+def test_nothing_is_called_chosen_that_was_not(trials: list[FrozenTrial]) -> None:
+    candidates = [SimpleNamespace(trial=1)]
+    kept, taken = (_star(cast(StudySummary, SimpleNamespace(candidates=candidates, chosen=c))) for c in (None, 1))
+    assert (kept, taken) == ((1, "best trial"), (1, "chosen"))
+    assert by_name(history(trials, "ATE", kept))["best trial"]["x"] == [1]
+
+
 def test_the_front_is_drawn(trials: list[FrozenTrial]) -> None:
-    shown = by_name(front(trials, {0, 1}, ["ATE", "time"], 1))
+    shown = by_name(front(trials, {0, 1}, ["ATE", "time"], (1, "chosen")))
     assert shown["front"]["x"] == pytest.approx([0.5, 1.0]) and shown["front"]["y"] == pytest.approx([2.0, 1.0])
 
 
