@@ -59,7 +59,7 @@ def test_bench_has_limits(cli, walk, tmp_path):
     assert code == 3 and json.loads(out)[0]["status"] in ("timeout", "out-of-memory")
 
 
-def test_a_sheet_of_a_stored_run_is_made(cli, walk, tmp_path):
+def test_sheet_and_video_of_a_stored_run_are_made(cli, walk, tmp_path):
     from pathlib import Path
 
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
@@ -70,6 +70,9 @@ def test_a_sheet_of_a_stored_run_is_made(cli, walk, tmp_path):
     assert row["from_store"] is False and (folder / "sheet.png").is_file()
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--sheet", "--json")[1])
     assert row["from_store"] is True
+    assert not (folder / "video.webm").exists()
+    (row,) = json.loads(cli("run", "orb-slam2", walk, "--video", "--json")[1])
+    assert Path(row["folder"]) == folder and (folder / "video.webm").read_bytes().startswith(b"\x1aE\xdf\xa3")
     assert cli("run", "never-move", walk, "--sheet")[0] == 0
     assert "no sheet.png: the tracker offers neither keyframes nor a map" in cli("runs", "show")[1]
     assert json.loads(cli("run", "never-move", walk, "--sheet", "--json")[1])[0]["from_store"] is True
