@@ -86,7 +86,7 @@ class SubprocessSettings(ProgramSettings):
         command, folder = self.words(), Path(self.folder or ".").expanduser()
         if not folder.is_dir():
             raise SettingsError(f"subprocess: no folder {folder}")
-        program = command[0] if os.sep not in command[0] else str(folder / Path(command[0]).expanduser())
+        program = command[0] if os.sep not in command[0] else str((folder / Path(command[0]).expanduser()).absolute())
         if shutil.which(program) is None:
             raise SettingsError(f"subprocess: cannot start '{command[0]}': no such program", "check its path and mode")
 

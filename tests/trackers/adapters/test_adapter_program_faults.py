@@ -13,6 +13,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SettingsError, TrackerError
 from dynslam_bench.trackers import build_tracker
 from dynslam_bench.trackers.adapters.program import files_of_command
+from dynslam_bench.trackers.adapters.settings import SubprocessSettings
 
 FAULTS = {
     "raises": ("raise ValueError('no such camera')", "exit code 1; its last line: 'ValueError: no such camera'"),
@@ -215,3 +216,13 @@ def test_serve_answers_for_a_python_tracker(program):
         tracker.track(frame(2))
     assert tracker.track(frame(3)).state == "ok", "an answered error does not end the program"
     assert len(tracker.finalize()) == 1
+
+
+def test_a_program_in_the_present_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "odometry"
+    program.write_text("#!/bin/sh\nexit 0\n")
+    program.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    SubprocessSettings(command="./odometry").verify()
+    with pytest.raises(SettingsError, match="cannot start 'odometry'"):
+        SubprocessSettings(command="odometry").verify()  # as in a shell: by its path, or on PATH
