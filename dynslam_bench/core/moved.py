@@ -43,7 +43,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """Fill the old module."""
         homes = MOVED[module.__name__]
         room = CONTRACTS if homes[0].startswith(f"{CONTRACTS}.") else homes[0]
-        warn_deprecated(f"'{module.__name__}' has moved", f"import from '{room}'", gone_in=GONE_IN, stacklevel=0)
+        warn_deprecated(f"'{module.__name__}' has moved", f"import from '{room}'", gone_in=GONE_IN)
         for home in reversed(homes):
             found = importlib.import_module(home)
             module.__dict__.update({name: value for name, value in vars(found).items() if not name.startswith("__")})

@@ -12,10 +12,12 @@ from reports_fake_store import add_run, fill
 
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.envs.source import open_frames
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs.frame_row import FrameRow, write_csv
 from dynslam_bench.runs.snapshots import SnapshotWriter
+from dynslam_bench.sequences.part import part_of
 
 sys.path.append(str(Path(__file__).parents[1] / "envs"))
 from envs_toys import write_folder
@@ -47,10 +49,11 @@ def report(tmp_path_factory):
     root = tmp_path_factory.mktemp("browser")
     store = fill(root / "results", seeds=(0, 1))
     place = write_folder(root / "toy", 40)
+    held = part_of(open_frames(str(place), None, None, (0, None), 1), 0).content
     for name, label in (("ours", "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN}"), ("orb-slam2", "ORB-SLAM2 (our back end)")):
         settings = {"features.options": "one long word after the other " * 40, "features.levels": 8}
         run_id = add_run(
-            store, name, "toy", n=40, label=label, place=str(place), lost=(20,), tags=("static",),
+            store, name, "toy", n=40, label=label, place=str(place), content=held, lost=(20,), tags=("static",),
             final_error=0.004, settings=settings,
         )  # fmt: skip
         add_frames(store.folder(run_id), 40)

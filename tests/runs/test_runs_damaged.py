@@ -108,7 +108,8 @@ def test_damaged_metrics_are_taken_again(store: RunStore, content: bytes | None)
     (path,) = [path for path in store.root.glob(f"metrics/*/{BAD}.json") if "tum-rgbd/v1" in path.read_text()]
     swapped = path.read_bytes().replace(BAD.encode(), GOOD.encode())  # those of another run
     path.write_bytes(swapped if content is None else content)
-    assert right["ate_rmse_m"] > 0 and score(store, record).metrics == right
+    assert right["ate_rmse_m"] > 0
+    assert score(store, record).metrics == pytest.approx(right, rel=1e-9), "to the last bits but few"
     assert json.loads(path.read_text())["run_id"] == BAD
 
 
