@@ -163,7 +163,7 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     """Ratios with their intervals, trials in their order, the front, settings against the objective."""
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     whats = [each.what for each in tuner.objectives]
-    star = _star(summary)
+    star = star_of(summary)
     figures: dict[str, dict[str, Any]] = {}
     ratio = _ratio_figure(summary)
     if ratio is not None:
@@ -182,7 +182,7 @@ def _figures(tuner: Tuner, summary: StudySummary) -> dict[str, dict[str, Any]]:
     return figures
 
 
-def _star(summary: StudySummary) -> Star | None:
+def star_of(summary: StudySummary) -> Star | None:
     """The trial that the page is about: the chosen one, else the first candidate; None without any."""
     if not summary.candidates:
         return None

@@ -9,7 +9,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import FrozenTrial, create_trial
 
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.tuning.page import _star
+from dynslam_bench.tuning.page import star_of
 from dynslam_bench.tuning.page_figures import front, history, settings_table, slices
 from dynslam_bench.tuning.summary import StudySummary
 
@@ -54,7 +54,7 @@ def test_every_setting_has_a_panel_of_its_own_scale(trials: list[FrozenTrial]) -
 
 def test_nothing_is_called_chosen_that_was_not(trials: list[FrozenTrial]) -> None:
     candidates = [SimpleNamespace(trial=1)]
-    kept, taken = (_star(cast(StudySummary, SimpleNamespace(candidates=candidates, chosen=c))) for c in (None, 1))
+    kept, taken = (star_of(cast(StudySummary, SimpleNamespace(candidates=candidates, chosen=c))) for c in (None, 1))
     assert (kept, taken) == ((1, "best trial"), (1, "chosen"))
     assert by_name(history(trials, "ATE", kept))["best trial"]["x"] == [1]
 
