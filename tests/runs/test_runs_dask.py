@@ -31,8 +31,9 @@ def test_a_scheduler_that_is_killed_in_the_middle_is_one_clear_line(
     place, store = tmp_path / "scheduler.json", RunStore(tmp_path / "results")
     file = ("--scheduler-file", str(place))
     with start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *file) as scheduler:
+        deadline = time.monotonic() + 300
         while not (place.is_file() and place.read_text()):
-            assert scheduler.poll() is None
+            assert scheduler.poll() is None and time.monotonic() < deadline
             time.sleep(0.02)
         executor = dask_executor(json.loads(place.read_text())["address"])
         private = ("--local-directory", str(tmp_path))
