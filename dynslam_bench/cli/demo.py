@@ -153,7 +153,7 @@ def leaderboard_text(board: Board) -> str:
 
     chosen = get_protocol(DEFAULT_PROTOCOL)
     parts = []
-    for table in (leaderboard(board, chosen), per_sequence(board, chosen)):
+    for table in (leaderboard(board, chosen).displayed(), per_sequence(board, chosen).displayed()):
         rows = [[column.name for column in table.columns]]
         rows += [[f"{cell.text} {cell.small}".strip() for cell in row] for row in table.rows]
         parts.append(f"{table.title}\n{aligned(rows)}")
