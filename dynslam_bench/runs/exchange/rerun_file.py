@@ -121,7 +121,7 @@ def _layout() -> Any:
 def packed(block: Block) -> bytes:
     """A block as the program reads it."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **block)  # type: ignore[arg-type]
+    np.savez(buffer, allow_pickle=False, **block)
     return len(buffer.getvalue()).to_bytes(SIZE_BYTES, "little") + buffer.getvalue()
 
 
