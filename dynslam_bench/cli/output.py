@@ -219,7 +219,7 @@ class _Lines:
         threading.Thread(target=self._run, daemon=True).start()
 
     def told(self, done: float, total: float | None, what: str = "") -> None:
-        share = "" if not total else f" {done:.1f} of {total:.0f}"
+        share = "" if not total else f" {done:.{0 if done == int(done) else 1}f} of {total:.0f}"
         spent = time.monotonic() - self.began
         left = f", about {spent * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
         self.text = f"{share}{left}" + (f" ({what})" if what else "")

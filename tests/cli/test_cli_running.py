@@ -101,6 +101,10 @@ def test_progress_where_nobody_watches(capsys, monkeypatch):
     said = capsys.readouterr().err.splitlines()
     assert len(said) >= 2 and said[0].startswith("3 runs: 1.5 of 3, about ")
     assert "(orb-slam2 on walk, frame 5 of 10)" in said[0]
+    with progress("reading runs") as advance:
+        advance(2.0, 3)
+        time.sleep(0.2)
+    assert capsys.readouterr().err.startswith("reading runs: 2 of 3, about ")
     with progress("nothing"):
         pass
     assert capsys.readouterr().err == ""
