@@ -11,7 +11,6 @@ from typing import Any
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
 from ..model.common import representatives
@@ -20,7 +19,8 @@ from ..model.rows import Loaded, LoadedRun
 from .explore_data import FrameSummary, FrameSums, explore_content, summarise
 from .page import render_run_page
 from .pictures import PictureBook
-from .run_data import MOST_FRAMES, exact_share, read_frames, run_content
+from .run_data import MOST_FRAMES, run_content
+from .run_frames import exact_shares, read_frames
 from .side_files import write_side
 
 RUN_PAGE = "run.html"
@@ -185,8 +185,7 @@ def write_pages(
         told: Called after every run.
     """
     pages = Pages()
-    for run in runs:
-        frames = read_frames(run, share)
+    for run, frames in zip(runs, read_frames(runs, share), strict=True):
         write_side(
             book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth(), most_frames)
         )
@@ -200,11 +199,8 @@ def write_pages(
 
 
 def _shares(loaded: Loaded) -> dict[str, dict[int, float]]:
-    """The exact share of dynamic pixels of every frame, by column, from whichever run has recorded it."""
-    found: dict[str, dict[int, float]] = {}
+    """The exact share of dynamic pixels of every frame, by column, as far as a run has recorded it."""
+    by_column: dict[str, list[LoadedRun]] = {}
     for run in sorted(loaded.runs, key=lambda run: run.record.offset):
-        if run.row.column_id not in found:
-            known = exact_share(run.store.folder(run.row.run_id) / CSV_FILE, run.record.offset)
-            if known:
-                found[run.row.column_id] = known
-    return found
+        by_column.setdefault(run.row.column_id, []).append(run)
+    return {column: exact_shares(runs) for column, runs in by_column.items()}
