@@ -132,18 +132,24 @@ def write_explore(
         ]
     else:
         written = _written(pieces, shown, known, crew, told)
+    sums, total = _summed(pieces, written)
+    pageless = _pageless(len(runs), len(loaded.runs))
+    with_page = {run.row.run_id for run in runs}
+    write_side(output, "explore", explore_content(board, protocol, sums, with_page, total.pictured, pageless))
+    write_atomic(output / RUN_PAGE, render_run_page(title))
+    unseen = f"Frames without a picture: {total.note()}." if total.missing else ""
+    return Explored(len(runs), len(total.pictured), [note for note in (pageless, unseen) if note])
+
+
+def _summed(pieces: Sequence[Sequence[LoadedRun]], written: Sequence[Pages]) -> tuple[FrameSums, Pages]:
+    """What the pages of all pieces say together: sums of the runs' frames, and which pictures there are."""
     sums, total = FrameSums(), Pages()
     for piece, pages in zip(pieces, written, strict=True):
         for run, frames in zip(piece, pages.frames, strict=True):
             sums.add(run.row, frames)
         total.pictured |= pages.pictured
         total.missing += pages.missing
-    pageless = _pageless(len(runs), len(loaded.runs))
-    known = {run.row.run_id for run in runs}
-    write_side(output, "explore", explore_content(board, protocol, sums, known, total.pictured, pageless))
-    write_atomic(output / RUN_PAGE, render_run_page(title))
-    unseen = f"Frames without a picture: {total.note()}." if total.missing else ""
-    return Explored(len(runs), len(total.pictured), [note for note in (pageless, unseen) if note])
+    return sums, total
 
 
 def _written(
