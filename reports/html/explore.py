@@ -132,9 +132,8 @@ def write_explore(
     else:
         written = _written(pieces, shown, known, crew, told)
     sums, total = _summed(pieces, written)
-    pageless = _pageless(len(runs), len(loaded.runs))
-    with_page = {run.row.run_id for run in runs}
-    write_side(output, "explore", explore_content(board, protocol, sums, with_page, total.pictured, pageless))
+    pageless, ids = _pageless(len(runs), len(loaded.runs)), {run.row.run_id for run in runs}
+    write_side(output, "explore", explore_content(board, protocol, sums, ids, total.pictured, pageless))
     write_atomic(output / RUN_PAGE, render_run_page(title))
     unseen = f"Frames without a picture: {total.note()}." if total.missing else ""
     return Explored(len(runs), len(total.pictured), [note for note in (pageless, unseen) if note])
