@@ -105,8 +105,8 @@ class Explore {
   }
 
   head(name, at, column) {
-    const group = column?.sequence?.name ?? "", pieces = name.split(/(?<=[/_])/).flatMap((piece, place) => (place ? [make("wbr"), piece] : [piece]));
-    const label = make("button", { type: "button" }, ...pieces);
+    const group = column?.sequence?.name ?? "";
+    const label = make("button", { type: "button" }, ...breakable(name));
     const head = make("th", { className: at ? "n" : "sticky", scope: "col", title: group }, label);
     label.addEventListener("click", () => {
       const up = this.view.sort !== `${name}:up`;

@@ -9,7 +9,7 @@ const figure = (id, caption) => {
 const show = (id, specification) => { FIGURES[id] = specification; inSight.observe($(id)); };
 const table = (heads, rows, kind = "n") => {
   const made = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((name, at) => make("th", { className: at ? kind : "", scope: "col", textContent: name })))),
-    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? kind : "sticky", textContent: value }))))));
+    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? kind : "sticky" }, ...(at ? [value] : breakable(value))))))));
   return make("div", { className: "scroll", tabIndex: 0 }, made);
 };
 
