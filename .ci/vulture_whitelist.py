@@ -12,6 +12,7 @@ emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measure
 hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
+compile_kernels  # cli.kernels: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
 # called by name: specs name their factories as "module:name"
