@@ -113,7 +113,6 @@ def write_explore(
     typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
     paged = _paged(board, loaded, typical, most_pages)
     shown = (typical | {row.run_id for row in board.rows if row.failed}) & {run.row.run_id for run in paged}
-    shares = _shares(paged)
     runs = sorted(paged, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
     done = 0
 
@@ -124,7 +123,7 @@ def write_explore(
             progress(done, len(runs))
 
     pieces = _pieces(runs, shown)
-    known = [shares.get(piece[0].row.column_id, {}) for piece in pieces]
+    known = _shares(pieces)
     if crew is None:
         book = PictureBook(output, picture_seconds)
         written = [
@@ -227,9 +226,10 @@ def write_pages(
     return pages
 
 
-def _shares(runs: Sequence[LoadedRun]) -> dict[str, dict[int, float]]:
-    """The exact share of dynamic pixels of every frame, by column, as far as a run has recorded it."""
+def _shares(pieces: Sequence[Sequence[LoadedRun]]) -> list[dict[int, float]]:
+    """For each piece the exact share of dynamic pixels of its column's frames, as far as a run has recorded it."""
     by_column: dict[str, list[LoadedRun]] = {}
-    for run in sorted(runs, key=lambda run: run.record.offset):
+    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.record.offset):
         by_column.setdefault(run.row.column_id, []).append(run)
-    return {column: exact_shares(some) for column, some in by_column.items()}
+    known = {column: exact_shares(some) for column, some in by_column.items()}
+    return [known[piece[0].row.column_id] for piece in pieces]
