@@ -18,7 +18,7 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html.explore import write_pages
 from .html.pictures import PictureBook
-from .model.common import common_of
+from .model.common import Tracked, common_of
 from .model.row import RunRow
 from .model.rows import LoadedRun, make_row
 
@@ -64,7 +64,7 @@ class Worker:
 
     def common(self, job: Job) -> list[Any]:
         """Errors of the runs on one sequence on the frames that all of them have; see `common_of`."""
-        return list(common_of(_loaded(job), self._protocol))
+        return list(common_of([Tracked(**each) for each in job["runs"]], self._protocol))
 
 
 def _loaded(job: Job) -> list[LoadedRun]:

@@ -74,7 +74,8 @@ class Pages:
 
     def note(self) -> str:
         """Why some frames have no picture, in words; empty if all have them."""
-        return "; ".join(f"{count} frames: {reason}" for reason, count in self.missing.items())
+        reasons = "; ".join(f"{count} frames: {reason}" for reason, count in self.missing.items())
+        return f"Frames without a picture: {reasons}." if reasons else ""
 
 
 def write_explore(
@@ -132,22 +133,10 @@ def write_explore(
     else:
         written = _written(pieces, shown, known, crew, told)
     sums, total = _summed(pieces, written)
-    pageless, ids = _pageless(len(runs), len(loaded.runs)), {run.row.run_id for run in runs}
-    write_side(output, "explore", explore_content(board, protocol, sums, ids, total.pictured, pageless))
+    pageless, with_page = _pageless(len(runs), len(loaded.runs)), {run.row.run_id for run in runs}
+    write_side(output, "explore", explore_content(board, protocol, sums, with_page, total.pictured, pageless))
     write_atomic(output / RUN_PAGE, render_run_page(title))
-    unseen = f"Frames without a picture: {total.note()}." if total.missing else ""
-    return Explored(len(runs), len(total.pictured), [note for note in (pageless, unseen) if note])
-
-
-def _summed(pieces: Sequence[Sequence[LoadedRun]], written: Sequence[Pages]) -> tuple[FrameSums, Pages]:
-    """What the pages of all pieces say together: sums of the runs' frames, and which pictures there are."""
-    sums, total = FrameSums(), Pages()
-    for piece, pages in zip(pieces, written, strict=True):
-        for run, frames in zip(piece, pages.frames, strict=True):
-            sums.add(run.row, frames)
-        total.pictured |= pages.pictured
-        total.missing += pages.missing
-    return sums, total
+    return Explored(len(runs), len(total.pictured), [note for note in (pageless, total.note()) if note])
 
 
 def _written(
@@ -163,6 +152,17 @@ def _written(
         for piece, share in zip(pieces, shares, strict=True)
     ]
     return [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
+
+
+def _summed(pieces: Sequence[Sequence[LoadedRun]], written: Sequence[Pages]) -> tuple[FrameSums, Pages]:
+    """What all frames say together, and all that was written but the frames."""
+    sums, total = FrameSums(), Pages()
+    for piece, pages in zip(pieces, written, strict=True):
+        for run, frames in zip(piece, pages.frames, strict=True):
+            sums.add(run.row, frames)
+        total.pictured |= pages.pictured
+        total.missing += pages.missing
+    return sums, total
 
 
 def _paged(board: Board, loaded: Loaded, typical: Set[str], most: int) -> list[LoadedRun]:

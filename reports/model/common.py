@@ -2,28 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from statistics import median
+from typing import Any
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.ate import ate_rmse_m
 from dynslam_bench.evaluation.frames import common_frames
 from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.runs.storage.store import RunStore
 
 from .board import Board
 from .crew import Crew, unheard_run
 from .rows import Loaded, LoadedRun
 
 
+@dataclass(frozen=True)
+class Tracked:
+    """What of a run is compared on common frames, small enough for a job.
+
+    Attributes:
+        store: Folder of its results.
+        run_id: Its id.
+        part: Its part of a sequence.
+        key: Its tracker, see `RunRow.variant_key`.
+        ate_m: Its error on all of its own frames.
+    """
+
+    store: str
+    run_id: str
+    part: str
+    key: str
+    ate_m: float
+
+    @classmethod
+    def of(cls, run: LoadedRun) -> Tracked:
+        """What of a run is needed."""
+        row = run.row
+        return cls(
+            str(run.store.root), row.run_id, run.record.sequence.part, row.variant_key, row.metrics["ate_rmse_m"]
+        )
+
+    def trajectory(self, which: str) -> Trajectory | None:
+        """Its trajectory; None if there is none with a pose, or it is damaged."""
+        try:
+            return RunStore(self.store).trajectory(self.run_id, which)
+        except DynslamError:
+            return None
+
+
 def common_errors(
     board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None
 ) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
     """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are."""
-    runs = {name: successful(board, name, loaded) for name in board.sequences}
+    runs = {name: [Tracked.of(run) for run in successful(board, name, loaded)] for name in board.sequences}
     if crew is None:
         answers = [common_of(found, protocol) for found in runs.values()]
     else:
-        jobs = [{"runs": [run.as_job() for run in found]} for found in runs.values()]
+        jobs: list[Mapping[str, Any]] = [{"runs": [asdict(run) for run in found]} for found in runs.values()]
         answers = crew.work("common", jobs, unheard_run)
     errors: dict[tuple[str, str], float] = {}
     frames: dict[str, str] = {}
@@ -39,7 +77,7 @@ def common_errors(
     return errors, frames
 
 
-def common_of(runs: Sequence[LoadedRun], protocol: Protocol) -> tuple[dict[str, float | None], int | None]:
+def common_of(runs: Sequence[Tracked], protocol: Protocol) -> tuple[dict[str, float | None], int | None]:
     """ATE of runs on one sequence on the frames that all of them tracked, by run, and how many those are.
 
     Returns:
@@ -48,19 +86,19 @@ def common_of(runs: Sequence[LoadedRun], protocol: Protocol) -> tuple[dict[str, 
     """
     pairs = [(run, run.trajectory(protocol.trajectory)) for run in runs]
     held = [(run, trajectory) for run, trajectory in pairs if trajectory is not None]
-    if len({run.row.variant_key for run, _ in held}) < 2:
+    if len({run.key for run, _ in held}) < 2:
         return {}, None
     reduced = common_frames([trajectory for _, trajectory in held])
     errors: dict[str, float | None] = {}
     for (run, whole), trajectory in zip(held, reduced, strict=True):
         if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # it is the error that is known
-            errors[run.row.run_id] = run.row.metrics["ate_rmse_m"]
+            errors[run.run_id] = run.ate_m
             continue
-        truth = run.ground_truth()
         try:
-            errors[run.row.run_id] = None if truth is None else ate_rmse_m(trajectory, truth, protocol)
+            truth = RunStore(run.store).ground_truth(run.part)
+            errors[run.run_id] = None if truth is None else ate_rmse_m(trajectory, truth, protocol)
         except DynslamError:
-            errors[run.row.run_id] = None
+            errors[run.run_id] = None
     return errors, len(reduced[0])
 
 

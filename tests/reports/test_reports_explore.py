@@ -3,10 +3,11 @@
 import pandas as pd
 import pytest
 from reports_browser import needs_browser
-from reports_fake_store import fill
-from test_reports_browser import browser, open_page, report, run_of
+from reports_fake_store import add_run, fill
+from test_reports_browser import add_frames, browser, open_page, report, run_of
 
 from dynslam_bench.reports import build_report
+from dynslam_bench.runs.storage.store import RunStore
 
 __all__ = ["browser", "report"]  # fixtures
 
@@ -204,19 +205,16 @@ def test_a_figure_hides_what_is_clicked_and_tells_what_is_pointed_at(browser, re
     assert "real time" in browser.run("one('#speed .tip.on').textContent")
 
 
-def test_figures_name_trackers_as_they_are_called_and_only_those_that_they_show(browser, report):
-    explore(browser, report)
-    browser.until("one('#explore-boxes .legend button') && one('#explore-share .legend button')")
-    names = {
-        browser.run(f"all('#explore-{place} .legend button').map((each) => each.textContent.trim()).join('|')")
-        for place in ("boxes", "share")
-    }
-    assert all("Ours <b>&amp;</b> 'quoted' \N{SNOWMAN}" in each for each in names)
-    dead = "[...row.cells].slice(3).every((cell) => cell.classList.contains('failed') || cell.textContent === '–')"
-    failed = browser.run(
-        f"all('#explore-table tbody tr').filter((row) => {dead}).map((row) => row.cells[0].textContent)"
-    )
-    assert failed and not any(name in each for each in names for name in failed)
+def test_figures_name_trackers_as_they_are_called_and_only_those_that_they_show(browser, tmp_path):
+    store = RunStore(tmp_path / "results")
+    for name, status in (("a <b>&amp;</b> 'quoted' \N{SNOWMAN}", "ok"), ("orb-slam2", "ok"), ("dead", "crashed")):
+        add_frames(store.folder(add_run(store, name, "s/<i>", label=name, n=40, status=status)), 40)
+    explore(browser, build_report(store, tmp_path / "report", picture_seconds=0))
+    for place in ("boxes", "share"):
+        browser.until(f"one('#explore-{place} .legend button')")
+        shown = browser.run(f"all('#explore-{place} .legend button').map((each) => each.textContent.trim())")
+        assert set(shown) == {"a <b>&amp;</b> 'quoted' \N{SNOWMAN}", "orb-slam2"}
+    assert "<i>" in browser.run("one('#explore-boxes svg').textContent")
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):

@@ -6,7 +6,7 @@ const COUNTS = Array.from({ length: 41 }, (_, step) => 2 + step / 4);  // of tic
 const widthOf = (text) => { ruler.font = FONT; return ruler.measureText(text).width; };
 const plain = (text) => String(text ?? "").replace(/<b>|<\/b>/g, "").replace(/&lt;/g, "<").replace(/&gt;/g, ">").replace(/&amp;/g, "&");
 /** The opposite: a name that a figure shows as it stands. */
-const named = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
+const verbatim = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
 const linesOf = (text) => String(text ?? "").split("<br>").map(plain);
 
 function wrapTo(text, room) {
