@@ -20,6 +20,7 @@ from .localisation.first_pose import Before, first_pose
 from .localisation.localised import Localised
 from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
+from .localisation.surroundings import Surroundings
 from .localisation.tracking import MapFit, Tracked, fit_to_map
 from .loop_closing import LoopCloser
 from .mapping.history import History
@@ -55,6 +56,7 @@ class RgbdBackend:
         if self._ready:
             self.mapper.settings = settings
             self.loops.settings = settings
+            self._surroundings.settings = settings
             self._keyframes.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
@@ -75,6 +77,7 @@ class RgbdBackend:
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
         self.loops = LoopCloser(self.world, self.mapper, self.settings, self.seed)
+        self._surroundings = Surroundings(self.world, self.settings)
         self._views = MapViews(self.world)
         self._ready = True
 
@@ -113,20 +116,23 @@ class RgbdBackend:
     def _localise(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised:
         """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
         prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
+        tracked = self.state == "ok"
+        around = self._surroundings.keyframes(self._reference) if tracked else self.world.keyframes
         before = Before(
-            last, prediction, self._reference, self.state == "ok", self.mapper.close_m, self.seed, frame.index
+            last, prediction, self._reference, around, tracked, self.mapper.close_m, self.seed, frame.index
         )
         first = first_pose(self.world, seen, before, self.settings)
         if first is None:
             return self._lost(prediction)
-        fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, self.settings.tracking)
+        points = self._surroundings.points(first.keyframe, first.matches.point)
+        fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, points, self.settings.tracking)
         self.world.visible[fit.in_view] += 1
         if fit.count < self._needed_inliers() or not np.isfinite(fit.estimate.T_cam_world).all():
             found = self._lost(prediction)
         else:
-            tracked = self._accept(frame, seen, fit, last)
-            spent = self._keyframe_if_wanted(frame, tracked, fit)
-            found = replace(self._localised(tracked.T_cam_world, spent), residual_px=fit.estimate.residual_px)
+            taken = self._accept(frame, seen, fit, last)
+            spent = self._keyframe_if_wanted(frame, taken, fit)
+            found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
         return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)
 
     def _needed_inliers(self) -> int:

@@ -25,6 +25,7 @@ from .bundle.pose_graph import Edge, optimise_poses
 from .bundle.with_gtsam import load_gtsam
 from .localisation.observation import Observations
 from .localisation.relocalisation import match_keyframe, ransac_pose
+from .localisation.surroundings import apart
 from .localisation.tracking import Matches, match_map, solve
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
@@ -131,22 +132,9 @@ class LoopCloser:
         self._last_centre = centre.copy()
         self._way[int(self.world.kf_id[slot])] = self._walked
 
-    def _elsewhere(self, slot: int) -> Slots:
-        """Keyframes that are old, and connected with this one over no third."""
-        world = self.world
-        near, _ = world.covisible(slot)
-        connected = np.zeros(world.kf_alive.size, bool)
-        connected[slot] = True
-        connected[near] = True
-        table = world.kf_point[near]
-        further, _ = world.covisible_of(np.unique(table[table >= 0]))
-        connected[further] = True
-        old = world.kf_id <= world.kf_id[slot] - self.settings.loop_closing.away
-        return np.flatnonzero(world.kf_alive & old & ~connected)
-
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
         s = self.settings.loop_closing
-        elsewhere = self._elsewhere(slot)
+        elsewhere = apart(self.world, slot, s.away)
         if not len(elsewhere):
             return None
         rng = stream(self._seed, "loop", int(self.world.kf_id[slot]))

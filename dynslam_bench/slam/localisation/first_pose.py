@@ -22,6 +22,7 @@ from .relocalisation import Relocalised, locate
 from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
 
 Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
 
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
@@ -38,6 +39,7 @@ class Before:
         last: The last tracked frame.
         prediction: World-to-camera pose that the motion model expects.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
+        keyframes: Slots of the keyframes near which the frame may have been taken.
         tracked: Whether the frame before this one was tracked.
         close_m: Depth below which a feature's depth is trusted, metres.
         seed: Of the sequence's random draws.
@@ -47,6 +49,7 @@ class Before:
     last: Tracked
     prediction: Array
     reference: int
+    keyframes: Slots
     tracked: bool
     close_m: float
     seed: int
@@ -60,11 +63,13 @@ class FirstPose:
     Attributes:
         T_cam_world: World-to-camera pose.
         matches: The matches that agree.
+        keyframe: Slot of a keyframe nearby: the one that they are with, or else the last frame's reference.
         relocalised: Whether they are a keyframe's, not the last frame's.
     """
 
     T_cam_world: Array
     matches: Matches
+    keyframe: int
     relocalised: bool
 
 
@@ -86,15 +91,15 @@ def first_pose(world: Map, seen: Observations, before: Before, settings: Backend
         if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
             best = matches, estimate
         if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
-            return _agreed(*best, relocalised=False)
+            return _agreed(*best, before.reference, relocalised=False)
     found = _from_keyframes(world, seen, before, settings, ENOUGH_FIRST // 2 if best is None else best[1].count + 1)
     if found is not None:
-        return _agreed(found.matches, found.estimate, relocalised=True)
-    return None if best is None else _agreed(*best, relocalised=False)
+        return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
+    return None if best is None else _agreed(*best, before.reference, relocalised=False)
 
 
-def _agreed(matches: Matches, estimate: PoseEstimate, *, relocalised: bool) -> FirstPose:
-    return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), relocalised)
+def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool) -> FirstPose:
+    return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), keyframe, relocalised)
 
 
 def _from_last_frame(world: Map, seen: Observations, before: Before, s: TrackingSettings) -> Iterator[Matches]:
@@ -114,7 +119,7 @@ def _from_keyframes(
     s = settings.relocalisation
     rng = stream(before.seed, "relocalisation", before.frame)
     for alike in (False, True) if before.tracked else (True,):
-        keyframes = most_alike(world, world.keyframes, seen, s.searched) if alike else [before.reference]
+        keyframes = most_alike(world, before.keyframes, seen, s.searched) if alike else [before.reference]
         found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
         if found is not None and found.estimate.count >= least:
             return found
