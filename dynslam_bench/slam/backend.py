@@ -248,7 +248,12 @@ class RgbdBackend:
         return self._views.outputs()
 
     def finalize(self) -> Trajectory:
-        """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes."""
+        """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
+
+        With `bundle_adjustment.full` all of the map is refined first.
+        """
+        if self.settings.bundle_adjustment.full:
+            self.mapper.adjust_all()
         stamps, poses, information = self.history.poses(self.world)
         order = np.argsort(stamps, kind="stable")
         fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)

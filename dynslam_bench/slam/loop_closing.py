@@ -22,7 +22,6 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 
 from .bundle.pose_graph import Edge, optimise_poses
-from .bundle.with_gtsam import load_gtsam
 from .localisation.observation import Observations
 from .localisation.relocalisation import match_keyframe, ransac_pose
 from .localisation.surroundings import apart
@@ -76,14 +75,9 @@ class LoopCloser:
         mapper: Fuses and adjusts.
         settings: Of the back end.
         seed: Founds RANSAC's draws.
-
-    Raises:
-        TrackerError: Loops are to be closed, and gtsam is not installed.
     """
 
     def __init__(self, world: Map, mapper: LocalMapper, settings: BackendSettings, seed: int) -> None:
-        if settings.loop_closing.enabled:
-            load_gtsam("backend.loop_closing.enabled")  # better now than at the first loop
         self.world = world
         self.mapper = mapper
         self.settings = settings

@@ -219,6 +219,12 @@ class BundleAdjustmentSettings(Settings):
     iterations: int = tunable(
         3, low=1, high=10, limits=(1, 100), when=ADJUSTED, meaning="Levenberg-Marquardt iterations"
     )
+    full: bool = Field(
+        False,
+        description="whether to refine all keyframes and points together after the last frame; moves the final "
+        "trajectory alone",
+    )
+    full_iterations: int = Field(10, ge=1, le=1000, description="Levenberg-Marquardt iterations of that")
 
 
 class RelocalisationSettings(Settings):
@@ -246,7 +252,7 @@ class RelocalisationSettings(Settings):
 
 
 class LoopClosingSettings(Settings):
-    """Recognising a place that was left, and correcting the drift since; needs gtsam."""
+    """Recognising a place that was left, and correcting the drift since."""
 
     enabled: bool = Field(False, description="whether to close loops")
     away: int = Field(

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from dynslam_bench.features.matching import CellGrid, search_in_radius
 from dynslam_bench.geometry import se3
 
-from ..bundle.schur import BundleProblem, adjust_bundle
+from ..bundle.schur import adjust_bundle
 from ..localisation.observation import Observations
-from ..settings import BackendSettings, BundleAdjustmentSettings
+from ..settings import BackendSettings
+from .bundles import Bundle, around, whole
 from .map import Map
 from .triangulation import triangulate
 
@@ -180,22 +181,28 @@ class LocalMapper:
 
     def adjust(self, slot: int) -> None:
         """Refine the window around a keyframe."""
-        world = self.world
-        chosen = choose_bundle(world, slot, self.settings.bundle_adjustment)
+        settings = self.settings.bundle_adjustment
+        self._refine(around(self.world, slot, settings), settings.iterations)
+
+    def adjust_all(self) -> None:
+        """Refine all keyframes but the oldest, and all points."""
+        self._refine(whole(self.world), self.settings.bundle_adjustment.full_iterations)
+
+    def _refine(self, chosen: Bundle | None, iterations: int) -> None:
         if chosen is None:
             return
-        problem, poses, points, features = chosen
+        world, problem, poses, points = self.world, chosen.problem, chosen.poses, chosen.points
         solver = adjust_bundle
         if self.settings.bundle_adjustment.solver == "gtsam":
             from ..bundle.with_gtsam import adjust_bundle_gtsam as solver
-        result = solver(problem, self.settings.bundle_adjustment.iterations)
+        result = solver(problem, iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
             return
         for k in range(problem.variable):
             world.set_pose(int(poses[k]), result.poses[k])
         world.position[points] = result.points
         out = ~result.inliers
-        world.unobserve(poses[problem.obs_pose[out]], features[out])
+        world.unobserve(poses[problem.obs_pose[out]], chosen.features[out])
         world.refresh(points[world.alive[points]])
 
     # ------------------------------------------------------------------ keyframes
@@ -224,59 +231,3 @@ class LocalMapper:
         heir = int(heirs[0]) if len(heirs) else int(world.keyframes[world.keyframes != slot][-1])
         self.dropped.append((slot, heir, world.kf_pose[slot] @ se3.inverse(world.kf_pose[heir])))
         world.remove_keyframe(slot)
-
-
-def choose_bundle(
-    world: Map, slot: int, settings: BundleAdjustmentSettings
-) -> tuple[BundleProblem, Slots, Slots, Slots] | None:
-    """The local window around a keyframe, cut to the observation budget.
-
-    Variable are the keyframe and its most covisible ones; fixed are further keyframes that see the same points, and
-    always at least one. The oldest keyframe of all is never variable.
-
-    Returns:
-        The problem, the slots of its poses and points, and the feature number of each observation; None if there is
-        nothing to refine.
-    """
-    near, _ = world.covisible(slot)
-    variable = np.concatenate([[slot], near[: settings.window - 1]]).astype(np.int64)
-    variable = variable[world.kf_id[variable] > 0]
-    if not len(variable):
-        return None
-    table = world.kf_point[variable]
-    counts = np.bincount(table[table >= 0].astype(np.int64), minlength=world.alive.size)
-    points = np.flatnonzero(counts)
-    further, _ = world.covisible_of(points)
-    further = further[~np.isin(further, variable)][: settings.fixed]
-    if not len(further):
-        if len(variable) < 2:
-            return None
-        further, variable = variable[-1:], variable[:-1]
-    poses = np.concatenate([variable, further])
-    rank = np.full(world.kf_alive.size, -1, np.int64)
-    rank[poses] = np.arange(len(poses))
-    n_obs = world.n_obs[points]
-    width = int(n_obs.max())
-    valid = np.arange(width)[None] < n_obs[:, None]
-    keyframe = world.obs_kf[points, :width]
-    pose = np.where(valid, rank[keyframe], -1)
-    used = pose >= 0
-    support = used.sum(axis=1)
-    worth = support >= 2
-    points, pose, used, support = points[worth], pose[worth], used[worth], support[worth]
-    order = np.lexsort((world.id[points], -support))  # long tracks first
-    order = order[np.cumsum(support[order]) <= settings.observations]
-    order.sort()
-    points, pose, used = points[order], pose[order], used[order]
-    if not len(points):
-        return None
-    obs_point, column = np.nonzero(used)
-    obs_pose = pose[obs_point, column]
-    features = world.obs_ft[points[obs_point], column].astype(np.int64)
-    at = poses[obs_pose]
-    problem = BundleProblem(
-        world.kf_pose[poses], len(variable), world.position[points], obs_pose.astype(np.int64),
-        obs_point.astype(np.int64), world.kf_xy[at, features], world.kf_right[at, features],
-        world.kf_info[at, features], world.kf_info_right[at, features], world.camera,
-    )  # fmt: skip
-    return problem, poses, points, features
