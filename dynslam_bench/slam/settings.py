@@ -249,6 +249,19 @@ class RelocalisationSettings(Settings):
     min_inliers: int = tunable(
         40, low=15, high=80, limits=(6, 1000), meaning="inliers that a recovered pose needs at least"
     )
+    min_share: float = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="share of a keyframe's own points in view that a frame without prediction must show, too",
+    )
+    new_map_after: int = Field(
+        5,
+        ge=1,
+        le=100000,
+        description="with loop closing: so many frames in a row that show enough but are not recognised begin a map of "
+        "their own; its frames count as lost until a loop joins it to the first one",
+    )
 
 
 class LoopClosingSettings(Settings):

@@ -18,6 +18,7 @@ from ..places import most_alike
 from ..settings import BackendSettings, TrackingSettings
 from .observation import Observations
 from .pose import PoseEstimate
+from .recognition import recognise
 from .relocalisation import Relocalised, locate
 from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
 
@@ -98,6 +99,13 @@ def first_pose(world: Map, seen: Observations, before: Before, settings: Backend
     return None if best is None else _agreed(*best, before.reference, relocalised=False)
 
 
+def _is_there(world: Map, seen: Observations, found: Relocalised, settings: BackendSettings) -> bool:
+    """Whether what was mapped around a keyframe is there: a place may only have something in common with another."""
+    matches = found.matches.select(found.estimate.inliers)
+    place = recognise(world, found.keyframe, seen, matches, found.estimate.T_cam_world, settings.tracking)
+    return place.share >= settings.relocalisation.min_share
+
+
 def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool) -> FirstPose:
     return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), keyframe, relocalised)
 
@@ -121,6 +129,8 @@ def _from_keyframes(
     for alike in (False, True) if before.tracked else (True,):
         keyframes = most_alike(world, before.keyframes, seen, s.searched) if alike else [before.reference]
         found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
-        if found is not None and found.estimate.count >= least:
+        if found is None or found.estimate.count < least:
+            continue
+        if before.tracked or _is_there(world, seen, found, settings):
             return found
     return None

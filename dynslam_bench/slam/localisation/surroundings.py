@@ -35,7 +35,7 @@ class Surroundings:
         self._points: Slots = np.zeros(0, np.int64)
 
     def keyframes(self, reference: int) -> Slots:
-        """Slots of the keyframes where the frame after one with this reference keyframe may show points of, old to new."""
+        """Slots of the keyframes around one, oldest first."""
         self._look_around(reference)
         return self._keyframes
 
@@ -67,7 +67,10 @@ class Surroundings:
 
 
 def apart(world: Map, keyframe: int, away: int) -> Slots:
-    """Slots of the keyframes made `away` before or after one, or longer, and connected with it over no third."""
+    """Slots of the keyframes made `away` before or after one, or longer, and connected with it over no third.
+
+    Those of other islands always are.
+    """
     near, _ = world.covisible(keyframe)
     connected = np.zeros(world.kf_alive.size, bool)
     connected[keyframe] = True
@@ -75,8 +78,8 @@ def apart(world: Map, keyframe: int, away: int) -> Slots:
     table = world.kf_point[near]
     further, _ = world.covisible_of(np.unique(table[table >= 0]))
     connected[further] = True
-    long_ago = np.abs(world.kf_id - world.kf_id[keyframe]) >= away
-    return np.flatnonzero(world.kf_alive & long_ago & ~connected)
+    long_ago = (np.abs(world.kf_id - world.kf_id[keyframe]) >= away) & ~connected
+    return np.flatnonzero(world.kf_alive & (long_ago | (world.kf_island != world.kf_island[keyframe])))
 
 
 def _observed(world: Map, keyframes: Slots) -> Slots:

@@ -44,7 +44,7 @@ class LocalMapper:
         return self.settings.tracking.close_factor * self.world.camera.baseline_m
 
     def insert(
-        self, seen: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float
+        self, seen: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float, island: int = 0
     ) -> tuple[int, dict[str, float]]:
         """Make a frame a keyframe: new points, fusion, bundle adjustment, culling.
 
@@ -54,6 +54,7 @@ class LocalMapper:
             T_cam_world: The frame's pose.
             frame: Index of the frame.
             stamp: Its timestamp.
+            island: The map that it belongs to (`Map.kf_island`).
 
         Returns:
             The keyframe's slot, and the seconds spent on ``mapping`` and ``bundle_adjustment``.
@@ -62,8 +63,8 @@ class LocalMapper:
         world = self.world
         self.merged.clear()
         self.dropped.clear()
-        first = world.keyframe_count == 0
-        slot = world.add_keyframe(seen, T_cam_world, frame, stamp)
+        first = not world.island(island).size
+        slot = world.add_keyframe(seen, T_cam_world, frame, stamp, island)
         features = np.flatnonzero(point >= 0)
         world.observe(slot, features, point[features])
         world.refresh(np.unique(world.kf_point[slot, features][world.kf_point[slot, features] >= 0]).astype(np.int64))
@@ -212,14 +213,16 @@ class LocalMapper:
         neighbours, _ = world.covisible(slot)
         newest = world.keyframes[-2:]
         for other in neighbours.tolist():
-            if world.kf_id[other] == 0 or other in newest:
+            if other in newest or world.kf_id[other] == 0:
                 continue
             total, redundant = world.redundancy(other, self.close_m)
             if total and redundant > s.redundant_share * total:
                 self.drop_keyframe(other)
-        while world.keyframe_count > s.maximum:
+        while world.keyframe_count > s.maximum:  # of an island one stays: its frames hang on it
             shares = []
-            for other in world.keyframes[1:-2].tolist():
+            kept = world.keyframes[1:-2]
+            alone = np.bincount(world.kf_island[world.keyframes])[world.kf_island[kept]] < 2
+            for other in kept[~alone].tolist():
                 total, redundant = world.redundancy(other, self.close_m)
                 shares.append((-redundant / max(total, 1), int(world.kf_id[other]), other))
             self.drop_keyframe(min(shares)[2])
@@ -228,6 +231,9 @@ class LocalMapper:
         """Remove a keyframe; the heirs of its frames are told through `dropped`."""
         world = self.world
         heirs, _ = world.covisible(slot)
-        heir = int(heirs[0]) if len(heirs) else int(world.keyframes[world.keyframes != slot][-1])
+        if not len(heirs):
+            kin = world.island(int(world.kf_island[slot]))
+            heirs = kin[kin != slot][::-1]
+        heir = int(heirs[0])
         self.dropped.append((slot, heir, world.kf_pose[slot] @ se3.inverse(world.kf_pose[heir])))
         world.remove_keyframe(slot)
