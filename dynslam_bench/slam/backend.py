@@ -20,10 +20,12 @@ from .localisation.first_pose import Before, first_pose
 from .localisation.localised import Localised
 from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
+from .localisation.reach import Reach
 from .localisation.surroundings import Surroundings
 from .localisation.tracking import MapFit, Tracked, fit_to_map
 from .loop_closing import LoopCloser
 from .mapping.history import History
+from .mapping.islands import Islands
 from .mapping.keyframes import KeyframeRule
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
@@ -75,11 +77,13 @@ class RgbdBackend:
         self._tracked = False
         self._island = 0
         self._unrecognised = 0
+        self._reach = Reach()
+        self._islands = Islands()
         self._last: Tracked | None = None
         self._motion = CameraMotion()
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
-        self.loops = LoopCloser(self.world, self.mapper, self.settings, self.seed)
+        self.loops = LoopCloser(self.world, self.mapper, self._islands, self.settings, self.seed)
         self._surroundings = Surroundings(self.world, self.settings)
         self._views = MapViews(self.world)
         self._ready = True
@@ -130,10 +134,10 @@ class RgbdBackend:
         """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
         prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
-        before = Before(
-            last, prediction, self._reference, around, self._tracked, self.mapper.close_m, self.seed, frame.index
-        )
-        first = first_pose(self.world, seen, before, self.settings)
+        reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
+        close, island = self.mapper.close_m, None if self._tracked else self._island
+        before = Before(last, prediction, self._reference, around, island, reach, close, self.seed, frame.index)
+        first = first_pose(self.world, self._islands, seen, before, self.settings)
         if first is None:
             return self._lost(frame, seen, prediction)
         points = self._surroundings.points(first.keyframe, first.matches.point)
@@ -153,15 +157,20 @@ class RgbdBackend:
     def _lost(self, frame: FrameBundle, seen: Observations, prediction: Array) -> Localised:
         """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
         self.state = "lost"
+        assert self._last is not None
+        deep = int(np.count_nonzero(seen.z > 0))
+        if self._tracked:
+            self._reach.lost(self._last, deep, MIN_INITIAL)
         self._tracked = False
         self._motion.forget()
-        shows_enough = np.count_nonzero(seen.z > 0) >= MIN_INITIAL
-        self._unrecognised = self._unrecognised + 1 if shows_enough else 0
+        self._unrecognised = self._unrecognised + 1 if deep >= MIN_INITIAL else 0
         if not self.settings.loop_closing.enabled or self._unrecognised < self.settings.relocalisation.new_map_after:
             return self._localised(prediction)
         self._unrecognised = 0
-        self._island = 1 + int(self.world.kf_island.max())
-        return self._begin_map(frame, seen, prediction)
+        reach = self._reach.metres(self._last, frame.timestamp, self.settings.relocalisation)
+        start = self._last.T_cam_world
+        self._island = self._islands.begin(self._island, se3.inverse(start)[:3, 3], reach)
+        return self._begin_map(frame, seen, start)
 
     def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: Tracked) -> Tracked:
         """The frame is tracked: what it sees counts as found, and its pose is weighed against the motion model."""

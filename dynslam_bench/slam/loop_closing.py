@@ -27,6 +27,7 @@ from .localisation.recognition import around, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
 from .localisation.surroundings import apart
 from .localisation.tracking import Matches
+from .mapping.islands import Islands
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
 from .places import likeness
@@ -54,6 +55,7 @@ class Loop:
         frame: Index of that keyframe's frame.
         T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
         inliers: Points that fit it.
+        share: How many of the keyframe's own points in view are among them, of one.
         joins: Whether the place lies on another island of the map.
         moved_m: How far the newest keyframe is from where it was believed to be, metres.
         turned_deg: By how much it is turned, degrees.
@@ -63,6 +65,7 @@ class Loop:
     frame: int
     T_cam_world: Array
     inliers: int
+    share: float
     joins: bool
     moved_m: float
     turned_deg: float
@@ -74,13 +77,15 @@ class LoopCloser:
     Args:
         world: The map.
         mapper: Fuses and adjusts.
+        islands: Where parts of the map may lie that are connected with the first one by nothing.
         settings: Of the back end.
         seed: Founds RANSAC's draws.
     """
 
-    def __init__(self, world: Map, mapper: LocalMapper, settings: BackendSettings, seed: int) -> None:
+    def __init__(self, world: Map, mapper: LocalMapper, islands: Islands, settings: BackendSettings, seed: int) -> None:
         self.world = world
         self.mapper = mapper
+        self.islands = islands
         self.settings = settings
         self.closed: list[Loop] = []
         """All loops that were closed."""
@@ -133,6 +138,8 @@ class LoopCloser:
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
         s = self.settings.loop_closing
         elsewhere = apart(self.world, slot, s.away)
+        there, here = self.world.kf_island[elsewhere], self.world.kf_island[slot]
+        elsewhere = elsewhere[(there == here) | (there == 0) | (here == 0)]
         if not len(elsewhere):
             return None
         rng = stream(self._seed, "loop", int(self.world.kf_id[slot]))
@@ -171,13 +178,20 @@ class LoopCloser:
         moved = float(np.linalg.norm(se3.inverse(T_cam_world)[:3, 3] - world.kf_centre[slot]))
         turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
         back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
-        loop = Loop(candidate, back, T_cam_world, len(place.matches), joins, moved, turned)
-        return loop if self._may_be_drift(loop) else None
+        loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned)
+        return loop if self._believable(slot, loop) else None
 
-    def _may_be_drift(self, loop: Loop) -> bool:
-        s = self.settings.loop_closing
+    def _believable(self, slot: int, loop: Loop) -> bool:
+        """Whether drift explains the correction; where islands meet, whether the camera can have got from one there."""
+        s, world = self.settings.loop_closing, self.world
+        if loop.joins and (loop.inliers < s.join_inliers or loop.share < s.join_share):
+            return False
         if loop.joins:
-            return True
+            here, there = int(world.kf_island[slot]), int(world.kf_island[loop.keyframe])
+            correction = se3.inverse(loop.T_cam_world) @ world.kf_pose[slot]
+            if not here:
+                return self.islands.may_lie(there, se3.inverse(correction))
+            return self.islands.may_lie(here, correction)
         way = self._walked - self._way[int(self.world.kf_id[loop.keyframe])]
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 

@@ -250,10 +250,17 @@ class RelocalisationSettings(Settings):
         40, low=15, high=80, limits=(6, 1000), meaning="inliers that a recovered pose needs at least"
     )
     min_share: float = Field(
-        0.3,
+        0.4,
         ge=0,
         le=1,
         description="share of a keyframe's own points in view that a frame without prediction must show, too",
+    )
+    max_speed: float = Field(
+        2.0,
+        gt=0,
+        le=1000,
+        description="metres a second, at most, that the camera may have moved while it was lost, unless it was put "
+        "elsewhere from one frame to the next: places farther away only look like the one that is recognised",
     )
     new_map_after: int = Field(
         5,
@@ -281,6 +288,10 @@ class LoopClosingSettings(Settings):
     min_share: float = Field(
         0.3, ge=0, le=1, description="share of the candidate's own points in view that must be among them"
     )
+    join_inliers: int = Field(
+        100, ge=10, le=10000, description="the same where two maps would be joined, which no drift bounds"
+    )
+    join_share: float = Field(0.5, ge=0, le=1, description="the same share where two maps would be joined")
     confirmations: int = Field(3, ge=1, le=20, description="keyframes in a row that must agree on the correction")
     drift_share: float = Field(
         0.03,

@@ -44,7 +44,7 @@ def test_a_lap_comes_back_to_where_it_began():
 
 
 def test_corridors_that_look_the_same_are_not_taken_for_one():
-    backend, _, errors = drive(RingWorld(alike=True), 70, closing=True)
+    backend, _, errors = drive(RingWorld(alike=0.5), 70, closing=True)
     assert not backend.loops.closed and errors.max() < 0.2
 
 

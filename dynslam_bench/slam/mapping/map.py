@@ -31,9 +31,9 @@ class Map:
 
     Attributes (keyframes, by slot; F is the largest number of features so far):
         kf_alive, kf_id, kf_island (0 for the map that began first; others began where nothing was recognised),
-        kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count, kf_raw ``[S, F, 2]`` raw pixels,
-        kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave, kf_angle, kf_info,
-        kf_info_right, kf_words ``[S, F, W]``, kf_point ``[S, F]`` (slot of the observed point, -1).
+        kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count, kf_raw
+        ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave,
+        kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``, kf_point ``[S, F]`` (slot of the observed point, -1).
 
     Attributes (points, by slot):
         alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
