@@ -16,7 +16,7 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
-from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
+from .html.explore import MOST_PAGES, PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
 from .html.run_data import MOST_FRAMES
@@ -61,6 +61,7 @@ def build_report(
     rank_seen: bool = False,
     picture_seconds: float = PICTURE_SECONDS,
     most_frames: int = MOST_FRAMES,
+    most_pages: int = MOST_PAGES,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = unheard,
@@ -79,6 +80,7 @@ def build_report(
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
+        most_pages: Runs that have a page of their own, those with the median error of their cell first.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -97,10 +99,10 @@ def build_report(
     with hired as crew:
         loaded = load_runs(stores, protocol, on_progress, crew, reference)
         board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
-        again = command or _command([store.root for store in stores], output, board)
+        again = command or _command([store.root for store in stores], output, board, most_pages)
         explored = write_explore(
             board, loaded, protocol, output, title=title, crew=crew,
-            picture_seconds=picture_seconds, most_frames=most_frames,
+            picture_seconds=picture_seconds, most_frames=most_frames, most_pages=most_pages,
             progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")
@@ -137,11 +139,12 @@ def _drafted(
     return draft
 
 
-def _command(roots: Sequence[Path], output: Path, board: Board) -> str:
+def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int) -> str:
     """The command that makes the report again."""
     words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
     words += ["--on", board.on] if board.on != "common" else []
     words += ["--reference", board.asked_reference] if board.asked_reference else []
+    words += ["--most-pages", str(most_pages)] if most_pages != MOST_PAGES else []
     return shlex.join(words + ["--rank-seen"] * board.rank_seen)
 
 

@@ -16,6 +16,7 @@ from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block as Piece
 from dynslam_bench.reports.html.page import Section, render
 from dynslam_bench.reports.model.row import SEEN
+from dynslam_bench.reports.model.row_values import command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 
 from .blocks import Block, scenes
@@ -80,7 +81,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             (_size(tuner.design.held_out), "held out"),
         ],
         footer=f"Sampler {spec.sampler}, race {spec.race}, Optuna {optuna.__version__}. "
-        f"Reproduce: {' '.join(study.user_attrs.get('command', []))}",
+        f"Reproduce: {command_line(study.user_attrs.get('command', []))}",
     )
     path = tuner.folder / "index.html"
     write_atomic(path, html)

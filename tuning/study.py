@@ -10,7 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -140,7 +140,6 @@ class Tuner:
         """
         if self.reading:
             raise StudyError(f"study '{self.spec.name}' was opened for reading")
-        self._bury_dead_workers()
         self.reference(on_event, jobs)
         deadline = None if self.spec.timeout_s is None else time.monotonic() + self.spec.timeout_s
 
@@ -289,6 +288,7 @@ class Tuner:
     def _more(self) -> bool:
         """Whether another trial is wanted; running ones count, those of dead workers do not."""
         with self._lock:
+            self._bury_dead_workers()
             trials = self.study.get_trials(deepcopy=False)
             counted = [t for t in trials if t.state in DONE and t.user_attrs.get("reason") != CRASHED_WORKER]
             running = [t for t in trials if t.state == TrialState.RUNNING]
@@ -299,8 +299,9 @@ class Tuner:
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             worker = trial.user_attrs.get("worker", "")
             if worker and worker_is_dead(worker):
-                self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
-                self.study.tell(trial.number, state=TrialState.FAIL)
+                with suppress(RuntimeError):  # another worker has buried it meanwhile
+                    self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
+                    self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
     def _open(self, sampler: optuna.samplers.BaseSampler) -> optuna.Study:
         """The stored study, or a new one whose first trial is the default, whatever is enqueued later."""

@@ -66,16 +66,29 @@ def write_table(
     shrink: Sequence[str] = (),
     spare: Sequence[str] = (),
 ) -> None:
-    """Write a table as aligned text, on a terminal no wider than that; where the output is none, it is whole.
+    """Write a table as `write_columns` does.
 
     Args:
         columns: Headings.
         rows: Cells.
+        shrink: As there.
+        spare: As there.
+    """
+    values = zip(*rows, strict=True) if rows else ((),) * len(columns)
+    write_columns(list(zip(columns, values, strict=True)), shrink=shrink, spare=spare)
+
+
+def write_columns(
+    columns: Sequence[tuple[str, Sequence[object]]], *, shrink: Sequence[str] = (), spare: Sequence[str] = ()
+) -> None:
+    """Write a table as aligned text, on a terminal no wider than that; where the output is none, it is whole.
+
+    Args:
+        columns: Headings, each with the cells below it.
         shrink: Columns that are shortened first to fit a terminal, one after the other; then all others.
         spare: Columns that are left out then if it is still too wide, the first one first; a line below names them.
     """
-    named = zip(columns, zip(*rows, strict=True) if rows else ((),) * len(columns), strict=True)
-    cells: list[Sequence[str]] = [[_text(name), *_texts(values)] for name, values in named]
+    cells: list[Sequence[str]] = [[_text(name), *_texts(values)] for name, values in columns]
     left_out: list[str] = []
     if sys.stdout.isatty():
         rows_of_text, left_out = fitted(list(zip(*cells, strict=True)), shrink, spare, _terminal_width())
@@ -98,8 +111,8 @@ def fitted(
 
     Args:
         rows: Cells, the headings first.
-        shrink: As in `write_table`.
-        spare: As in `write_table`; the last columns follow where that is not enough, but the first one always stays.
+        shrink: As in `write_columns`.
+        spare: As in `write_columns`; the last columns follow where that is not enough, but the first one always stays.
         width: Characters of a line.
 
     Returns:
@@ -161,11 +174,8 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _under_each_other(columns: Sequence[Sequence[str]]) -> str:
-    padded = []
-    for column in columns:
-        width = max(map(len, column))
-        padded.append([cell.ljust(width) for cell in column])
-    return "\n".join([line.rstrip() for line in map("  ".join, zip(*padded, strict=True))])
+    line = "  ".join(f"%-{max(map(len, column))}s" for column in columns)
+    return "\n".join([(line % cells).rstrip() for cells in zip(*columns, strict=True)])
 
 
 def write_fields(fields: Mapping[str, object]) -> None:
@@ -209,7 +219,7 @@ class _Lines:
         threading.Thread(target=self._run, daemon=True).start()
 
     def told(self, done: float, total: float | None, what: str = "") -> None:
-        share = "" if not total else f" {done:.1f} of {total:.0f}"
+        share = "" if not total else f" {done:.{0 if done == int(done) else 1}f} of {total:.0f}"
         spent = time.monotonic() - self.began
         left = f", about {spent * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
         self.text = f"{share}{left}" + (f" ({what})" if what else "")

@@ -48,6 +48,7 @@ def make(
     rank_seen: Annotated[
         bool, typer.Option("--rank-seen", help="Rank also where the network behind the masks was trained.")
     ] = False,
+    most_pages: Annotated[int, typer.Option(min=0, help="Runs that have a page of their own.")] = 5000,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     as_json: AsJson = False,
 ) -> None:
@@ -67,6 +68,7 @@ def make(
             title=title,
             on="all" if on == "all" else "common",
             rank_seen=rank_seen,
+            most_pages=most_pages,
             on_progress=advance,
         )
     if as_json:

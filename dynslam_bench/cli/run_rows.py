@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from itertools import product
 from typing import TYPE_CHECKING
 
-from .output import complain, write, write_json, write_table
+from .output import complain, write, write_columns, write_json
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunRecord, RunStore
@@ -55,8 +55,8 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
         return
     names = {name: title for name, title in TITLES.items() if name != "part" or any(row["part"] for row in rows)}
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
-    cells = [[row[name] for name in names] for row in rows]
-    write_table(list(names.values()), cells, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
+    columns = [(title, [row[name] for row in rows]) for name, title in names.items()]
+    write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
 
 
 def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> None:

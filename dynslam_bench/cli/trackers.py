@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,7 +71,7 @@ def info(
         "citation": spec.citation,
         "entry_point": spec.entry_point,
         "install": spec.missing(),
-        "presets": list(spec.presets),
+        "presets": {name: dict(values) for name, values in spec.presets.items()},
         "assumptions": list(spec.assumptions),
         "remarks": spec.remarks,
     }
@@ -80,6 +81,7 @@ def info(
         facts |= {"epipolar_skipped": skipped, "settings": flatten(spec.settings()), "parameters": described}
         write_json({**facts, "reported": numbers})
         return
+    facts["presets"] = [f"{name} ({_assigned(values)})" for name, values in spec.presets.items()]
     if skipped:
         facts["epipolar_skipped"] = [f"{100 * share:.0f} % of {where}" for where, share in skipped.items()]
     write_fields(facts)
@@ -90,6 +92,11 @@ def info(
         write_table(
             ("sequence", "reported metric", "value", "source", "remarks"), [tuple(row.values()) for row in numbers]
         )
+
+
+def _assigned(values: Mapping[str, Any]) -> str:
+    """Settings as ``--set`` takes them."""
+    return ", ".join(f"{name}={value}" for name, value in values.items())
 
 
 def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:

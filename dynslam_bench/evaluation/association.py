@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +50,14 @@ class Association:
     def __len__(self) -> int:
         return len(self.estimate)
 
+    @cached_property
+    def dropped(self) -> int:
+        """Estimated poses that are compared with no true one."""
+        return self.n_estimate - len(np.unique(self.estimate))
+
     def describe(self, max_dt: float) -> str:
         """One line with the measured numbers; empty if nothing was dropped."""
-        dropped = self.n_estimate - len(np.unique(self.estimate))
+        dropped = self.dropped
         if not dropped:
             return ""
         reasons = [

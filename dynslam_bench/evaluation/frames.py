@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ STAMP_TOLERANCE = 1e-3
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
-    """Which input frames ``[N]`` have a pose in the estimate.
+    """Which input frames ``[N]`` have a pose in the estimate; nobody may write into it.
 
     A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some systems write the depth
     image's stamp, and files round.
@@ -25,17 +25,23 @@ def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray
     Raises:
         EvaluationError: The estimate has poses at stamps that are no input frame's.
     """
-    stamps = np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
+    return _tracked(estimate.timestamps.tobytes(), np.asarray(input_timestamps, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _tracked(estimate: bytes, inputs: bytes) -> NDArray[np.bool_]:
+    """`tracked_frames`, once for equal stamps: most runs on one sequence have them."""
+    poses, stamps = np.frombuffer(estimate), np.frombuffer(inputs)
     interval = float(np.median(np.diff(np.sort(stamps)))) if len(stamps) > 1 else 0.0
-    index, _ = associate(stamps, estimate.timestamps, max(interval / 2, STAMP_TOLERANCE), strict=False)
-    if len(index) < len(estimate):
+    index, _ = associate(stamps, poses, max(interval / 2, STAMP_TOLERANCE), strict=False)
+    if len(index) < len(poses):
         raise EvaluationError(
-            f"{len(estimate) - len(index)} of {len(estimate)} estimated poses belong to none of {len(stamps)} "
-            "input frames",
+            f"{len(poses) - len(index)} of {len(poses)} estimated poses belong to none of {len(stamps)} input frames",
             "the estimate has to carry the stamps of the images",
         )
     tracked = np.zeros(len(stamps), dtype=bool)
     tracked[index] = True
+    tracked.flags.writeable = False
     return tracked
 
 

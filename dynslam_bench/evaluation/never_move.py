@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -33,6 +35,13 @@ def never_move(ground_truth: Trajectory, stamps: ArrayLike | None = None, max_dt
         positions = positions[index]
     if not len(positions):
         raise EvaluationError(f"none of {len(ground_truth)} true poses belongs to an input frame")
+    return dict(_errors(positions.tobytes()))
+
+
+@lru_cache(maxsize=8)
+def _errors(where: bytes) -> dict[str, float]:
+    """`never_move` of positions, once for all runs on one sequence."""
+    positions = np.frombuffer(where).reshape(-1, 3)
     constant = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
     first = np.linalg.norm(positions - positions[0], axis=1)
     return {

@@ -58,8 +58,17 @@ def tum_relative_errors(
     kept = pairs[covered[pairs[:, 0]] & covered[pairs[:, 1]]]
     estimated = _relative(estimate.T_world_cam, kept)
     estimated[:, :3, 3] *= scale
-    true = _relative(ground_truth.T_world_cam, nearest[kept])
-    return _errors(kept, estimated @ se3.inverse(true), dropped=len(pairs) - len(kept))
+    back = _true_steps_back(ground_truth.T_world_cam.tobytes(), nearest[kept].tobytes())
+    return _errors(kept, estimated @ back, dropped=len(pairs) - len(kept))
+
+
+@lru_cache(maxsize=8)
+def _true_steps_back(ground_truth: bytes, pairs: bytes) -> Array:
+    """Inverse steps ``[P, 4, 4]`` between true poses, once for all runs on one sequence; nobody may write into it."""
+    steps = _relative(np.frombuffer(ground_truth).reshape(-1, 4, 4), np.frombuffer(pairs, np.intp).reshape(-1, 2))
+    back = se3.inverse(steps)
+    back.flags.writeable = False
+    return back
 
 
 @lru_cache(maxsize=256)

@@ -114,7 +114,8 @@ class _Recorder:
         self._video = VideoWriter(folder, env) if spec.video else None
         self.sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
         title = f"{env.tracker_spec.label} on {env.sequence.id}"
-        self.recording = RecordingWriter(folder / RECORDING_FILE, env.sequence.camera, title) if spec.rrd else None
+        recording = folder / RECORDING_FILE
+        self.recording = RecordingWriter(recording, env.sequence.camera, title, apart=True) if spec.rrd else None
 
     def add(self) -> None:
         self._frames.write()

@@ -11,7 +11,6 @@ from typing import Any
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..model.board import Board
 from ..model.common import representatives
@@ -20,12 +19,16 @@ from ..model.rows import Loaded, LoadedRun
 from .explore_data import FrameSummary, FrameSums, explore_content, summarise
 from .page import render_run_page
 from .pictures import PictureBook
-from .run_data import MOST_FRAMES, exact_share, read_frames, run_content
+from .run_data import MOST_FRAMES, run_content
+from .run_frames import exact_shares, read_frames
 from .side_files import write_side
 
 RUN_PAGE = "run.html"
 PICTURE_SECONDS = 12.0
 """Time that drawing pictures may take of the making of one report; the next one goes on there."""
+
+MOST_PAGES = 5000
+"""Runs that have a page of their own in one report unless something else is asked for."""
 
 Progress = Callable[[int, int], None]
 
@@ -37,12 +40,12 @@ class Explored:
     Attributes:
         pages: Runs that have a page.
         pictured: Runs of which pictures are shown.
-        note: Why some frames have none, in words; empty if all have them.
+        notes: Which runs have no page, and why some frames have no picture, in words.
     """
 
     pages: int
     pictured: int
-    note: str
+    notes: list[str]
 
 
 @dataclass
@@ -83,6 +86,7 @@ def write_explore(
     title: str,
     picture_seconds: float = PICTURE_SECONDS,
     most_frames: int = MOST_FRAMES,
+    most_pages: int = MOST_PAGES,
     progress: Progress | None = None,
     crew: Crew | None = None,
 ) -> Explored:
@@ -98,15 +102,17 @@ def write_explore(
         title: Title of the report.
         picture_seconds: Time that opening sequences and drawing pictures may take.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
+        most_pages: Runs that have a page, those with the median error of their cell first.
         progress: Told of the runs that are done, and of all.
         crew: Helpers that write the pages; None to write them here.
 
     Raises:
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
-    shown = _pictured(board, loaded)
-    shares = _shares(loaded)
-    runs = sorted(loaded.runs, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
+    typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
+    paged = _paged(board, loaded, typical, most_pages)
+    shown = (typical | {row.run_id for row in board.rows if row.failed}) & {run.row.run_id for run in paged}
+    runs = sorted(paged, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
     done = 0
 
     def told(count: int, _what: str) -> None:
@@ -116,7 +122,7 @@ def write_explore(
             progress(done, len(runs))
 
     pieces = _pieces(runs, shown)
-    known = [shares.get(piece[0].row.column_id, {}) for piece in pieces]
+    known = _shares(pieces)
     if crew is None:
         book = PictureBook(output, picture_seconds)
         written = [
@@ -125,15 +131,23 @@ def write_explore(
         ]
     else:
         written = _written(pieces, shown, known, crew, told)
+    sums, total = _summed(pieces, written)
+    pageless, ids = _pageless(len(runs), len(loaded.runs)), {run.row.run_id for run in runs}
+    write_side(output, "explore", explore_content(board, protocol, sums, ids, total.pictured, pageless))
+    write_atomic(output / RUN_PAGE, render_run_page(title))
+    unseen = f"Frames without a picture: {total.note()}." if total.missing else ""
+    return Explored(len(runs), len(total.pictured), [note for note in (pageless, unseen) if note])
+
+
+def _summed(pieces: Sequence[Sequence[LoadedRun]], written: Sequence[Pages]) -> tuple[FrameSums, Pages]:
+    """What the pages of all pieces say together: sums of the runs' frames, and which pictures there are."""
     sums, total = FrameSums(), Pages()
     for piece, pages in zip(pieces, written, strict=True):
         for run, frames in zip(piece, pages.frames, strict=True):
             sums.add(run.row, frames)
         total.pictured |= pages.pictured
         total.missing += pages.missing
-    write_side(output, "explore", explore_content(board, protocol, sums, total.pictured))
-    write_atomic(output / RUN_PAGE, render_run_page(title))
-    return Explored(len(runs), len(total.pictured), total.note())
+    return sums, total
 
 
 def _written(
@@ -151,10 +165,24 @@ def _written(
     return [Pages.of(answer) for answer in crew.work("pages", jobs, told)]
 
 
-def _pictured(board: Board, loaded: Loaded) -> set[str]:
-    """The runs of which pictures are shown: those with the median error of their cell, and those that failed."""
-    typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
-    return typical | {row.run_id for row in board.rows if row.failed}
+def _paged(board: Board, loaded: Loaded, typical: Set[str], most: int) -> list[LoadedRun]:
+    """The runs that have a page: the typical one of every cell, then its first, its second, ... repeat."""
+    if len(loaded.runs) <= most:
+        return loaded.runs
+    cells = [cell.rows for cells in board.cells.values() for cell in cells.values()]
+    turn = {row.run_id: at for rows in cells for at, row in enumerate(rows)} | dict.fromkeys(typical, -1)
+    return sorted(loaded.runs, key=lambda run: turn[run.row.run_id])[:most]
+
+
+def _pageless(pages: int, runs: int) -> str:
+    """Which runs have no page, in words; empty if all have one."""
+    if pages == runs:
+        return ""
+    return (
+        f"{runs - pages} of {runs} runs have no page of their own, and their frames stand in no figure: pages are made "
+        f"of {pages}, those with the median error of their cell first (`report --most-pages {runs}` makes all). "
+        "Every number of the tables counts all runs."
+    )
 
 
 def _pieces(runs: Sequence[LoadedRun], shown: Collection[str]) -> list[list[LoadedRun]]:
@@ -185,8 +213,7 @@ def write_pages(
         told: Called after every run.
     """
     pages = Pages()
-    for run in runs:
-        frames = read_frames(run, share)
+    for run, frames in zip(runs, read_frames(runs, share), strict=True):
         write_side(
             book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth(), most_frames)
         )
@@ -199,12 +226,10 @@ def write_pages(
     return pages
 
 
-def _shares(loaded: Loaded) -> dict[str, dict[int, float]]:
-    """The exact share of dynamic pixels of every frame, by column, from whichever run has recorded it."""
-    found: dict[str, dict[int, float]] = {}
-    for run in sorted(loaded.runs, key=lambda run: run.record.offset):
-        if run.row.column_id not in found:
-            known = exact_share(run.store.folder(run.row.run_id) / CSV_FILE, run.record.offset)
-            if known:
-                found[run.row.column_id] = known
-    return found
+def _shares(pieces: Sequence[Sequence[LoadedRun]]) -> list[dict[int, float]]:
+    """For each piece the exact share of dynamic pixels of its column's frames, as far as a run has recorded it."""
+    by_column: dict[str, list[LoadedRun]] = {}
+    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.record.offset):
+        by_column.setdefault(run.row.column_id, []).append(run)
+    known = {column: exact_shares(some) for column, some in by_column.items()}
+    return [known[piece[0].row.column_id] for piece in pieces]

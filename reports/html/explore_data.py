@@ -87,14 +87,23 @@ class FrameSums:
         return found
 
 
-def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured: Collection[str]) -> dict[str, Any]:
+def explore_content(
+    board: Board,
+    protocol: Protocol,
+    sums: FrameSums,
+    paged: Collection[str],
+    pictured: Collection[str],
+    pageless: str = "",
+) -> dict[str, Any]:
     """What ``data/explore.js`` holds.
 
     Args:
         board: The board.
         protocol: How errors were computed.
         sums: What the frames say.
-        pictured: Ids of the runs that have pictures.
+        paged: Ids of the runs that have a page.
+        pictured: Ids of those that have pictures.
+        pageless: Which runs have no page, in words.
     """
     keys = [*board.trackers, *board.final_only]
     place = {key: at for at, key in enumerate(keys)}
@@ -106,7 +115,7 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
     for row in sorted(board.rows, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
         values = [significant(_value(row, metric), 5) for metric in metrics]
         flags = (row.run_id in kept) + 2 * (row.run_id in pictured) + 4 * (not row.rotation_reliable)
-        flags += 8 * (row.seen_in_training and not board.rank_seen)
+        flags += 8 * (row.seen_in_training and not board.rank_seen) + 16 * (row.run_id not in paged)
         five = sums.quartiles.get(row.run_id)
         where = [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat]
         runs.append([*where, row.ending, flags, values, five or []])
@@ -116,6 +125,7 @@ def explore_content(board: Board, protocol: Protocol, sums: FrameSums, pictured:
     return {
         "protocol": protocol.describe(),
         "seen": SEEN,
+        "pageless": pageless,
         "reference": None if board.reference is None else place[board.reference],
         "referenceName": board.reference_name,
         "metrics": metrics,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -132,8 +133,8 @@ def _joined(names: Sequence[str]) -> Markup:
 
 
 def _breakable(name: str) -> Markup:
-    """A heading that may be broken behind its underlines and slashes."""
-    return Markup(str(escape(name)).replace("_", "_<wbr>").replace("/", "/<wbr>"))
+    """A name that may be broken behind its dots, underlines and slashes."""
+    return Markup(re.sub(r"(?<=[/_.])(?=.)", "<wbr>", str(escape(name))))
 
 
 @cache

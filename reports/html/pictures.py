@@ -22,7 +22,7 @@ from dynslam_bench.runs.snapshots import Snapshot, read_snapshots, spread
 
 from ..figures.style import significant
 from ..model.rows import LoadedRun
-from .run_data import RunFrames
+from .run_frames import RunFrames
 from .side_files import write_side
 
 FOLDER = "frames"

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.evaluate import pose_errors
 from dynslam_bench.evaluation.protocol import Protocol, RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.runs.frame_row import CSV_FILE
 
 from ..figures.sequence import broken
 from ..figures.style import significant
 from ..model.missing import run_command
 from ..model.rows import LoadedRun
+from .run_frames import COUNTS, RunFrames
 from .side_files import packed_rows
 
 Array = NDArray[np.float64]
@@ -30,92 +26,6 @@ Array = NDArray[np.float64]
 MOST_FRAMES = 400
 """Frames of a run that its page shows unless something else is asked for."""
 _LOG_BYTES = 20_000
-_COUNTS = ("keypoints", "culled", "matches", "inliers")
-_STATS = {f"stat_{name}" for name in (*_COUNTS, "mask_fraction")}
-_NEEDED = {"index", "timestamp", "state", "frame_error_trans_m"}
-
-
-@dataclass(frozen=True, eq=False)
-class RunFrames:
-    """The frames of a run.
-
-    Attributes:
-        columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an imported trajectory.
-        share: Share of the pixels that show people ``[N]``, nan where it is not known.
-        share_source: Where that comes from, in words; empty where nothing is known.
-        fault: Why there are no frames though there is a table; empty otherwise.
-    """
-
-    columns: dict[str, NDArray[Any]]
-    share: Array
-    share_source: str
-    fault: str = ""
-
-    def __len__(self) -> int:
-        return len(self.share)
-
-    @property
-    def errors_m(self) -> Array:
-        """Frame-to-frame translational errors ``[N]`` in metres, nan where there is none."""
-        return np.asarray(self.columns["frame_error_trans_m"], dtype=np.float64)
-
-
-def read_frames(run: LoadedRun, exact: Mapping[int, float]) -> RunFrames:
-    """The frames of a run with the share of dynamic pixels: the exact one if it is known, else by its own masks.
-
-    Args:
-        run: The run.
-        exact: Frame in the numbering of the run's part without offset to the exact share.
-    """
-    path = run.store.folder(run.row.run_id) / CSV_FILE
-    if not path.is_file() or not path.stat().st_size:
-        return RunFrames({}, np.zeros(0), "")
-    try:
-        table = _read(path, _is_shown)
-    except RunError as error:
-        return RunFrames({}, np.zeros(0), "", str(error))
-    columns = {str(name): table[name].to_numpy() for name in table}
-    if exact:
-        share = np.array([exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()])
-        return RunFrames(columns, share, "exact masks")
-    own = columns.get("stat_mask_fraction")
-    if own is not None:
-        return RunFrames(columns, own.astype(np.float64), "the tracker's own masks")
-    return RunFrames(columns, np.full(len(table), np.nan), "")
-
-
-def _is_shown(name: str) -> bool:
-    """Whether the page shows a column of ``frames.csv``."""
-    return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
-
-
-def _read(path: Path, wanted: Callable[[str], bool]) -> pd.DataFrame:
-    """Columns of a ``frames.csv``: numbers, and the state in words.
-
-    Raises:
-        RunError: It holds no frames, or something else than numbers.
-    """
-    kinds: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
-    try:
-        table = pd.read_csv(path, usecols=wanted, dtype=kinds)
-    except (ValueError, OverflowError, OSError) as error:
-        raise RunError(f"{CSV_FILE} is damaged: {error}") from error
-    needed = [name for name in _NEEDED if wanted(name)]
-    if not len(table) or not set(needed) <= set(table):
-        raise RunError(f"{CSV_FILE} holds no frames")
-    if not np.isfinite(table.get("timestamp", 0.0)).all():
-        raise RunError(f"{CSV_FILE} is damaged: not every frame has a stamp")
-    return table
-
-
-def exact_share(path: Path, offset: int) -> dict[int, float]:
-    """Frame (before the offset) to its exact share of dynamic pixels, of a ``frames.csv`` that knows it; else empty."""
-    try:
-        table = _read(path, {"index", "dynamic_share"}.__contains__)
-    except RunError:  # the page of that run says so
-        return {}
-    known = table.dropna() if "dynamic_share" in table else table.iloc[:0]
-    return {index + offset: share for index, share in known.itertuples(index=False)}
 
 
 def run_content(
@@ -204,7 +114,7 @@ def _series(frames: RunFrames, most: int) -> dict[str, Any]:
     step = -(-len(frames) // most)
     stamps, start = columns["timestamp"], float(columns["timestamp"][0])
     stages = [name for name in columns if name.endswith("_s") and name not in ("total_s", "read_s")]
-    counts = [name for name in _COUNTS if f"stat_{name}" in columns]
+    counts = [name for name in COUNTS if f"stat_{name}" in columns]
     rows = [stamps - start, 1000 * frames.errors_m, 100 * frames.share]
     rows += [columns[f"stat_{name}"] for name in counts] + [1000 * columns[name] for name in stages]
     t, error, share, *others = packed_rows([np.asarray(row, dtype=np.float64)[::step] for row in rows])

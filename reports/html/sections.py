@@ -68,8 +68,7 @@ def _leaderboard_notes(board: Board, loaded: Loaded) -> list[str]:
 def add_explore(draft: Draft, explored: Explored) -> None:
     """The table that leads to every run."""
     section = Section("explore", "Explore", "Explore", blocks=[Block("explore")])
-    if explored.note:
-        section.notes.append(f"Frames without a picture: {explored.note}.")
+    section.notes += explored.notes
     draft.add(section)
 
 

@@ -48,6 +48,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     metrics = sorted({name for row in rows for name in row.metrics})
     kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
     kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "Float64")
+    own_names = [name for name in kinds if name not in set(metrics)]
     lines = []
     for row in ordered:
         own: dict[str, Any] = {
@@ -55,6 +56,6 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
             "sequence": columns[row.column_id],
             "settings": "; ".join(f"{name}={value}" for name, value in row.variant.items()),
         }
-        values = {name: own[name] if name in own else getattr(row, name) for name in kinds if name not in metrics}
+        values = {name: own[name] if name in own else getattr(row, name) for name in own_names}
         lines.append(values | {name: row.metrics.get(name) for name in metrics})
     return pd.DataFrame(lines, columns=list(kinds)).astype(kinds)

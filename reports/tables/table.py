@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -127,9 +129,14 @@ class Table:
 
     def frame(self) -> pd.DataFrame:
         """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
-        pairs = zip(self.values.items(), self.shown.items(), strict=True)
-        columns = [values.astype(object).where(values.notna(), shown.map(_words)) for (_, values), (_, shown) in pairs]
-        return pd.concat(columns, axis=1)
+        columns = [
+            [
+                _words(cell) if value is pd.NA else value
+                for value, cell in zip(values.astype(object), shown, strict=True)
+            ]
+            for (_, values), (_, shown) in zip(self.values.items(), self.shown.items(), strict=True)
+        ]
+        return pd.DataFrame(list(zip(*columns, strict=True)), columns=self.values.columns, dtype=object)
 
     def displayed(self) -> Table:
         """The table as pages, Markdown and LaTeX show it: without columns in which nothing is written; CSV has all."""
@@ -175,9 +182,12 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
-    safe = frame.astype(object).map(_harmless)
-    safe.columns = pd.Index([_harmless(name) for name in frame.columns])
-    return str(safe.to_csv(index=False, lineterminator="\n"))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(map(_harmless, frame.columns))
+    columns = [[_harmless(value) for value in values.astype(object)] for _, values in frame.items()]
+    writer.writerows(zip(*columns, strict=True))
+    return text.getvalue()
 
 
 def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
@@ -227,5 +237,5 @@ def _words(cell: TableCell) -> str:
 
 def _harmless(value: object) -> object:
     if not isinstance(value, str):
-        return value
+        return None if value is pd.NA or value != value else value
     return ("'" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else "") + printable(value)

@@ -93,6 +93,12 @@ def test_info_tells_a_program_what_it_may_set(cli):
     }
 
 
+def test_info_says_what_a_preset_sets(cli):
+    assert "fast (segmentation.schedule=every_nth, segmentation.n=3)" in cli("trackers", "info", "mask-rcnn")[1]
+    facts = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])
+    assert facts["presets"] == {"fast": {"segmentation.schedule": "every_nth", "segmentation.n": 3}}
+
+
 def test_progress_where_nobody_watches(capsys, monkeypatch):
     monkeypatch.setattr(output, "HEARTBEAT_S", 0.05)
     with progress("3 runs") as advance:
@@ -101,6 +107,10 @@ def test_progress_where_nobody_watches(capsys, monkeypatch):
     said = capsys.readouterr().err.splitlines()
     assert len(said) >= 2 and said[0].startswith("3 runs: 1.5 of 3, about ")
     assert "(orb-slam2 on walk, frame 5 of 10)" in said[0]
+    with progress("reading runs") as advance:
+        advance(2.0, 3)
+        time.sleep(0.2)
+    assert capsys.readouterr().err.startswith("reading runs: 2 of 3, about ")
     with progress("nothing"):
         pass
     assert capsys.readouterr().err == ""

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pandas as pd
 import plotly.graph_objects as go
 import pytest
-from notebooks import NOTEBOOKS, cells, play
+from notebooks import NOTEBOOKS, cells, play, play_in_a_kernel
 
 SHORTER = {
     "leaderboard": {"FRAMES = 60": "FRAMES = 4", "range(100, 106)": "range(100, 102)", ', "mask-rcnn"': ""},
     "culling": {},
+    "study": {"FRAMES, ROOMS, TRIALS = 40, 6, 12": "FRAMES, ROOMS, TRIALS = 8, 1, 2"},
 }
+IN_A_KERNEL = {
+    "leaderboard": ["ranks", "error over the error of not moving", "droid-w/v1"],
+    "culling": ["epipolar_f_judged", "distance to the epipolar line", "precision 70%, recall 35%"],
+    "study": ["features.fast_threshold", "params.backend.tracking.map_radius_px", "default"],
+}
+"""What the outputs of a notebook hold, from its first cells to its last one."""
 
 
 def test_there_are_three() -> None:
-    assert {notebook.stem for notebook in NOTEBOOKS} == {*SHORTER, "study"}
+    assert {notebook.stem for notebook in NOTEBOOKS} == set(SHORTER) == set(IN_A_KERNEL)
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
@@ -43,3 +51,12 @@ def test_the_anatomy_of_culling(capsys: pytest.CaptureFixture[str]) -> None:
     assert distances["median distance on people, px"] > 1.5 * distances["median distance in the room, px"]
     assert all(isinstance(each, go.Figure) for each in (flow, histogram, culled))
     assert "precision 70%, recall 35%" in capsys.readouterr().out, "the text speaks of these"
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
+def test_they_run_in_a_jupyter_kernel(notebook: Path, tmp_path: Path) -> None:
+    pytest.importorskip("nbclient", reason="nbclient is not installed")
+    pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+    outputs = play_in_a_kernel(notebook, tmp_path, SHORTER[notebook.stem])
+    shown = json.dumps([{name: output.get(name) for name in ("text", "data")} for output in outputs])
+    assert [text for text in IN_A_KERNEL[notebook.stem] if text not in shown] == []

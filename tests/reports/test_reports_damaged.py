@@ -10,7 +10,7 @@ from test_reports_browser import add_frames
 from dynslam_bench.reports import build_report
 from dynslam_bench.reports.figures.leaderboard import mask_figure, repeat_figure
 from dynslam_bench.reports.figures.style import log_axis
-from dynslam_bench.reports.html.run_data import exact_share
+from dynslam_bench.reports.html.run_frames import read_tables
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.runs import repeatability
@@ -49,10 +49,29 @@ def test_a_damaged_table_of_frames_costs_only_its_own_figures(store, tmp_path, d
     hurt, other = store.ids()[:2]
     path = store.folder(hurt) / "frames.csv"
     path.write_bytes(DAMAGE[damage])
-    assert len(exact_share(path, 0)) <= 1 and len(exact_share(store.folder(other) / "frames.csv", 0)) == 40
     paths = build_report(store, tmp_path / "report", picture_seconds=0)
     assert any("frames.csv" in note for note in page_of(paths, hurt)["notes"])
     assert page_of(paths, hurt)["frames"] == {} and page_of(paths, other)["frames"]["count"] == 40
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_tables_read_together_are_what_each_of_them_is(tmp_path, damage):
+    rows = [f"{at},{1000 + at / 30:.6f},ok,{0.001 * at},0.25" for at in range(30)]
+    whole = HEAD + "\n".join(rows).encode() + b"\n"
+    shapes = {
+        "whole": whole, "hurt": DAMAGE[damage], "short": HEAD + b"7,1000.0,lost,,\n", "cut off": whole[:-20],
+        "blank line": whole.replace(b"\n9,", b"\n\n9,"), "quoted": whole.replace(b",ok,", b',"o,\nk",'),
+        "hurt alike": HEAD + DAMAGE[damage].removeprefix(HEAD), "empty": b"", "again": whole,
+    }  # fmt: skip
+    paths = [tmp_path / name for name in [*shapes, "missing"]]
+    for path in paths[:-1]:
+        path.write_bytes(shapes[path.name])
+    known = {"index", "timestamp", "state", "frame_error_trans_m", "dynamic_share"}.__contains__
+    for order in (paths, paths[::-1], paths[1:], [paths[0], paths[2], paths[-2]]):
+        together = list(read_tables(order, known))
+        alone = [next(read_tables([path], known)) for path in order]
+        assert [repr(found) for found in together] == [repr(found) for found in alone]
+    assert len(together[0]["index"]) == len(together[2]["index"]) == 30 and together[1]["state"].tolist() == ["lost"]
 
 
 def test_what_is_left_out_is_named(store, tmp_path):

@@ -3,7 +3,10 @@
 import pandas as pd
 import pytest
 from reports_browser import needs_browser
+from reports_fake_store import fill
 from test_reports_browser import browser, open_page, report, run_of
+
+from dynslam_bench.reports import build_report
 
 __all__ = ["browser", "report"]  # fixtures
 
@@ -212,6 +215,23 @@ def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
     browser.until("one('main .note')")
     victim.write_text(kept)
     assert "is missing beside this page" in browser.run("one('main .note').textContent")
+
+
+def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):
+    store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"], seeds=(0, 1))
+    paths = build_report(store, tmp_path / "report", most_pages=6, picture_seconds=0)
+    pages = {path.stem.removeprefix("run-") for path in (tmp_path / "report" / "data").glob("run-*.js")}
+    text = paths.markdown.read_text()
+    assert len(pages) == 6 < len(store.ids()) and f"{len(store.ids()) - 6} of {len(store.ids())} runs have no" in text
+    assert "--most-pages 6" in paths.html.read_text() and len(pd.read_csv(paths.csv["runs"])) == len(store.ids())
+    explore(browser, paths)
+    linked = set(browser.run("all('#explore-table a').map((link) => link.hash.slice(1))"))
+    assert linked and linked <= pages  # the typical run of every cell comes first
+    (pageless, *_) = sorted(set(store.ids()) - pages)
+    browser.open(paths.run, anchor=f"#{pageless}")
+    browser.until("one('#run .note')")
+    said = browser.run("one('#run .note').textContent")
+    assert f"Run {pageless} has no page here" in said and "--most-pages" in said
 
 
 def test_print_shows_all(browser, report, tmp_path):

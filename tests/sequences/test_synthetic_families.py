@@ -156,7 +156,7 @@ class TestRollingShutter:
         for row in (0, 121, 300, 479):
             still = scene.snapshot_from(poses[row], index / 30)
             view = View(still, poses[row][None], scene.scale)
-            alone = renderer._geometry(view, renderer._tiles(view))[1]
+            alone = renderer._geometry(*renderer._tiles(view))[1]
             assert np.abs(alone[row] - depth[row]).max() < 1e-9
 
     def test_flow_ends_where_the_other_frames_rows_see_the_point(self) -> None:

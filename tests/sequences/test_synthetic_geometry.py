@@ -90,7 +90,7 @@ def test_hits_lie_on_their_surfaces(walking) -> None:
     renderer, scene = walking.renderer, walking.scene
     view = view_of(scene, 90)
     snap = view.middle
-    hit, depth = renderer._geometry(view, renderer._tiles(view))
+    hit, depth = renderer._geometry(*renderer._tiles(view))
     points = CAMERA.unproject(np.stack([U, V], -1), depth)[::3, ::3].reshape(-1, 3)
     keys = hit[::3, ::3].ravel()
     assert (keys >= 0).all()

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import math
+import socket
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import optuna
 import pytest
-from optuna.trial import TrialState, create_trial
+from optuna.trial import FrozenTrial, TrialState, create_trial
 from simulated import SimulatedTuner, make_spec, nothing, valley
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import finish, race
 from dynslam_bench.tuning.objectives import ACCURACY
+from dynslam_bench.tuning.study import CRASHED_WORKER, StudyEvent
 from dynslam_bench.tuning.trials import errors_of
 
 
@@ -126,6 +133,38 @@ def test_eight_workers_and_a_resume_repeat_no_trial(tmp_path: Path) -> None:
     drawn = [tuple(sorted(trial.params.items())) for trial in study.get_trials()]
     assert len(set(drawn)) == len(drawn) == 40
     assert drawn[0] == (("gain", 1.5), ("wobble", 2)), "the default, once"
+
+
+def test_survivors_make_the_trials_of_a_worker_that_dies_beside_them(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    tuner, other = (SimulatedTuner(make_spec(trials=6), tmp_path, in_memory=False) for _ in range(2))
+
+    def dies_later(event: StudyEvent) -> None:
+        if event.kind == "finished" and event.number == 2:
+            other.study.ask().set_user_attr("worker", f"{socket.gethostname()}:{ended.pid}")
+
+    reasons = [trial.user_attrs.get("reason") for trial in tuner.run(on_event=dies_later).get_trials()]
+    assert (len(reasons), reasons.count(CRASHED_WORKER)) == (7, 1)
+
+
+def test_workers_may_bury_the_same_trial_at_the_same_time(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    tuner, other = (SimulatedTuner(make_spec(trials=3), tmp_path, in_memory=False) for _ in range(2))
+    lost = other.study.ask()
+    lost.set_user_attr("worker", f"{socket.gethostname()}:{ended.pid}")
+    seen = tuner.study.get_trials
+
+    def then_the_other_is_quicker(*given: Any, **how: Any) -> list[FrozenTrial]:
+        found = seen(*given, **how)
+        with suppress(ValueError):  # it has done so before
+            other.study.tell(lost, state=TrialState.FAIL)
+        return found
+
+    with patch.object(tuner.study, "get_trials", then_the_other_is_quicker):
+        tuner.run()
+    assert [trial.state for trial in tuner.study.get_trials()].count(TrialState.FAIL) == 1
 
 
 def test_one_worker_makes_the_same_trials_again(tmp_path: Path) -> None:

@@ -182,8 +182,10 @@ def test_a_study_is_a_frame_and_its_page_tells_what_holds_up(folders: list[str],
     spec = StudySpec.model_validate(values | {"race": "none", "min_coverage": 0.5, "recorded": []})
     tuner = run_study(spec, results=tmp_path)
     summary = finish(tuner)
+    tuner.study.set_user_attr("command", ["/home/x/venv/bin/dynslam-bench", "tune", "run", "my study.toml"])
     page = write_page(tuner, summary).read_text()
     assert summary.verdict in page.replace("&#39;", "'")
+    assert "Reproduce: dynslam-bench tune run 'my study.toml'" in page.replace("&#39;", "'")
     assert ("Use them" in page) == summary.improves
     assert StudySummary.read(tuner.folder / "summary.json").verdict == summary.conclusion
 

@@ -12,10 +12,14 @@ and without time, from the end of the run: ``world/map``, ``world/estimate``, ``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import importlib.util
+import json
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -27,13 +31,13 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
+from ..process.server import child_environment
 from ..snapshots import Snapshot
+from .rerun_file import CLEARED, IMAGE, LAYERS, Block, RerunFile, packed
 
 RECORDING_FILE = "recording.rrd"
 BLOCK = 25
 _QUALITY = 80
-_IMAGE = "world/camera/image"
-_LAYERS = {"mask": f"{_IMAGE}/mask", "kept": f"{_IMAGE}/kept", "culled": f"{_IMAGE}/culled"}
 
 
 @dataclass
@@ -44,6 +48,49 @@ class _Rows:
     times: list[float] = field(default_factory=list)
     values: list[Any] = field(default_factory=list)
 
+    def arrays(self, entity: str) -> Block:
+        """The rows in a block: side by side where all have one shape, else one behind the other with their lengths."""
+        block: Block = {
+            f"{entity}|frames": np.array(self.frames, np.int64),
+            f"{entity}|times": np.array(self.times, np.float64),
+        }
+        if entity in (IMAGE, LAYERS["kept"], LAYERS["culled"]):
+            lengths = np.array([len(value) for value in self.values], np.int64)
+            return block | {f"{entity}|values": np.concatenate(self.values), f"{entity}|lengths": lengths}
+        return block | {f"{entity}|values": np.array(self.values)}
+
+
+class _File(Protocol):
+    """What takes the blocks."""
+
+    def write(self, block: Block) -> None: ...
+    def close(self) -> None: ...
+
+
+class _Apart:
+    """The file in a process of its own, `rerun_file`: rerun takes a while to load, and its work is not the run's."""
+
+    def __init__(self, start: Block) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", RerunFile.__module__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=child_environment(),
+        )
+        self.write(start)
+
+    def write(self, block: Block) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # `close` says why
+            self._process.stdin.write(packed(block))
+            self._process.stdin.flush()
+
+    def close(self) -> None:
+        said, _ = self._process.communicate()
+        if self._process.returncode:
+            reason = json.loads(said) if said else f"its process ended with exit code {self._process.returncode}"
+            raise RunError(f"the recording cannot be written: {reason}", "check the free space; the log may say more")
+
 
 class RecordingWriter:
     """Writes one run as an ``.rrd`` file; what a run that ends early has handed over stays readable.
@@ -52,26 +99,28 @@ class RecordingWriter:
         path: The file.
         camera: Of the images that will be added.
         name: Recording's name in the viewer.
+        apart: Whether a process of its own writes the file, so that a run need not wait for it.
 
     Raises:
         RunError: `rerun-sdk` is not installed, or the file cannot be written.
     """
 
-    def __init__(self, path: Path, camera: Camera, name: str) -> None:
-        self._rr: Any = load_rerun()
+    def __init__(self, path: Path, camera: Camera, name: str, *, apart: bool = False) -> None:
+        check_rerun()
         self._size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
         self._scale = np.array([self._size[0] / camera.width, self._size[1] / camera.height])
         self._rows: dict[str, _Rows] = {}
         self._shown: set[str] = set()
         self._first: float | None = None
         self._state = ""
-        self._stream = self._rr.RecordingStream("dynslam-bench")
+        start = {"path": str(path), "name": name, "matrix": self._matrix(camera), "size": self._size}
+        start |= {"kept": KEPT, "culled": CULLED, "mask": MASK}
         try:
-            self._stream.save(path, default_blueprint=_layout())
-        except (OSError, RuntimeError) as error:
+            path.touch()
+            block = {name: np.array(value) for name, value in start.items()}
+            self._file: _File = _Apart(block) if apart else RerunFile(block)
+        except OSError as error:
             raise RunError(f"cannot write {path}: {error}", "check the permissions and the free space") from error
-        self._stream.send_recording_name(name)
-        self._set_up(camera)
 
     def add(
         self,
@@ -100,17 +149,16 @@ class RecordingWriter:
         if pose is not None:
             self._put("world/camera", at, np.concatenate(se3.to_quaternion(pose)))
         if rgb is not None:
-            self._put(_IMAGE, at, self._jpeg(rgb))
+            self._put(IMAGE, at, self._jpeg(rgb))
         if error_m is not None:
             self._put("error/trans_m", at, error_m)
         self._clear(shot, at)
         if shot is not None:
             self._put_seen(shot, at)
         if state != self._state:
-            self._at(at)
-            self._stream.log("state", self._rr.TextLog(state))
+            self._put("state", at, state)
             self._state = state
-        if len(self._rows.get(_IMAGE, _Rows()).frames) >= BLOCK:
+        if len(self._rows.get(IMAGE, _Rows()).frames) >= BLOCK:
             self._hand_over()
 
     def finish(
@@ -121,30 +169,30 @@ class RecordingWriter:
         colours: NDArray[np.uint8] | None,
     ) -> None:
         """Add what is known at the end: the trajectory, the truth in its frame, and the map ``[M, 3]`` in metres."""
-        rr = self._rr
+        block: Block = {}
         for name, track, colour in (("estimate", estimate, ESTIMATE), ("truth", truth, TRUTH)):
             if track is not None and len(track):
-                self._stream.log(f"world/{name}", rr.LineStrips3D([track.positions], colors=[colour]), static=True)
+                block |= {f"world/{name}|line": track.positions, f"world/{name}|colour": np.array(colour)}
         if positions is not None and len(positions):
-            self._stream.log("world/map", rr.Points3D(positions, colors=colours, radii=0.005), static=True)
+            block["world/map|points"] = positions
+            if colours is not None:
+                block["world/map|colours"] = colours
+        if block:
+            self._file.write(block)
 
     def close(self) -> None:
-        """Hand over what is left and end the file."""
-        self._hand_over()
-        self._stream.disconnect()
+        """Hand over what is left and end the file.
 
-    def _set_up(self, camera: Camera) -> None:
-        rr, (sx, sy) = self._rr, self._scale
-        matrix = camera.matrix * np.array([[sx], [sy], [1.0]])
+        Raises:
+            RunError: It could not be written.
+        """
+        self._hand_over()
+        self._file.close()
+
+    def _matrix(self, camera: Camera) -> NDArray[np.float64]:
+        matrix: NDArray[np.float64] = camera.matrix * np.array([*self._scale, 1.0])[:, None]
         matrix[:2, 2] += 0.5 * self._scale  # rerun puts the corner of the top-left pixel at 0, we its centre
-        width, height = self._size
-        pinhole = rr.Pinhole(image_from_camera=matrix, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF)
-        classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
-        self._stream.log("world", rr.ViewCoordinates.RDF, static=True)
-        self._stream.log(_IMAGE, pinhole, classes, static=True)
-        for name, colour in (("kept", KEPT), ("culled", CULLED)):
-            looks = rr.Points2D.from_fields(colors=[colour], radii=[1.0])
-            self._stream.log(_LAYERS[name], looks, static=True)
+        return matrix
 
     def _put(self, entity: str, at: tuple[int, float], value: Any) -> None:
         rows = self._rows.setdefault(entity, _Rows())
@@ -155,71 +203,40 @@ class RecordingWriter:
     def _put_seen(self, shot: Snapshot, at: tuple[int, float]) -> None:
         points = ((shot.points + 0.5) * self._scale).astype(np.float32)
         for name, chosen in (("kept", points[shot.kept]), ("culled", points[~shot.kept])):
-            self._put(_LAYERS[name], at, chosen)
+            self._put(LAYERS[name], at, chosen)
             self._put(f"features/{name}", at, float(len(chosen)))
         if shot.mask is not None:
             small = cv2.resize(shot.mask.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
-            self._put(_LAYERS["mask"], at, small.tobytes())
+            self._put(LAYERS["mask"], at, small)
 
     def _clear(self, shot: Snapshot | None, at: tuple[int, float]) -> None:
         """What an earlier frame showed and this one does not know must not stand on in the viewer."""
         shown = set() if shot is None else {"kept", "culled"} | ({"mask"} if shot.mask is not None else set())
         for name in self._shown - shown:
-            self._at(at)
-            self._stream.log(_LAYERS[name], self._rr.Clear(recursive=False))
+            self._put(f"{CLEARED}{LAYERS[name]}", at, False)
         self._shown = shown
 
-    def _at(self, at: tuple[int, float]) -> None:
-        self._stream.set_time("frame", sequence=at[0])
-        self._stream.set_time("time", duration=at[1])
-
-    def _jpeg(self, rgb: NDArray[np.uint8]) -> bytes:
+    def _jpeg(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         small = cv2.cvtColor(cv2.resize(rgb, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
-        return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+        encoded: NDArray[np.uint8] = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+        return encoded
 
     def _hand_over(self) -> None:
-        rr = self._rr
+        block: Block = {}
         for entity, rows in self._rows.items():
-            index = [rr.TimeColumn("frame", sequence=rows.frames), rr.TimeColumn("time", duration=rows.times)]
-            self._stream.send_columns(entity, indexes=index, columns=self._columns(entity, rows.values))
+            block |= rows.arrays(entity)
         self._rows.clear()
-
-    def _columns(self, entity: str, values: Sequence[Any]) -> Any:
-        rr = self._rr
-        if entity == "world/camera":
-            poses = np.array(values)
-            return rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
-        if entity == _IMAGE:
-            return rr.EncodedImage.columns(blob=values, media_type=["image/jpeg"] * len(values))
-        if entity == _LAYERS["mask"]:
-            width, height = self._size
-            shape = rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U8)
-            return rr.SegmentationImage.columns(buffer=values, format=[shape] * len(values))
-        if entity in _LAYERS.values():
-            lengths = [len(points) for points in values]
-            return rr.Points2D.columns(positions=np.concatenate(values).reshape(-1, 2)).partition(lengths)
-        return rr.Scalars.columns(scalars=values)
+        if block:
+            self._file.write(block)
 
 
-def load_rerun() -> Any:
-    """The library.
+def check_rerun() -> None:
+    """See that the library is there, without loading it.
 
     Raises:
         RunError: It is not installed.
     """
-    try:
-        import rerun
-    except ImportError as error:
+    if importlib.util.find_spec("rerun") is None:
         raise RunError(
             "recordings are written with rerun-sdk, which is not installed", "pip install 'dynslam-bench[rerun]'"
-        ) from error
-    return rerun
-
-
-def _layout() -> Any:
-    """What the viewer shows at first: the room on the left, the image and the numbers on the right."""
-    import rerun.blueprint as rrb
-
-    numbers = rrb.Horizontal(rrb.TimeSeriesView(origin="error"), rrb.TimeSeriesView(origin="features"))
-    right = rrb.Vertical(rrb.Spatial2DView(origin=_IMAGE), numbers, row_shares=[2, 1])
-    return rrb.Blueprint(rrb.Horizontal(rrb.Spatial3DView(origin="world"), right))
+        )

@@ -93,9 +93,9 @@ class Renderer:
         """Render frame `index`."""
         settings = self.settings
         now = view_of(self.scene, index)
-        tiles = self._tiles(now)
-        hit, depth = self._geometry(now, tiles)
-        color, cosine = self._shade(now, tiles, hit, depth, index / FPS)
+        tiles, local = self._tiles(now)
+        hit, depth = self._geometry(tiles, local)
+        color, cosine = self._shade(now, tiles, local, hit, depth, index / FPS)
         raw = self._measure(index, depth, cosine, color)
         if settings.shadow:
             self._shadow(now.middle, index / FPS, depth, color)
@@ -113,7 +113,7 @@ class Renderer:
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in the other frame.
         """
         now, after = view_of(self.scene, index), view_of(self.scene, other)
-        hit, depth = self._geometry(now, self._tiles(now))
+        hit, depth = self._geometry(*self._tiles(now))
         if now.rolling:
             return rolling_flow(now, after, hit, depth)
         flow = np.empty((*hit.shape, 2), np.float32)
@@ -124,11 +124,17 @@ class Renderer:
     def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
         now = view_of(self.scene, index)
-        hit, depth = self._geometry(now, self._tiles(now))
+        hit, depth = self._geometry(*self._tiles(now))
         return depth, np.append(self.scene.instance, 0).astype(np.uint8)[hit >> 3]
 
     def _shade(
-        self, now: View, tiles: Tiles, hit: NDArray[np.int32], depth: NDArray[np.float64], time: float
+        self,
+        now: View,
+        tiles: Tiles,
+        local: NDArray[np.float64],
+        hit: NDArray[np.int32],
+        depth: NDArray[np.float64],
+        time: float,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
         scene, atlas = self.scene, self.atlas
@@ -140,9 +146,9 @@ class Renderer:
             seen = now.at_row((a + b) // 2)
             lights = self._lights(seen, time)
             facets = self._facets(seen, lights)
-            for first, end, local in _rows_of(now, a, b):
+            for first, end, maps in _rows_of(local, a, b):
                 kernels.shade_pixels(
-                    first, end, self._intrinsics, *tiles, scene.kind, local, scene.shape, scene.texture, scene.uv,
+                    first, end, self._intrinsics, *tiles, scene.kind, maps, scene.shape, scene.texture, scene.uv,
                     scene.tint, facets, atlas.texels, atlas.level_offset, atlas.log2_size, lights, hit, depth, jitter,
                     color, cosine,
                 )  # fmt: skip
@@ -163,8 +169,12 @@ class Renderer:
             motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
 
         self._rows(work, bands=now.rolling)
-        shutter = self.color_sensor.shutter
-        self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, flow, shutter, blurred))
+        shutter, exact, shares = (
+            self.color_sensor.shutter,
+            sharp.astype(np.float64).ravel(),
+            motion_kernels.tap_shares(),
+        )
+        self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
         return blurred
 
     def _rows(self, work: Callable[[int, int], None], *, bands: bool = False) -> None:
@@ -179,8 +189,12 @@ class Renderer:
         for done in [self._pool.submit(work, a, b) for a, b in parts]:
             done.result()
 
-    def _tiles(self, view: View) -> Tiles:
-        """Bin the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter."""
+    def _tiles(self, view: View) -> tuple[Tiles, NDArray[np.float64]]:
+        """Bin the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter.
+
+        Returns:
+            The tiles, and the maps from the camera to what lies in them (`View.local`).
+        """
         scene, snap = self.scene, view.middle
         world = (scene.corners * scene.scale[:, None, :]) @ np.swapaxes(snap.rotation, 1, 2) + snap.origin[:, None, :]
         chosen = np.linspace(0, len(view.poses) - 1, 9 if view.rolling else 1).astype(int)
@@ -204,17 +218,18 @@ class Renderer:
         order = np.argsort(nearest, kind="stable")
         order = order[seen[order]].astype(np.int32)
         start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
-        return tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
+        tiles = tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
+        return tiles, view.local(order)
 
-    def _geometry(self, view: View, tiles: Tiles) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    def _geometry(self, tiles: Tiles, local: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """What every pixel sees (`cast_geometry`) and its z-depth in metres."""
         hit = np.empty((CAMERA.height, CAMERA.width), np.int32)
         depth = np.empty((CAMERA.height, CAMERA.width))
 
         def work(a: int, b: int) -> None:
-            for first, end, local in _rows_of(view, a, b):
+            for first, end, maps in _rows_of(local, a, b):
                 kernels.cast_geometry(
-                    first, end, self._intrinsics, *tiles, self.scene.kind, local, self.scene.shape, hit, depth
+                    first, end, self._intrinsics, *tiles, self.scene.kind, maps, self.scene.shape, hit, depth
                 )
 
         self._rows(work)
@@ -342,13 +357,13 @@ class Renderer:
         return rgb
 
 
-def _rows_of(view: View, first: int, end: int) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+def _rows_of(local: NDArray[np.float64], first: int, end: int) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
     """Runs of rows that share a pose: first row, one past the last, the maps into the primitives' frames."""
-    if not view.rolling:
-        yield first, end, view.local[0]
+    if len(local) == 1:
+        yield first, end, local[0]
         return
     for row in range(first, end):
-        yield row, row + 1, view.local[row]
+        yield row, row + 1, local[row]
 
 
 SensorSettings = TypeVar("SensorSettings", bound=Settings)

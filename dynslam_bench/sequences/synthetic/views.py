@@ -7,7 +7,6 @@ middle of the image is exposed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,20 +38,19 @@ class View:
         """Whether every row has its own pose."""
         return len(self.poses) > 1
 
-    @cached_property
-    def local(self) -> Array:
-        """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`."""
+    def local(self, seen: NDArray[np.int32]) -> Array:
+        """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`.
+
+        Under a rolling shutter those of the primitives `seen` alone are filled in.
+        """
         if not self.rolling:
             return self.middle.local[None]
-        inverse = np.swapaxes(self.middle.rotation, 1, 2) / self.scale[:, :, None]
-        axes = np.tensordot(inverse.reshape(-1, 3), self.poses[:, :3, :3], axes=(1, 1)).reshape(
-            -1, 3, len(self.poses), 3
-        )
-        away = self.poses[:, None, :3, 3] - self.middle.origin[None]
-        local = np.empty((len(self.poses), len(inverse), 3, 4))
-        local[..., :3] = axes.transpose(2, 0, 1, 3)
-        local[..., 3] = (inverse[None] @ away[..., None])[..., 0]
-        return local.reshape(len(self.poses), -1, 12)
+        inverse = np.swapaxes(self.middle.rotation[seen], 1, 2) / self.scale[seen, :, None]
+        poses = np.repeat(self.poses[:, None, :3], len(seen), axis=1)
+        poses[..., 3] -= self.middle.origin[seen]
+        local = np.empty((len(self.poses), len(self.scale), 12))
+        local[:, seen] = (inverse @ poses).reshape(len(poses), -1, 12)
+        return local
 
     def at_row(self, row: int) -> Snapshot:
         """The scene from the pose of a row."""

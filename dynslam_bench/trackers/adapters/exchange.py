@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 from typing import Any, Literal
@@ -107,8 +106,7 @@ def _with_space(size: int) -> TemporaryFolder:
             reasons.append(f"{base or tempfile.gettempdir()}: {error.strerror}")
             continue
         try:
-            with (folder.path / FRAME_FILE).open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, size)
+            (folder.path / FRAME_FILE).write_bytes(bytes(size))
         except OSError as error:
             folder.close()
             reasons.append(f"{folder.path.parent}: {error.strerror}")

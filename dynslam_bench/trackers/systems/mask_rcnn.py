@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 
 from .composition import SemanticSystemSettings, compose
+from .presets import FAST
 from .published import CFPN, masks_in_words
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ SPEC = TrackerSpec(
     settings=SemanticSystemSettings,
     summary="drops the features on dilated masks of people; the masks' source is a setting",
     provenance="own",
+    presets=FAST,
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
     assumptions=(

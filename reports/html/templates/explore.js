@@ -9,7 +9,7 @@ const $ = (id) => document.getElementById(id);
 function cellsOf(data) {
   const cells = new Map();
   for (const [id, t, s, repeat, ending, flags, values, quartiles] of data.runs) {
-    const key = `${t},${s}`, run = { id, repeat, ending, kept: flags & 1, pictured: flags & 2, doubt: flags & 4, seen: flags & 8, values, quartiles };
+    const key = `${t},${s}`, run = { id, repeat, ending, kept: flags & 1, pictured: flags & 2, doubt: flags & 4, seen: flags & 8, paged: !(flags & 16), values, quartiles };
     if (!cells.has(key)) cells.set(key, { t, s, runs: [] });
     cells.get(key).runs.push(run);
   }
@@ -105,8 +105,8 @@ class Explore {
   }
 
   head(name, at, column) {
-    const group = column?.sequence?.name ?? "", pieces = name.split(/(?<=[/_])/).flatMap((piece, place) => (place ? [make("wbr"), piece] : [piece]));
-    const label = make("button", { type: "button" }, ...pieces);
+    const group = column?.sequence?.name ?? "";
+    const label = make("button", { type: "button" }, ...breakable(name));
     const head = make("th", { className: at ? "n" : "sticky", scope: "col", title: group }, label);
     label.addEventListener("click", () => {
       const up = this.view.sort !== `${name}:up`;
@@ -152,7 +152,7 @@ class Explore {
       if (value !== null && value === best.get(sequence.at) && !cell.failed && !cell.seen && tracker.ranked && !this.doubted(cell, metric)) td.classList.add("best");
       this.shade(td, cell, sequence, metric);
     }
-    const others = runs.filter((run) => run !== chosen).slice(0, 9);
+    const others = runs.filter((run) => run !== chosen && run.paged).slice(0, 9);
     if (others.length) td.append(" ", make("small", {}, ...others.flatMap((run, at) => [at ? " " : "", link(run, run.ending ? "✕" : String(at + 2))])));
     return td;
   }

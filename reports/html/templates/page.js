@@ -5,6 +5,9 @@ const make = (tag, properties = {}, ...children) => {
   return element;
 };
 
+/** A name that may be broken behind its dots, underlines and slashes. */
+const breakable = (name) => name.split(/(?<=[/_.])/).flatMap((piece, at) => (at ? [make("wbr"), piece] : [piece]));
+
 /** The address behind #: an anchor, and the view as name=value pairs. */
 const address = {
   read() {

@@ -9,7 +9,7 @@ const figure = (id, caption) => {
 const show = (id, specification) => { FIGURES[id] = specification; inSight.observe($(id)); };
 const table = (heads, rows, kind = "n") => {
   const made = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((name, at) => make("th", { className: at ? kind : "", scope: "col", textContent: name })))),
-    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? kind : "sticky", textContent: value }))))));
+    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? kind : "sticky" }, ...(at ? [value] : breakable(value))))))));
   return make("div", { className: "scroll", tabIndex: 0 }, made);
 };
 
@@ -17,8 +17,8 @@ const table = (heads, rows, kind = "n") => {
 function addChoices(all, id) {
   const here = all.runs.find((run) => run[0] === id);
   if (!here) return null;
-  const [, tracker, sequence] = here;
-  const nearest = (fits) => all.runs.filter(fits).sort((a, b) => (b[3] === here[3]) - (a[3] === here[3]))[0];
+  const [, tracker, sequence] = here, paged = all.runs.filter((run) => run === here || !(run[5] & 16));
+  const nearest = (fits) => paged.filter(fits).sort((a, b) => (b[3] === here[3]) - (a[3] === here[3]))[0];
   const choice = (name, entries, chosen) => {
     const select = make("select", { ariaLabel: name }, ...entries.map(([value, text]) => make("option", { value, textContent: text, selected: value === chosen })));
     select.addEventListener("change", () => { location.hash = select.value; });
@@ -26,10 +26,10 @@ function addChoices(all, id) {
   };
   const trackers = all.trackers.flatMap((entry, at) => { const run = nearest((r) => r[1] === at && r[2] === sequence); return run ? [[run[0], entry.label]] : []; });
   const sequences = all.sequences.flatMap((entry, at) => { const run = nearest((r) => r[2] === at && r[1] === tracker); return run ? [[run[0], entry.name]] : []; });
-  const repeats = all.runs.filter((run) => run[1] === tracker && run[2] === sequence).map((run) => [run[0], run[3] + (run[4] ? ` (${run[4]})` : "")]);
+  const repeats = paged.filter((run) => run[1] === tracker && run[2] === sequence).map((run) => [run[0], run[3] + (run[4] ? ` (${run[4]})` : "")]);
   const own = (entries, at) => entries.find(([value]) => all.runs.find((run) => run[0] === value)[at] === here[at])?.[0];
   $("run-choice").replaceChildren(choice("Tracker", trackers, own(trackers, 1)), choice("Sequence", sequences, own(sequences, 2)), choice("Repeat", repeats, id));
-  return { label: all.trackers[tracker].label, colour: all.trackers[tracker].colour, sequence: all.sequences[sequence].name, repeat: here[3], pictured: here[5] & 2 };
+  return { label: all.trackers[tracker].label, colour: all.trackers[tracker].colour, sequence: all.sequences[sequence].name, repeat: here[3], pictured: here[5] & 2, paged: !(here[5] & 16) };
 }
 
 function factsOf(run) {
@@ -88,6 +88,7 @@ async function render(id) {
   try {
     const all = await side("explore"), where = addChoices(all, id);
     if (!where) throw new Error(id ? `There is no run ${id} in this report.` : "No run is named behind # in the address.");
+    if (!where.paged) throw new Error(`Run ${id} has no page here. ${all.pageless}`);
     const run = unpacked(await side(`run-${id}`));
     document.title = `${where.label} on ${where.sequence}`;
     $("run-title").textContent = document.title;

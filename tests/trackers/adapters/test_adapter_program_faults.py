@@ -1,7 +1,9 @@
 """Every way in which a program over JSON lines can fail, and how it is ended."""
 
+import resource
 import shlex
 import shutil
+import tempfile
 import time
 from pathlib import Path
 
@@ -10,8 +12,10 @@ import pytest
 from adapter_programs import GOOD, frame, gone, reset
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.core.errors import SettingsError, TrackerError
+from dynslam_bench.core.errors import InfrastructureError, SettingsError, TrackerError
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.trackers import build_tracker
+from dynslam_bench.trackers.adapters import exchange
 from dynslam_bench.trackers.adapters.program import files_of_command
 from dynslam_bench.trackers.adapters.settings import SubprocessSettings
 
@@ -226,3 +230,21 @@ def test_a_program_in_the_present_folder_is_found(tmp_path: Path, monkeypatch: p
     SubprocessSettings(command="./odometry").verify()
     with pytest.raises(SettingsError, match="cannot start 'odometry'"):
         SubprocessSettings(command="odometry").verify()  # as in a shell: by its path, or on PATH
+
+
+def test_room_for_a_frame_is_taken_first_elsewhere_if_need_be(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    monkeypatch.setattr(exchange, "SHARED_MEMORY", tmp_path / "missing")
+    beside = exchange.ImageExchange(camera, "raw")
+    file = beside.folder / exchange.FRAME_FILE
+    assert file.is_relative_to(tmp_path) and file.stat().st_blocks * 512 >= 640 * 480 * 7, "not a file of holes"
+    beside.close()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))  # as if the disk were full
+    try:
+        with pytest.raises(InfrastructureError, match=r"no room for a frame of 2.2 MB: .*free some space"):
+            exchange.ImageExchange(camera, "raw")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [], "nothing is left of it"

@@ -11,6 +11,15 @@ from dynslam_bench.core.compiled import dividing_kernel
 from .arrays import Intrinsics, Ints, Reals
 from .hits import NEAR_M
 
+MOST_TAPS = 16
+"""Samples of the longest blur."""
+
+
+def tap_shares() -> Reals:
+    """Where along a blur each of its taps lies, as shares of its length from the middle: ``[n, i]`` for tap i of n."""
+    taps, i = np.arange(MOST_TAPS + 1)[:, None], np.arange(MOST_TAPS)[None]
+    return np.where(i < taps, (i + 0.5) / np.maximum(taps, 1) - 0.5, 0.0)
+
 
 @dividing_kernel
 def flow_field(
@@ -43,9 +52,17 @@ def flow_field(
 
 
 @dividing_kernel
-def motion_blur(row0: int, row1: int, color: Reals, flow: Reals, shutter: float, blurred: Reals) -> None:
-    """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred."""
+def motion_blur(
+    row0: int, row1: int, color: Reals, exact: Reals, shares: Reals, flow: Reals, shutter: float, blurred: Reals
+) -> None:
+    """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred.
+
+    ``exact`` is the whole colour image as flat float64: what all taps read is converted once. ``shares`` are
+    `tap_shares`. Unsigned indices need no test for negative ones.
+    """
     height, width = color.shape[:2]
+    right, below, stride = width - 1.001, height - 1.001, np.uint64(3 * width)
+    one, two, three, four, five = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5)
     for row in range(row0, row1):
         for column in range(width):
             du, dv = flow[row, column, 0] * shutter, flow[row, column, 1] * shutter
@@ -54,31 +71,18 @@ def motion_blur(row0: int, row1: int, color: Reals, flow: Reals, shutter: float,
                 for ch in range(3):
                     blurred[row, column, ch] = color[row, column, ch]
                 continue
-            taps = min(int(length) + 2, 16)
+            taps = min(int(length) + 2, MOST_TAPS)
             r, g, b = 0.0, 0.0, 0.0
             for i in range(taps):
-                s = (i + 0.5) / taps - 0.5
-                x = min(max(column + s * du, 0.0), width - 1.001)
-                y = min(max(row + s * dv, 0.0), height - 1.001)
-                x0, y0 = int(x), int(y)
+                s = shares[taps, i]
+                x = min(max(column + s * du, 0.0), right)
+                y = min(max(row + s * dv, 0.0), below)
+                x0, y0 = np.uint32(x), np.uint32(y)
                 ax, ay = x - x0, y - y0
                 w00, w10, w01, w11 = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
-                r += (
-                    w00 * color[y0, x0, 0]
-                    + w10 * color[y0, x0 + 1, 0]
-                    + w01 * color[y0 + 1, x0, 0]
-                    + w11 * color[y0 + 1, x0 + 1, 0]
-                )
-                g += (
-                    w00 * color[y0, x0, 1]
-                    + w10 * color[y0, x0 + 1, 1]
-                    + w01 * color[y0 + 1, x0, 1]
-                    + w11 * color[y0 + 1, x0 + 1, 1]
-                )
-                b += (
-                    w00 * color[y0, x0, 2]
-                    + w10 * color[y0, x0 + 1, 2]
-                    + w01 * color[y0 + 1, x0, 2]
-                    + w11 * color[y0 + 1, x0 + 1, 2]
-                )
+                k = np.uint64(y0) * stride + three * np.uint64(x0)
+                m = k + stride
+                r += w00 * exact[k] + w10 * exact[k + three] + w01 * exact[m] + w11 * exact[m + three]
+                g += w00 * exact[k + one] + w10 * exact[k + four] + w01 * exact[m + one] + w11 * exact[m + four]
+                b += w00 * exact[k + two] + w10 * exact[k + five] + w01 * exact[m + two] + w11 * exact[m + five]
             blurred[row, column, 0], blurred[row, column, 1], blurred[row, column, 2] = r / taps, g / taps, b / taps

@@ -127,6 +127,7 @@ def shade_pixels(
     height, width = hit.shape
     samples = jitter.shape[0]
     share = 1.0 / samples
+    one, two = np.uint64(1), np.uint64(2)  # unsigned: an index that may be negative costs a test
     for row in range(row0, row1):
         for column in range(width):
             key = hit[row, column]
@@ -244,14 +245,18 @@ def shade_pixels(
                         au, av = fu - iu, fv - iv
                         u0, v0 = iu & (size - 1), (iv & (size - 1)) << bits
                         u1, v1 = (iu + 1) & (size - 1), ((iv + 1) & (size - 1)) << bits
-                        a, b = base + ((v0 + u0) << 2), base + ((v0 + u1) << 2)
-                        c, d = base + ((v1 + u0) << 2), base + ((v1 + u1) << 2)
+                        a, b = np.uint64(base + ((v0 + u0) << 2)), np.uint64(base + ((v0 + u1) << 2))
+                        c, d = np.uint64(base + ((v1 + u0) << 2)), np.uint64(base + ((v1 + u1) << 2))
                         weight = light * (blend if upper else 1.0 - blend)
                         wa, wb = (1.0 - au) * (1.0 - av) * weight, au * (1.0 - av) * weight
                         wc, wd = (1.0 - au) * av * weight, au * av * weight
                         new_red += wa * atlas[a] + wb * atlas[b] + wc * atlas[c] + wd * atlas[d]
-                        new_green += wa * atlas[a + 1] + wb * atlas[b + 1] + wc * atlas[c + 1] + wd * atlas[d + 1]
-                        new_blue += wa * atlas[a + 2] + wb * atlas[b + 2] + wc * atlas[c + 2] + wd * atlas[d + 2]
+                        new_green += (
+                            wa * atlas[a + one] + wb * atlas[b + one] + wc * atlas[c + one] + wd * atlas[d + one]
+                        )
+                        new_blue += (
+                            wa * atlas[a + two] + wb * atlas[b + two] + wc * atlas[c + two] + wd * atlas[d + two]
+                        )
                     new_red, new_green, new_blue = new_red * tint[p, 0], new_green * tint[p, 1], new_blue * tint[p, 2]
                 if sample < 0:
                     own_red, own_green, own_blue, own_cos = new_red, new_green, new_blue, cos

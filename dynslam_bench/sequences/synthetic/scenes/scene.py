@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,7 @@ class Scene:
         self.texture = np.array([[index[name] for name in row] for row in room.texture], np.int32)
         self.texture_names = names
         self.corners = self._corners()
+        self._placed = lru_cache(maxsize=8)(self._place)
 
     def atlas(self) -> textures.Atlas:
         """The instance's textures."""
@@ -93,8 +95,13 @@ class Scene:
         return self.world.camera(times)
 
     def place(self, time: float) -> tuple[Array, Array]:
-        """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start)."""
-        t = time if self.mode == "moving" else 0.0
+        """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start).
+
+        The last few times are kept, since neighbouring frames ask for the same ones.
+        """
+        return self._placed(time if self.mode == "moving" else 0.0)
+
+    def _place(self, t: float) -> tuple[Array, Array]:
         parts = _Poses()
         for actor in self.actors:
             add_person(parts, actor.person, actor.posture(t))

@@ -1,0 +1,78 @@
+"""The presets that ship, beside the default settings: error and processor time on held-out scenes and on recordings.
+
+    python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
+
+Both run block by block in turn, so that whatever else the machine does slows them alike. Rendered scenes are instances
+that no choice has seen, three start offsets each, with the embedded network; the Bonn excerpt has masks of YOLO and
+eight start offsets; the fr1 excerpts, with nobody in view, have the embedded network and four each. Recordings are
+looked for in ``../shared``; what is not there is named. Ratios are preset : default, with 95 % intervals over scenes
+(over starts where there is one scene). "Not worse" is said where the one-sided 95 % bound of the error's ratio lies
+below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes
+hundreds of runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dynslam_bench.runs import RunStore
+from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.tuning.blocks import Block, parse_blocks
+from dynslam_bench.tuning.evaluate import Outcome, evaluate
+from dynslam_bench.tuning.objectives import SPEED
+from dynslam_bench.tuning.ratio import compared
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"
+MARGIN = 0.1
+PARTS = {
+    "rendered": tuple(
+        f"synthetic/{instances}?frames=60&offsets=0-2"
+        for instances in (
+            "walking_xyz@140-144", "walking_halfsphere@145-149", "walking_rpy@150-154", "walking_static@155-157",
+            "sitting_xyz@158-159",
+        )
+    ),
+    "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=0-7",),
+    "fr1": tuple(f"{SHARED}/data/tum/rgbd_dataset_freiburg1_{name}?offsets=0-3" for name in ("xyz", "rpy")),
+}  # fmt: skip
+
+
+def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> str:
+    """One line: what the preset is worth on that part."""
+    source = {"segmentation.source": f"onnx:{NETWORK}" if part == "bonn" else "embedded"}
+    blocks = [block for text in PARTS[part] for block in parse_blocks(text)]
+    settings = [source, {**source, **TRACKERS.get(tracker).presets[preset]}]
+    outcomes: list[dict[Block, Outcome]] = [{}, {}]
+    for block in blocks:
+        for found, values in zip(outcomes, settings, strict=True):
+            found |= evaluate(tracker, values, [block], results=RunStore(options.results))
+    default, own = outcomes
+    error, time_taken = compared(own, default), compared(own, default, objective=SPEED)
+    lost = max(1 - run.coverage for run in own.values())
+    verdict = "not worse" if error.bound is not None and error.bound < 1 + MARGIN else "not shown to be no worse"
+    return (
+        f"{tracker} {preset}, {part}, {error.n} pairs: {error}, bound {error.bound:.3f} ({verdict}); {time_taken}; "
+        f"most frames lost {lost:.1%}"
+    )
+
+
+def main() -> None:
+    """Judge the presets of the trackers that are named, or of all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trackers", nargs="*", metavar="TRACKER")
+    parser.add_argument("--part", nargs="+", default=list(PARTS), choices=list(PARTS))
+    parser.add_argument("--results", type=Path, default=Path("results/presets"))
+    options = parser.parse_args()
+    for tracker in options.trackers or [found.spec.id for found in TRACKERS.all() if found.spec.presets]:
+        for preset in TRACKERS.get(tracker).presets:
+            for part in options.part:
+                if part == "rendered" or Path(PARTS[part][0].partition("?")[0]).is_dir():
+                    print(judge(tracker, preset, part, options), flush=True)
+                else:
+                    print(f"{tracker} {preset}, {part}: not judged, no recording under {SHARED}")
+
+
+if __name__ == "__main__":
+    main()
