@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 
 import dynslam_bench
 from dynslam_bench.core.records import write_atomic
@@ -97,6 +99,8 @@ def build_report(
     setup = {"protocol": protocol.model_dump_json(), "output": str(output), **shown}
     hired: AbstractContextManager[Crew | None] = Crew(count, setup) if count else nullcontext()
     with hired as crew:
+        if crew is not None:  # what only this process needs is loaded while it waits for them
+            Thread(target=import_module, args=("scipy.stats",), daemon=True).start()
         loaded = load_runs(stores, protocol, on_progress, crew, reference)
         board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
         again = command or _command([store.root for store in stores], output, board, most_pages)

@@ -174,7 +174,7 @@ def bench(
     suite: Annotated[
         str,
         typer.Argument(
-            help="dynamic, dynamic-full, real, robustness, or a TOML file.", autocompletion=completion.suites
+            help="dynamic, dynamic-full, objects, real, robustness, or a TOML file.", autocompletion=completion.suites
         ),
     ],
     results: Results = Path("results"),

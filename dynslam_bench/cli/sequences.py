@@ -54,20 +54,14 @@ def list_(
 
 def _write_group(title: str, found: list[Summary]) -> None:
     """A data set's sequences under a line of what holds for all of them."""
-    layout = found[0].layout
-    about = [f"licence {found[0].license}", f"layout: {layout} on the publisher's files" if layout else ""]
-    about.append(f"by hand: {found[0].by_hand}" if found[0].by_hand else "")
-    write(f"{title} ({'; '.join(filter(None, about))})")
+    count = f"{len(found)} listed, {sum(each.here for each in found)} here"
+    layout, by_hand = found[0].layout, found[0].by_hand
+    about = [count, f"licence: {found[0].license}", f"layout: {layout} on the publisher's files" if layout else ""]
+    write(f"{title} ({'; '.join(filter(None, (*about, f'by hand: {by_hand}' if by_hand else '')))})")
     write_table(
-        ("sequence", "here", "size", "tags", "split", "ground truth", "checksum", "license", "verified"),
-        [
-            (
-                *(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum),
-                *(each.license, each.layout),
-            )
-            for each in found
-        ],
-        spare=("license", "verified", "checksum", "ground truth", "split"),
+        ("sequence", "here", "size", "tags", "split", "ground truth", "checksum"),
+        [(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum) for each in found],
+        spare=("checksum", "ground truth", "split"),
     )
     write("")
 

@@ -22,7 +22,7 @@ def to_script(value: Any) -> str:
 
 
 def write_side(output: Path, name: str, value: Any) -> Path:
-    """Write ``data/<name>.js``, which hands a value to the page that loads it.
+    """Write ``data/<name>.js``, which hands a value to the page that loads it; one that is there already stays.
 
     Args:
         output: Folder of the page.
@@ -33,8 +33,18 @@ def write_side(output: Path, name: str, value: Any) -> Path:
         DynslamError: It cannot be written.
     """
     path = output / FOLDER / f"{name}.js"
-    write_atomic(path, f"keep({json.dumps(name)},{to_script(value)});\n")
+    content = f"keep({json.dumps(name)},{to_script(value)});\n".encode()
+    if not _holds(path, content):  # to replace a file takes the disk far longer than to read it
+        write_atomic(path, content)
     return path
+
+
+def _holds(path: Path, content: bytes) -> bool:
+    """Whether a file is there and has this content."""
+    try:
+        return path.stat().st_size == len(content) and path.read_bytes() == content
+    except OSError:
+        return False
 
 
 def packed_rows(rows: ArrayLike) -> list[list[float | str]]:

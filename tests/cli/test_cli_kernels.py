@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dynslam_bench.cli.kernels import compile_kernels, compiled_ahead
+from dynslam_bench.cli.kernels import compile_flow, compile_tracking, compiled_ahead
 from dynslam_bench.flow.daisy.refinement import similarity_lucas_kanade
 from dynslam_bench.flow.searches.propagation import motions_of
 from dynslam_bench.slam.bundle.schur import adjust_bundle
@@ -23,6 +24,34 @@ def program(folder: Path, text: str) -> str:
     return str(path)
 
 
+NOTHING_IS_LEFT = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from dynslam_bench.cli.kernels import compile_flow, compile_tracking
+from dynslam_bench.envs import SlamEnv
+from dynslam_bench.testing import CornerSequence
+
+def ready():
+    modules = [module for name, module in sys.modules.items() if name.startswith("dynslam_bench")]
+    found = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+    return {(kernel.py_func.__qualname__, signature) for kernel in found for signature in kernel.signatures}
+
+compile_flow()
+compile_tracking()
+before = ready()
+env = SlamEnv(CornerSequence(12), "emfoa-oft", settings={"segmentation.source": "oracle"})
+env.reset(seed=0)
+while not env.step(env.neutral_action)[3]:
+    pass
+print(len(before) > 20, sorted(name for name, _ in ready() - before))
+"""
+
+
+def test_nothing_is_left_for_the_first_run_to_compile() -> None:
+    done = subprocess.run([sys.executable, "-c", NOTHING_IS_LEFT], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["True []"], done.stdout + done.stderr
+
+
 def test_it_uses_the_kernels_of_flow_and_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     adjusted = []
 
@@ -31,7 +60,8 @@ def test_it_uses_the_kernels_of_flow_and_of_the_map(monkeypatch: pytest.MonkeyPa
         return adjust_bundle(*given)
 
     monkeypatch.setattr("dynslam_bench.slam.mapping.local_mapping.adjust_bundle", noted)
-    compile_kernels(rendering=False)
+    compile_flow()
+    compile_tracking()
     for kernel in (similarity_lucas_kanade, motions_of, refresh):
         assert kernel.signatures, kernel
     assert adjusted, "the scene is long enough for a bundle"
@@ -43,7 +73,7 @@ def test_its_failure_is_one_line_and_no_error(
     monkeypatch.setattr(sys, "executable", program(tmp_path, "exit 7"))
     with compiled_ahead():
         pass
-    assert capsys.readouterr().err.count("compiled ahead (exit code 7)") == 1
+    assert capsys.readouterr().err.count("compiled ahead (exit code 7, 7)") == 1
 
 
 def test_nothing_is_left_of_it_when_rendering_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

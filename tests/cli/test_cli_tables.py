@@ -1,5 +1,7 @@
 """What a terminal shows: tables as wide as it is, no Markdown, a leaderboard, grouped help, completion."""
 
+import json
+
 import pytest
 from cli_errors import one_line
 
@@ -71,6 +73,24 @@ def test_help_is_grouped(cli):
     assert places == sorted(places) and "─ Commands" not in out
     out = cli("run", "--help")[1]
     assert all(title in out for title in ("Which frames", "The tracker's settings", "The machine", "What is kept"))
+
+
+def test_sequences_are_listed_by_data_set_and_the_heading_holds_for_all_of_them(cli):
+    listed = json.loads(cli("sequences", "list", "--json")[1])
+    groups = {each["dataset"]: [] for each in listed}
+    for each in listed:
+        groups[each["dataset"]].append(each)
+    out = cli("sequences", "list")[1]
+    blocks = [block.splitlines() for block in out.strip().split("\n\n")]
+    assert [len(block) - 2 for block in blocks] == [len(group) for group in groups.values()] and len(blocks) == 9
+    for (heading, columns, *rows), (title, group) in zip(blocks, groups.items(), strict=True):
+        assert len({(each["license"], each["layout"], each["by_hand"]) for each in group}) == 1, title
+        assert heading.startswith(f"{title} ({len(group)} listed, ") and f"licence: {group[0]['license']}" in heading
+        assert ("layout: " in heading) == (title != "rendered rooms with exact poses, masks and flow")
+        assert [row.split()[0] for row in rows] == [each["id"] for each in group]
+        assert columns.split()[:4] == ["sequence", "here", "size", "tags"] and all(each["size"] for each in group)
+    static = cli("sequences", "list", "synthetic/*", "--tag", "static")[1]
+    assert "synthetic/fast_spin" in static and "synthetic/fast_walking" not in static
 
 
 @pytest.mark.parametrize(

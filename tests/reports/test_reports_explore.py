@@ -204,6 +204,21 @@ def test_a_figure_hides_what_is_clicked_and_tells_what_is_pointed_at(browser, re
     assert "real time" in browser.run("one('#speed .tip.on').textContent")
 
 
+def test_figures_name_trackers_as_they_are_called_and_only_those_that_they_show(browser, report):
+    explore(browser, report)
+    browser.until("one('#explore-boxes .legend button') && one('#explore-share .legend button')")
+    names = {
+        browser.run(f"all('#explore-{place} .legend button').map((each) => each.textContent.trim()).join('|')")
+        for place in ("boxes", "share")
+    }
+    assert all("Ours <b>&amp;</b> 'quoted' \N{SNOWMAN}" in each for each in names)
+    dead = "[...row.cells].slice(3).every((cell) => cell.classList.contains('failed') || cell.textContent === '–')"
+    failed = browser.run(
+        f"all('#explore-table tbody tr').filter((row) => {dead}).map((row) => row.cells[0].textContent)"
+    )
+    assert failed and not any(name in each for each in names for name in failed)
+
+
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
     browser.open(report.run, anchor="#" + "0" * 16)
     browser.until("one('main .note')")

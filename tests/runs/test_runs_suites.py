@@ -15,7 +15,7 @@ from dynslam_bench.trackers.registry import TRACKERS
 
 
 def test_the_suites_that_are_promised_are_there() -> None:
-    assert {"smoke", "demo", "dynamic", "dynamic-full", "real", "robustness"} <= set(suite_names())
+    assert {"smoke", "demo", "dynamic", "dynamic-full", "objects", "real", "robustness"} <= set(suite_names())
 
 
 @pytest.mark.parametrize("name", suite_names())
@@ -39,6 +39,9 @@ def test_dynamic_holds_every_ranked_system_on_the_eight_twins() -> None:
     ablations = {name for name in composed if not TRACKERS.get(name).ranked and name.startswith("emfoa-oft-")}
     assert composed - ablations <= set(suite.trackers)
     assert load_suite("dynamic-full").trackers == suite.trackers
+    objects = load_suite("objects")
+    assert set(suite.trackers) - {"emfoa-oft-paper"} < set(objects.trackers), "its dense flow takes seconds a frame"
+    assert objects.settings == {"segmentation.source": "oracle"}
 
 
 def write(path: Path, text: str) -> Path:

@@ -6,6 +6,7 @@ import pytest
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic import open_synthetic, parse_synthetic_id
 from dynslam_bench.sequences.synthetic.families.loop import WALKS
+from dynslam_bench.sequences.synthetic.views import view_of
 
 
 def walk_of(name: str):
@@ -52,6 +53,20 @@ def test_repeated_walls_share_their_textures_and_others_do_not() -> None:
 
     assert len(names("corridor")) > 40
     assert len(names("corridor_repeated")) < 12
+    assert len(names("rooms")) > 150
+    assert len(names("rooms_repeated")) < 24, "six rooms look the same, whatever their number"
+
+
+def test_rooms_show_something_wherever_the_camera_turns() -> None:
+    """In the first version bare walls filled these frames: no corners, and no system that sees could go on."""
+    sequence = open_synthetic("synthetic/loop_rooms", None, threads=1)
+    scene, renderer = sequence.scene, sequence.renderer
+    for index in (528, 5280):
+        hit, _ = renderer._geometry(
+            *renderer._tiles(view_of(scene, index))
+        )  # what is seen, without drawing 240 textures
+        names = np.array(scene.texture_names)[scene.texture[hit >> 3, hit & 7]]
+        assert np.char.startswith(names, "poster").mean() > 0.03
 
 
 @pytest.mark.parametrize("variant", WALKS)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -88,7 +87,7 @@ class _Apart:
     def close(self) -> None:
         said, _ = self._process.communicate()
         if self._process.returncode:
-            reason = json.loads(said) if said else f"its process ended with exit code {self._process.returncode}"
+            reason = said.decode(errors="replace") or f"its process ended with exit code {self._process.returncode}"
             raise RunError(f"the recording cannot be written: {reason}", "check the free space; the log may say more")
 
 

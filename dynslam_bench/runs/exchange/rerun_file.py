@@ -9,7 +9,6 @@ this module reads blocks from standard input, each an ``.npz`` behind its size i
 from __future__ import annotations
 
 import io
-import json
 import sys
 from typing import Any
 
@@ -133,13 +132,13 @@ def _read() -> Block:
 
 
 def main() -> int:
-    """Write what standard input says; on standard output is then what went wrong, as JSON, or nothing."""
+    """Write what standard input says; on standard output is then what went wrong, or nothing."""
     sys.modules["pandas"] = None  # type: ignore[assignment]
     # Arrow would load it to look whether an array is one of its columns: as long as loading rerun takes.
     try:
         file = RerunFile(_read())
     except OSError as error:
-        sys.stdout.write(json.dumps(str(error)))
+        sys.stdout.write(str(error))
         return 1
     while block := _read():
         file.write(block)

@@ -42,13 +42,13 @@ class SyntheticId:
 
     @property
     def version(self) -> int:
-        """Version of the family; 0 where the renderer's alone counts."""
-        return FAMILIES[self.family].version
+        """Version of the variant; 0 where the renderer's alone counts."""
+        return FAMILIES[self.family].version(self.variant)
 
     @property
     def tags(self) -> tuple[str, ...]:
         """As in the catalogue, for example ``high-dynamic``."""
-        return FAMILIES[self.family].tags
+        return FAMILIES[self.family].tags_of(self.variant)
 
     def world(self) -> World:
         """What is filmed."""

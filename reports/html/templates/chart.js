@@ -5,6 +5,8 @@ const ruler = document.createElement("canvas").getContext("2d");
 const COUNTS = Array.from({ length: 41 }, (_, step) => 2 + step / 4);  // of ticks: how many fit is known only once the room for them is
 const widthOf = (text) => { ruler.font = FONT; return ruler.measureText(text).width; };
 const plain = (text) => String(text ?? "").replace(/<b>|<\/b>/g, "").replace(/&lt;/g, "<").replace(/&gt;/g, ">").replace(/&amp;/g, "&");
+/** The opposite: a name that a figure shows as it stands. */
+const named = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
 const linesOf = (text) => String(text ?? "").split("<br>").map(plain);
 
 function wrapTo(text, room) {

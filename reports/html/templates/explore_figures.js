@@ -3,18 +3,18 @@ const MOST_BOXES = 6;
 
 /** Box plots of frame errors: a group of boxes for every sequence, one for every tracker. */
 function boxFigure(explore, trackers, sequences) {
-  const shown = trackers.filter((tracker) => sequences.some((sequence) => explore.cells.get(`${tracker.at},${sequence.at}`)?.runs.some((run) => run.quartiles.length))).slice(0, MOST_BOXES);
+  const shown = trackers.filter((tracker) => sequences.some((sequence) => explore.cells.get(`${tracker.at},${sequence.at}`)?.runs.some((run) => run.quartiles.length && !run.ending))).slice(0, MOST_BOXES);
   const data = shown.map((tracker, at) => {
     const names = [], quartiles = [];
     for (const sequence of sequences) {
       const cell = explore.cells.get(`${tracker.at},${sequence.at}`), run = cell && standing(cell);
       if (!run?.quartiles.length || run.ending) continue;
-      names.push(sequence.short);
+      names.push(named(sequence.short));
       quartiles.push(run.quartiles.map((value) => Math.max(value, 1e-3)));
     }
-    return { type: "box", name: tracker.label, x: names, quartiles, marker: { color: tracker.colour }, width: 0.9 / shown.length, shift: ((at + 0.5) / shown.length - 0.5) * 0.84 };
+    return { type: "box", name: named(tracker.label), x: names, quartiles, marker: { color: tracker.colour }, width: 0.9 / shown.length, shift: ((at + 0.5) / shown.length - 0.5) * 0.84 };
   });
-  const known = sequences.map((sequence) => sequence.short).filter((name) => data.some((trace) => trace.x.includes(name)));
+  const known = sequences.map((sequence) => named(sequence.short)).filter((name) => data.some((trace) => trace.x.includes(name)));
   return {
     data,
     layout: { height: 420, xaxis: { type: "category", categories: known }, yaxis: { type: "log", title: { text: "frame-to-frame error (mm)" } } },
@@ -28,7 +28,7 @@ function shareFigure(explore, trackers) {
   const names = edges.slice(0, -1).map((low, at) => `${percent(low)}–${percent(edges[at + 1])} %`);
   const with_ = trackers.filter((tracker) => byShare[tracker.at]);
   const data = with_.map((tracker, at) => ({
-    mode: "lines+markers", name: tracker.label, visible: at < 10 ? true : "legendonly", x: names,
+    mode: "lines+markers", name: named(tracker.label), visible: at < 10 ? true : "legendonly", x: names,
     y: byShare[tracker.at].map(([middle]) => middle), text: byShare[tracker.at].map(([, count]) => `${count} frames`),
     line: { color: tracker.colour, width: 2 }, marker: { color: tracker.colour, size: 8 },
     hovertemplate: "%{x} of the image: %{y} mm<br>%{text}<extra>%{fullData.name}</extra>",

@@ -56,7 +56,9 @@ def _seen_by(optics: Optics) -> Callable[[World, int], World]:
     return lambda world, _: replace(world, optics=optics)
 
 
+_TAGS = {"empty": ("static",), "walking": ("high-dynamic",)}
+
 CONDITIONS = tuple(
-    Family(name, ("empty", "walking"), partial(build_condition, alter), ("high-dynamic",))
+    Family(name, tuple(_TAGS), partial(build_condition, alter), _TAGS)
     for name, alter in (("dark", _seen_by(DARK)), ("blank", _plain), ("far", _hall), ("outdoor", _seen_by(SUNLIGHT)))
 )

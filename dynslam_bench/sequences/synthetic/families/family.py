@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from ..scenes.world import World
 from ..settings import DEFAULT_FRAMES
+
+Value = TypeVar("Value", int, tuple[str, ...])
 
 
 @dataclass(frozen=True)
@@ -17,22 +20,34 @@ class Family:
         name: First part of the ids.
         variants: Second parts; the empty one stands for the name alone.
         build: Variant and instance to the world that is filmed.
-        tags: As in the catalogue: ``static``, ``low-dynamic``, ``high-dynamic``.
+        tags: As in the catalogue: ``static``, ``low-dynamic``, ``high-dynamic``; of each variant, or of all.
         frames: Default length of each variant, or of all.
-        version: Raised whenever any pixel, pose or mask of this family changes.
+        versions: Raised whenever any pixel, pose or mask changes; of each variant, or of all.
     """
 
     name: str
     variants: tuple[str, ...]
     build: Callable[[str, int], World]
-    tags: tuple[str, ...]
+    tags: tuple[str, ...] | dict[str, tuple[str, ...]]
     frames: int | dict[str, int] = DEFAULT_FRAMES
-    version: int = 1
+    versions: int | dict[str, int] = 1
 
     def length(self, variant: str) -> int:
         """Default number of frames of a variant."""
-        return self.frames if isinstance(self.frames, int) else self.frames[variant]
+        return _of(self.frames, variant)
+
+    def version(self, variant: str) -> int:
+        """Version of a variant."""
+        return _of(self.versions, variant)
+
+    def tags_of(self, variant: str) -> tuple[str, ...]:
+        """How much moves in a variant."""
+        return _of(self.tags, variant)
 
     def ids(self) -> list[str]:
         """All ids, for example ``synthetic/walking_xyz``."""
         return [f"synthetic/{self.name}" + (f"_{variant}" if variant else "") for variant in self.variants]
+
+
+def _of(values: Value | dict[str, Value], variant: str) -> Value:
+    return values[variant] if isinstance(values, dict) else values

@@ -63,4 +63,6 @@ def fast_camera(variant: str, instance: int, times: Array) -> Array:
     return poses
 
 
-FAST = Family("fast", tuple(SWINGS), build_fast, ("high-dynamic",))
+FAST = Family(
+    "fast", tuple(SWINGS), build_fast, {name: ("high-dynamic" if name == "walking" else "static",) for name in SWINGS}
+)

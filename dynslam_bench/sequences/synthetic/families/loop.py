@@ -14,7 +14,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from ..scenes.interiors import Point, add_floor, add_wall, cartons, corridor_bay, office_bay, office_chair
+from ..scenes.interiors import Point, add_floor, add_wall, cartons, corridor_bay, notices, office_bay, office_chair
 from ..scenes.parts import BOX, Parts, turn
 from ..scenes.plan import pick, plan_room
 from ..scenes.walks import Walk, walk_along, walking_camera
@@ -36,9 +36,9 @@ class _Building:
     loose: list[tuple[str, Parts, float, Point]] = field(default_factory=list)
     bays: int = 0
 
-    def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, period: int = 1) -> None:
-        """Furnish a stretch of wall; repeated ones come again after `period`."""
-        number = self.bays % period if self.repeated else self.bays
+    def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
+        """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
+        number = alike if self.repeated else self.bays
         self.parts.extend(make(self.instance, number), yaw, (*at, 0.0), f"/{number}")
         self.bays += 1
 
@@ -130,7 +130,7 @@ def _corridor(b: _Building) -> Walk:
             count = int(length / 2.3)
             for k in range(count):
                 at = np.array(start) + way * (k + 0.5) / count + inward
-                b.bay(corridor_bay, yaw, (float(at[0]), float(at[1])), period=4)
+                b.bay(corridor_bay, yaw, (float(at[0]), float(at[1])), alike=b.bays % 4)
                 if k % 3 == 1:
                     out = at + inward / 0.05 * 0.35
                     b.piece(("chair", "box")[k % 2], yaw, (float(out[0]), float(out[1])))
@@ -154,7 +154,7 @@ def _rooms(b: _Building) -> Walk:
             if k:
                 edge = x - side * wide / 2
                 add_wall(b.parts, (edge, side * half), (edge, side * (half + deep)), plan)
-            _furnish(b, x, side, wide, half + deep)
+            _furnish(b, x, side, wide, half, half + deep)
             corners += [
                 (x + side * u, side * v)
                 for u, v in ((-0.2, 0.3), (-0.2, 2.2), (-1.9, 3.1), (-1.9, 5.0), (1.9, 5.0), (1.9, 3.1), (0.2, 2.2),
@@ -163,17 +163,24 @@ def _rooms(b: _Building) -> Walk:
             if k < 2:
                 at = (x + side * wide / 2, side * (half - 0.05))
                 b.bay(corridor_bay, 180.0 if side < 0 else 0.0, at)
+        b.bay(notices, -90.0 * side, (side * (ends - 0.05), 0.0), alike=7)
         corners += [(side * u, side * v) for u, v in ((ends - 1.7, 0.6), (ends - 0.9, 0.1), (ends - 1.7, -0.6))]
     return walk_along(corners, 0.7)
 
 
-def _furnish(b: _Building, x: float, side: int, wide: float, back: float) -> None:
-    """One room: an office along its back wall, stretches of corridor furniture along its sides, loose pieces."""
+def _furnish(b: _Building, x: float, side: int, wide: float, front: float, back: float) -> None:
+    """One room: an office along its back wall, furniture and notices along all others, loose pieces.
+
+    The wall with the door, at `front`, has notices on both of its faces: those on the outer one hang in the corridor.
+    """
     yaw = 0.0 if side > 0 else 180.0
-    b.bay(office_bay, yaw, (x, side * (back - 0.05)), period=1)
+    b.bay(office_bay, yaw, (x, side * (back - 0.05)))
     for hand in (1, -1):
-        at = (x + hand * (wide / 2 - 0.05), side * (back - 2.6))
-        b.bay(corridor_bay, -90.0 * hand, at, period=3)
+        beside = x + hand * (wide / 2 - 0.05)
+        b.bay(corridor_bay, -90.0 * hand, (beside, side * (back - 2.6)), alike=1 if hand > 0 else 2)
+        b.bay(notices, -90.0 * hand, (beside, side * (front + 1.5)), alike=3)
+        b.bay(notices, yaw + 180.0, (x + hand * 1.75, side * (front + 0.05)), alike=4)
+        b.bay(notices, yaw, (x + hand * 1.55, side * (front - 0.05)), alike=5)
     b.piece("chair", yaw, (x + 0.4, side * (back - 1.55)))
     b.piece("box", yaw, (x - 0.1 * wide, side * 3.9))
 
@@ -181,4 +188,11 @@ def _furnish(b: _Building, x: float, side: int, wide: float, back: float) -> Non
 _SHAPES: dict[str, Callable[[_Building], Walk]] = {"room": _room, "corridor": _corridor, "rooms": _rooms}
 _FRAMES = {"room": 2400, "corridor": 3900, "rooms": 6600}
 
-LOOP = Family("loop", VARIANTS, build_loop, ("static",), {name: _FRAMES[name.partition("_")[0]] for name in VARIANTS})
+LOOP = Family(
+    "loop",
+    VARIANTS,
+    build_loop,
+    {name: ("low-dynamic",) if name.endswith("_moved") else ("static",) for name in VARIANTS},
+    {name: _FRAMES[name.partition("_")[0]] for name in VARIANTS},
+    {name: 2 if name.startswith("rooms") else 1 for name in VARIANTS},
+)

@@ -52,5 +52,5 @@ def _roll(keys: tuple[ChairKey, ...], period: float, time: float) -> tuple[Array
     return turn(facing + 180.0), np.array([x, y, 0.0])
 
 
-WALKING = Family("walking", MOTIONS, partial(build_twin, "walking"), ("high-dynamic",), version=0)
-SITTING = Family("sitting", MOTIONS, partial(build_twin, "sitting"), ("low-dynamic",), version=0)
+WALKING = Family("walking", MOTIONS, partial(build_twin, "walking"), ("high-dynamic",), versions=0)
+SITTING = Family("sitting", MOTIONS, partial(build_twin, "sitting"), ("low-dynamic",), versions=0)

@@ -88,6 +88,16 @@ def corridor_bay(instance: int, number: int) -> Parts:
     return parts
 
 
+def notices(instance: int, number: int) -> Parts:
+    """Nearly two metres of wall with four sheets on it at different heights."""
+    rng, parts = stream(instance, "synthetic", "notices", number), Parts()
+    for k in range(4):
+        half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
+        at = np.array([-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random()])
+        parts.add(BOX, np.eye(3), at, half, texture=f"poster:{k}", fit=(2,))
+    return parts
+
+
 def _add_closed_door(parts: Parts, plan: Plan) -> None:
     eye, tint = np.eye(3), plan.tints
     parts.add(BOX, eye, np.array([0, -0.02, 1.03]), (0.5, 0.02, 1.03), tint=tint["shelf"])
