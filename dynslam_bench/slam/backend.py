@@ -20,9 +20,12 @@ from .localisation.first_pose import Before, first_pose
 from .localisation.localised import Localised
 from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
+from .localisation.reach import Reach
+from .localisation.surroundings import Surroundings
 from .localisation.tracking import MapFit, Tracked, fit_to_map
 from .loop_closing import LoopCloser
 from .mapping.history import History
+from .mapping.islands import Islands
 from .mapping.keyframes import KeyframeRule
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
@@ -55,6 +58,7 @@ class RgbdBackend:
         if self._ready:
             self.mapper.settings = settings
             self.loops.settings = settings
+            self._surroundings.settings = settings
             self._keyframes.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
@@ -70,11 +74,17 @@ class RgbdBackend:
         self.mapper = LocalMapper(self.world, self.settings)
         self.history = History()
         self.state: TrackingState = "initialising"
+        self._tracked = False
+        self._island = 0
+        self._unrecognised = 0
+        self._reach = Reach()
+        self._islands = Islands()
         self._last: Tracked | None = None
         self._motion = CameraMotion()
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
-        self.loops = LoopCloser(self.world, self.mapper, self.settings, self.seed)
+        self.loops = LoopCloser(self.world, self.mapper, self._islands, self.settings, self.seed)
+        self._surroundings = Surroundings(self.world, self.settings)
         self._views = MapViews(self.world)
         self._ready = True
 
@@ -103,39 +113,64 @@ class RgbdBackend:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
         if np.count_nonzero(seen.z > 0) < MIN_INITIAL:
             return self._localised(None)
-        self.state = "ok"
-        self._last = tracked = Tracked(seen, np.full(len(seen), -1, np.int64), np.eye(4), frame.timestamp)
+        return self._begin_map(frame, seen, np.eye(4))
+
+    def _begin_map(self, frame: FrameBundle, seen: Observations, T_cam_world: Array) -> Localised:
+        """A keyframe that shows nothing known; until its map is joined to the first one its frames count as lost."""
+        self._tracked = True
+        self._last = tracked = Tracked(seen, np.full(len(seen), -1, np.int64), T_cam_world, frame.timestamp)
         spent = self._make_keyframe(frame, tracked)
+        self.state = self._state()
         self.history.append(frame.timestamp, self._reference, np.eye(4), 1e6 * np.eye(6))
         points = int(np.count_nonzero(tracked.point >= 0))
-        return replace(self._localised(np.eye(4), spent), matches=points, inliers=points)
+        return replace(self._localised(T_cam_world, spent), matches=points, inliers=points)
+
+    def _state(self) -> TrackingState:
+        """Poses count in the world of the first map alone."""
+        self._island = int(self.world.kf_island[self._reference])
+        return "ok" if self._tracked and self._island == 0 else "lost"
 
     def _localise(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised:
         """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
         prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
-        before = Before(
-            last, prediction, self._reference, self.state == "ok", self.mapper.close_m, self.seed, frame.index
-        )
-        first = first_pose(self.world, seen, before, self.settings)
+        around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
+        reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
+        close, island = self.mapper.close_m, None if self._tracked else self._island
+        before = Before(last, prediction, self._reference, around, island, reach, close, self.seed, frame.index)
+        first = first_pose(self.world, self._islands, seen, before, self.settings)
         if first is None:
-            return self._lost(prediction)
-        fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, self.settings.tracking)
+            return self._lost(frame, seen, prediction)
+        points = self._surroundings.points(first.keyframe, first.matches.point)
+        fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, points, self.settings.tracking)
         self.world.visible[fit.in_view] += 1
         if fit.count < self._needed_inliers() or not np.isfinite(fit.estimate.T_cam_world).all():
-            found = self._lost(prediction)
+            found = self._lost(frame, seen, prediction)
         else:
-            tracked = self._accept(frame, seen, fit, last)
-            spent = self._keyframe_if_wanted(frame, tracked, fit)
-            found = replace(self._localised(tracked.T_cam_world, spent), residual_px=fit.estimate.residual_px)
+            taken = self._accept(frame, seen, fit, last)
+            spent = self._keyframe_if_wanted(frame, taken, fit)
+            found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
         return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)
 
     def _needed_inliers(self) -> int:
-        return self.settings.tracking.min_inliers if self.state == "ok" else self.settings.relocalisation.min_inliers
+        return self.settings.tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
 
-    def _lost(self, prediction: Array) -> Localised:
+    def _lost(self, frame: FrameBundle, seen: Observations, prediction: Array) -> Localised:
+        """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
         self.state = "lost"
+        assert self._last is not None
+        deep = int(np.count_nonzero(seen.z > 0))
+        if self._tracked:
+            self._reach.lost(self._last, deep, MIN_INITIAL)
+        self._tracked = False
         self._motion.forget()
-        return self._localised(prediction)
+        self._unrecognised = self._unrecognised + 1 if deep >= MIN_INITIAL else 0
+        if not self.settings.loop_closing.enabled or self._unrecognised < self.settings.relocalisation.new_map_after:
+            return self._localised(prediction)
+        self._unrecognised = 0
+        reach = self._reach.metres(self._last, frame.timestamp, self.settings.relocalisation)
+        start = self._last.T_cam_world
+        self._island = self._islands.begin(self._island, se3.inverse(start)[:3, 3], reach)
+        return self._begin_map(frame, seen, start)
 
     def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: Tracked) -> Tracked:
         """The frame is tracked: what it sees counts as found, and its pose is weighed against the motion model."""
@@ -145,11 +180,12 @@ class RgbdBackend:
         point[fit.matches.feature[fit.inliers]] = points
         measured = fit.estimate.T_cam_world, fit.estimate.information
         pose = self._motion.filtered(last, frame.timestamp, *measured, self.settings.motion)
-        self.state = "ok"
+        self._tracked, self._unrecognised = True, 0
         self._last = tracked = Tracked(seen, point, pose, frame.timestamp)
         near, _ = self.world.covisible_of(points)
         if len(near):
             self._reference = int(near[0])
+        self.state = self._state()
         return tracked
 
     # ------------------------------------------------------------------ keyframes
@@ -165,10 +201,12 @@ class RgbdBackend:
                 self._motion.relocated(pose)
         relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
         self.history.append(frame.timestamp, self._reference, relative, fit.estimate.information)
+        self.state = self._state()
         return spent
 
     def _make_keyframe(self, frame: FrameBundle, tracked: Tracked) -> dict[str, float]:
-        slot, spent = self.mapper.insert(tracked.seen, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp)
+        pose, at = tracked.T_cam_world, (frame.index, frame.timestamp, self._island)
+        slot, spent = self.mapper.insert(tracked.seen, tracked.point, pose, *at)
         self._reference = slot
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
@@ -242,7 +280,12 @@ class RgbdBackend:
         return self._views.outputs()
 
     def finalize(self) -> Trajectory:
-        """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes."""
+        """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
+
+        With `bundle_adjustment.full` all of the map is refined first.
+        """
+        if self.settings.bundle_adjustment.full:
+            self.mapper.adjust_all()
         stamps, poses, information = self.history.poses(self.world)
         order = np.argsort(stamps, kind="stable")
         fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)

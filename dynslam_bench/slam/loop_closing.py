@@ -6,14 +6,14 @@
 2. *Verify*: a pose by RANSAC, then by all points around the candidate, in metres since depth is known. It must explain
    most of what should be in view, agree with the keyframes before, and ask for no more correction than the way since
    the candidate may have drifted. The last condition is ours: rooms that look the same pass all others.
-3. *Correct*: a pose graph over all keyframes: neighbours in time, those that share many points, all loops.
+3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loops. A map of its own,
+   begun after the camera was lost where nothing was recognised, is moved to where it belongs instead, as it is.
 4. *Fuse*: points of both visits that are one thing in the world are merged, and the surroundings are adjusted.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,12 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 
 from .bundle.pose_graph import Edge, optimise_poses
-from .bundle.with_gtsam import load_gtsam
 from .localisation.observation import Observations
+from .localisation.recognition import around, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
-from .localisation.tracking import Matches, match_map, solve
+from .localisation.surroundings import apart
+from .localisation.tracking import Matches
+from .mapping.islands import Islands
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
 from .places import likeness
@@ -34,8 +36,6 @@ from .settings import BackendSettings
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
-AROUND = 10
-"""Keyframes around each end of a loop whose points are looked for and fused."""
 STRONG = 100
 """Keyframes that share so many points are tied in the pose graph (ORB-SLAM2's number)."""
 SLACK_M, SLACK_DEG = 0.1, 3.0
@@ -55,6 +55,8 @@ class Loop:
         frame: Index of that keyframe's frame.
         T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
         inliers: Points that fit it.
+        share: How many of the keyframe's own points in view are among them, of one.
+        joins: Whether the place lies on another island of the map.
         moved_m: How far the newest keyframe is from where it was believed to be, metres.
         turned_deg: By how much it is turned, degrees.
     """
@@ -63,6 +65,8 @@ class Loop:
     frame: int
     T_cam_world: Array
     inliers: int
+    share: float
+    joins: bool
     moved_m: float
     turned_deg: float
 
@@ -73,18 +77,15 @@ class LoopCloser:
     Args:
         world: The map.
         mapper: Fuses and adjusts.
+        islands: Where parts of the map may lie that are connected with the first one by nothing.
         settings: Of the back end.
         seed: Founds RANSAC's draws.
-
-    Raises:
-        TrackerError: Loops are to be closed, and gtsam is not installed.
     """
 
-    def __init__(self, world: Map, mapper: LocalMapper, settings: BackendSettings, seed: int) -> None:
-        if settings.loop_closing.enabled:
-            load_gtsam("backend.loop_closing.enabled")  # better now than at the first loop
+    def __init__(self, world: Map, mapper: LocalMapper, islands: Islands, settings: BackendSettings, seed: int) -> None:
         self.world = world
         self.mapper = mapper
+        self.islands = islands
         self.settings = settings
         self.closed: list[Loop] = []
         """All loops that were closed."""
@@ -117,7 +118,10 @@ class LoopCloser:
         if len(self._row) < self.settings.loop_closing.confirmations:
             return False
         self._row.clear()
-        self._correct(slot, loop)
+        if loop.joins:
+            self._join(slot, loop, correction)
+        else:
+            self._correct(slot, loop)
         self._fuse(slot, loop.keyframe)
         self.closed.append(loop)
         return True
@@ -131,22 +135,11 @@ class LoopCloser:
         self._last_centre = centre.copy()
         self._way[int(self.world.kf_id[slot])] = self._walked
 
-    def _elsewhere(self, slot: int) -> Slots:
-        """Keyframes that are old, and connected with this one over no third."""
-        world = self.world
-        near, _ = world.covisible(slot)
-        connected = np.zeros(world.kf_alive.size, bool)
-        connected[slot] = True
-        connected[near] = True
-        table = world.kf_point[near]
-        further, _ = world.covisible_of(np.unique(table[table >= 0]))
-        connected[further] = True
-        old = world.kf_id <= world.kf_id[slot] - self.settings.loop_closing.away
-        return np.flatnonzero(world.kf_alive & old & ~connected)
-
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
         s = self.settings.loop_closing
-        elsewhere = self._elsewhere(slot)
+        elsewhere = apart(self.world, slot, s.away)
+        there, here = self.world.kf_island[elsewhere], self.world.kf_island[slot]
+        elsewhere = elsewhere[(there == here) | (there == 0) | (here == 0)]
         if not len(elsewhere):
             return None
         rng = stream(self._seed, "loop", int(self.world.kf_id[slot]))
@@ -160,7 +153,7 @@ class LoopCloser:
         return None
 
     def _as_alike_as_neighbours(self, slot: int, elsewhere: Slots, seen: Observations) -> list[int]:
-        near = self._around(slot)[1:]
+        near = around(self.world, slot)[1:]
         score = likeness(self.world, np.concatenate([near, elsewhere]), seen)
         least = score[: len(near)].min(initial=np.inf)
         there = score[len(near) :]
@@ -178,37 +171,29 @@ class LoopCloser:
         if found is None or np.count_nonzero(found[1]) < s.min_matches // 2:
             return None
         pose, inliers = found
-        known = matches.select(inliers)
-        estimate = solve(world, seen, known, pose)
-        more, _ = match_map(
-            world, seen, estimate.T_cam_world, known, self._points_around(candidate), self.settings.tracking, widen=2.0
-        )
-        joined = known.joined(more)
-        estimate = solve(world, seen, joined, estimate.T_cam_world)
-        if estimate.count < s.min_inliers or not np.isfinite(estimate.T_cam_world).all():
+        place = recognise(world, candidate, seen, matches.select(inliers), pose, self.settings.tracking)
+        if len(place.matches) < s.min_inliers or place.share < s.min_share:
             return None
-        own = world.kf_point[candidate]
-        in_view, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
-        hit = np.isin(in_view, joined.point[estimate.inliers])
-        moved = np.linalg.inv(estimate.T_cam_world)[:3, 3] - world.kf_centre[slot]
-        turned = float(np.degrees(se3.rotation_angle(estimate.T_cam_world @ se3.inverse(world.kf_pose[slot]))))
-        back = int(world.kf_frame[candidate])
-        loop = Loop(candidate, back, estimate.T_cam_world, estimate.count, float(np.linalg.norm(moved)), turned)
-        share = np.count_nonzero(hit) / max(len(in_view), 1)
-        return loop if share >= s.min_share and self._may_be_drift(loop) else None
+        T_cam_world = place.T_cam_world
+        moved = float(np.linalg.norm(se3.inverse(T_cam_world)[:3, 3] - world.kf_centre[slot]))
+        turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
+        back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
+        loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned)
+        return loop if self._believable(slot, loop) else None
 
-    def _may_be_drift(self, loop: Loop) -> bool:
-        s = self.settings.loop_closing
+    def _believable(self, slot: int, loop: Loop) -> bool:
+        """Whether drift explains the correction; where islands meet, whether the camera can have got from one there."""
+        s, world = self.settings.loop_closing, self.world
+        if loop.joins and (loop.inliers < s.join_inliers or loop.share < s.join_share):
+            return False
+        if loop.joins:
+            here, there = int(world.kf_island[slot]), int(world.kf_island[loop.keyframe])
+            correction = se3.inverse(loop.T_cam_world) @ world.kf_pose[slot]
+            if not here:
+                return self.islands.may_lie(there, se3.inverse(correction))
+            return self.islands.may_lie(here, correction)
         way = self._walked - self._way[int(self.world.kf_id[loop.keyframe])]
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
-
-    def _around(self, keyframe: int) -> Slots:
-        near, _ = self.world.covisible(keyframe)
-        return np.concatenate([[keyframe], near[:AROUND]]).astype(np.int64)
-
-    def _points_around(self, keyframe: int) -> Slots:
-        table = self.world.kf_point[self._around(keyframe)]
-        return np.unique(table[table >= 0]).astype(np.int64)
 
     # ------------------------------------------------------------------ correct and fuse
 
@@ -219,17 +204,28 @@ class LoopCloser:
         self._ties = [edge for edge in self._ties if self._alive(edge)] + [tie]
         if loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG:
             return
-        slots = world.keyframes
+        slots = world.island(int(world.kf_island[slot]))
         before = world.kf_pose.copy()
         after = optimise_poses(world.kf_id[slots], before[slots], [*self._edges(slots), *self._ties])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
-        points = world.points[world.n_obs[world.points] > 0]
+        points = np.unique(world.kf_point[slots])
+        points = points[points >= 0].astype(np.int64)
         reference = world.obs_kf[points, 0]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
         now = se3.inverse(world.kf_pose[reference])
         world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
         world.refresh(points)
+
+    def _join(self, slot: int, loop: Loop, correction: Array) -> None:
+        """Move the younger of two islands as a whole to where the older one has the place."""
+        world = self.world
+        here, there = int(world.kf_island[slot]), int(world.kf_island[loop.keyframe])
+        if here > there:
+            world.move_island(here, correction, there)
+        else:
+            world.move_island(there, se3.inverse(correction), here)
+        self._ties.append(self._edge(loop.keyframe, slot, world.kf_pose[slot]))
 
     def _edge(self, one: int, other: int, pose_of_other: Array) -> Edge:
         world = self.world
@@ -241,17 +237,21 @@ class LoopCloser:
         return bool(np.isin([edge.one, edge.other], ids).all())
 
     def _edges(self, slots: Slots) -> list[Edge]:
-        """Ties between keyframes as the map is now: neighbours in time, and those that share many points."""
-        pairs = set(pairwise(slots.tolist()))
+        """Ties between keyframes as the map is now: each with the older ones that share many points, and the most.
+
+        Neighbours in time that share nothing are not tied: the camera was lost between them.
+        """
+        pairs = set()
         for slot in slots.tolist():
             near, shared = self.world.covisible(slot)
-            strong = near[shared >= STRONG]
-            pairs |= {(int(other), slot) for other in strong if self.world.kf_id[other] < self.world.kf_id[slot]}
+            older = self.world.kf_id[near] < self.world.kf_id[slot]
+            near, shared = near[older], shared[older]
+            pairs |= {(int(other), slot) for other in [*near[:1], *near[shared >= STRONG]]}
         return [self._edge(a, b, self.world.kf_pose[b]) for a, b in sorted(pairs)]
 
     def _fuse(self, slot: int, candidate: int) -> None:
-        theirs = self._points_around(candidate)
-        for keyframe in self._around(slot).tolist():
+        theirs = points_around(self.world, candidate)
+        for keyframe in around(self.world, slot).tolist():
             self.mapper.fuse_into(keyframe, theirs[self.world.alive[theirs]])
         self.world.refresh(theirs[self.world.alive[theirs]])
         if self.settings.bundle_adjustment.enabled:

@@ -219,6 +219,12 @@ class BundleAdjustmentSettings(Settings):
     iterations: int = tunable(
         3, low=1, high=10, limits=(1, 100), when=ADJUSTED, meaning="Levenberg-Marquardt iterations"
     )
+    full: bool = Field(
+        False,
+        description="whether to refine all keyframes and points together after the last frame; moves the final "
+        "trajectory alone",
+    )
+    full_iterations: int = Field(10, ge=1, le=1000, description="Levenberg-Marquardt iterations of that")
 
 
 class RelocalisationSettings(Settings):
@@ -243,10 +249,30 @@ class RelocalisationSettings(Settings):
     min_inliers: int = tunable(
         40, low=15, high=80, limits=(6, 1000), meaning="inliers that a recovered pose needs at least"
     )
+    min_share: float = Field(
+        0.4,
+        ge=0,
+        le=1,
+        description="share of a keyframe's own points in view that a frame without prediction must show, too",
+    )
+    max_speed: float = Field(
+        2.0,
+        gt=0,
+        le=1000,
+        description="metres a second, at most, that the camera may have moved while it was lost, unless it was put "
+        "elsewhere from one frame to the next: places farther away only look like the one that is recognised",
+    )
+    new_map_after: int = Field(
+        5,
+        ge=1,
+        le=100000,
+        description="with loop closing: so many frames in a row that show enough but are not recognised begin a map of "
+        "their own; its frames count as lost until a loop joins it to the first one",
+    )
 
 
 class LoopClosingSettings(Settings):
-    """Recognising a place that was left, and correcting the drift since; needs gtsam."""
+    """Recognising a place that was left, and correcting the drift since."""
 
     enabled: bool = Field(False, description="whether to close loops")
     away: int = Field(
@@ -262,6 +288,10 @@ class LoopClosingSettings(Settings):
     min_share: float = Field(
         0.3, ge=0, le=1, description="share of the candidate's own points in view that must be among them"
     )
+    join_inliers: int = Field(
+        100, ge=10, le=10000, description="the same where two maps would be joined, which no drift bounds"
+    )
+    join_share: float = Field(0.5, ge=0, le=1, description="the same share where two maps would be joined")
     confirmations: int = Field(3, ge=1, le=20, description="keyframes in a row that must agree on the correction")
     drift_share: float = Field(
         0.03,

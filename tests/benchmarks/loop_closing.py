@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--alike", action="store_true", help="half of the points the same in all corridors")
     options = parser.parse_args()
     for side in options.side:
-        world = RingWorld(side, alike=options.alike)
+        world = RingWorld(side, alike=0.5 if options.alike else 0.0)
         way = 4 * (side - 2) + 2 * np.pi
         print(f"{way:.1f} m a lap, {len(world.walls)} points", flush=True)
         for closing in (False, True):

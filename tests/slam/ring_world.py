@@ -19,9 +19,9 @@ def turned(quarters):
 
 
 class RingWorld(PointWorld):
-    """A ring with centre lines of `side` metres; with `alike` half of the points are the same in all four corridors."""
+    """A ring with centre lines of `side` metres; a share `alike` of the points is the same in all four corridors."""
 
-    def __init__(self, side=6.0, density=24, seed=0, *, alike=False):
+    def __init__(self, side=6.0, density=24, seed=0, *, alike=0.0):
         rng = np.random.default_rng(seed)
         walls, looks, same = [], [], {}
         for r in (side / 2 + WIDTH / 2, side / 2 - WIDTH / 2):
@@ -30,7 +30,8 @@ class RingWorld(PointWorld):
                 wall = np.stack([rng.uniform(-r, r, n), rng.uniform(-1.2, 1.3, n), np.full(n, r)], axis=1)
                 look = rng.integers(0, 256, (n, 32), dtype=np.uint8)
                 if alike:
-                    wall[: n // 2], look[: n // 2] = same.setdefault(r, (wall[: n // 2], look[: n // 2]))
+                    common = int(alike * n)
+                    wall[:common], look[:common] = same.setdefault(r, (wall[:common], look[:common]))
                 walls.append(wall @ turned(quarter).T)
                 looks.append(look)
         self.side = side

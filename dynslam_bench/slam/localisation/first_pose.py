@@ -12,16 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
+from dynslam_bench.geometry import se3
 
+from ..mapping.islands import Islands
 from ..mapping.map import Map
 from ..places import most_alike
 from ..settings import BackendSettings, TrackingSettings
 from .observation import Observations
 from .pose import PoseEstimate
+from .recognition import recognise
 from .relocalisation import Relocalised, locate
 from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
 
 Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
 
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
@@ -38,7 +42,9 @@ class Before:
         last: The last tracked frame.
         prediction: World-to-camera pose that the motion model expects.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
-        tracked: Whether the frame before this one was tracked.
+        keyframes: Slots of the keyframes near which the frame may have been taken.
+        lost_on: The island, or 0, where the camera was tracked last; None if the frame before this one was tracked.
+        reach_m: How far it may have gone since then.
         close_m: Depth below which a feature's depth is trusted, metres.
         seed: Of the sequence's random draws.
         frame: Index of the frame that comes.
@@ -47,7 +53,9 @@ class Before:
     last: Tracked
     prediction: Array
     reference: int
-    tracked: bool
+    keyframes: Slots
+    lost_on: int | None
+    reach_m: float
     close_m: float
     seed: int
     frame: int
@@ -60,15 +68,19 @@ class FirstPose:
     Attributes:
         T_cam_world: World-to-camera pose.
         matches: The matches that agree.
+        keyframe: Slot of a keyframe nearby: the one that they are with, or else the last frame's reference.
         relocalised: Whether they are a keyframe's, not the last frame's.
     """
 
     T_cam_world: Array
     matches: Matches
+    keyframe: int
     relocalised: bool
 
 
-def first_pose(world: Map, seen: Observations, before: Before, settings: BackendSettings) -> FirstPose | None:
+def first_pose(
+    world: Map, islands: Islands, seen: Observations, before: Before, settings: BackendSettings
+) -> FirstPose | None:
     """A first pose, or None.
 
     The last frame's map points come first. Where they are few, what only its depth gives helps as well. A pose that few
@@ -76,6 +88,7 @@ def first_pose(world: Map, seen: Observations, before: Before, settings: Backend
 
     Args:
         world: The map.
+        islands: Where parts of it may lie that are connected with the first one by nothing.
         seen: The frame's features.
         before: What is known of the camera.
         settings: Of tracking and relocalisation.
@@ -86,15 +99,33 @@ def first_pose(world: Map, seen: Observations, before: Before, settings: Backend
         if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
             best = matches, estimate
         if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
-            return _agreed(*best, relocalised=False)
-    found = _from_keyframes(world, seen, before, settings, ENOUGH_FIRST // 2 if best is None else best[1].count + 1)
+            return _agreed(*best, before.reference, relocalised=False)
+    found = _from_keyframes(
+        world, islands, seen, before, settings, ENOUGH_FIRST // 2 if best is None else best[1].count + 1
+    )
     if found is not None:
-        return _agreed(found.matches, found.estimate, relocalised=True)
-    return None if best is None else _agreed(*best, relocalised=False)
+        return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
+    return None if best is None else _agreed(*best, before.reference, relocalised=False)
 
 
-def _agreed(matches: Matches, estimate: PoseEstimate, *, relocalised: bool) -> FirstPose:
-    return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), relocalised)
+def _is_there(
+    world: Map, islands: Islands, seen: Observations, found: Relocalised, before: Before, settings: BackendSettings
+) -> bool:
+    """Whether the camera can have got to a keyframe's place, and what was mapped around that is there.
+
+    A place may only have something in common with another.
+    """
+    there = int(world.kf_island[found.keyframe])
+    last, now = (se3.inverse(pose)[:3, 3] for pose in (before.last.T_cam_world, found.estimate.T_cam_world))
+    if before.lost_on is not None and not islands.within(before.lost_on, there, last, now, before.reach_m):
+        return False
+    matches = found.matches.select(found.estimate.inliers)
+    place = recognise(world, found.keyframe, seen, matches, found.estimate.T_cam_world, settings.tracking)
+    return place.share >= settings.relocalisation.min_share
+
+
+def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool) -> FirstPose:
+    return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), keyframe, relocalised)
 
 
 def _from_last_frame(world: Map, seen: Observations, before: Before, s: TrackingSettings) -> Iterator[Matches]:
@@ -108,14 +139,16 @@ def _from_last_frame(world: Map, seen: Observations, before: Before, s: Tracking
 
 
 def _from_keyframes(
-    world: Map, seen: Observations, before: Before, settings: BackendSettings, least: int
+    world: Map, islands: Islands, seen: Observations, before: Before, settings: BackendSettings, least: int
 ) -> Relocalised | None:
     """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike."""
     s = settings.relocalisation
     rng = stream(before.seed, "relocalisation", before.frame)
-    for alike in (False, True) if before.tracked else (True,):
-        keyframes = most_alike(world, world.keyframes, seen, s.searched) if alike else [before.reference]
+    for alike in (True,) if before.lost_on is not None else (False, True):
+        keyframes = most_alike(world, before.keyframes, seen, s.searched) if alike else [before.reference]
         found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
-        if found is not None and found.estimate.count >= least:
+        if found is None or found.estimate.count < least:
+            continue
+        if not alike or _is_there(world, islands, seen, found, before, settings):
             return found
     return None

@@ -196,7 +196,12 @@ class MapFit:
 
 
 def fit_to_map(
-    world: Map, seen: Observations, known: Matches, T_cam_world: Array, settings: TrackingSettings
+    world: Map,
+    seen: Observations,
+    known: Matches,
+    T_cam_world: Array,
+    candidates: Slots,
+    settings: TrackingSettings,
 ) -> MapFit:
     """Look for the rest of the local map around a first pose, and fit the pose to all of it.
 
@@ -207,9 +212,9 @@ def fit_to_map(
         seen: The frame's features.
         known: Matches of the first pose.
         T_cam_world: The first pose.
+        candidates: Slots of the points to look for.
         settings: Radius, descriptor distances and number of inliers.
     """
-    candidates = local_points(world, known, settings.local_map)
     found, in_view = match_map(world, seen, T_cam_world, known, candidates, settings)
     matches = known.joined(found)
     mapped = matches.select(matches.point >= 0)
@@ -217,13 +222,3 @@ def fit_to_map(
         matches = mapped
     estimate = solve(world, seen, matches, T_cam_world)
     return MapFit(matches, estimate, estimate.inliers & (matches.point >= 0), in_view)
-
-
-def local_points(world: Map, known: Matches, mode: str, limit: int = 80) -> Slots:
-    """Which map points to look for: all, or those that keyframes see which share points with the known matches."""
-    if mode == "all":
-        return world.points
-    near, _ = world.covisible_of(known.point)
-    near = near[:limit]
-    points = np.unique(world.kf_point[near])
-    return points[points >= 0].astype(np.int64)

@@ -41,7 +41,10 @@ class History:
         self._reference[rows] = heir
 
     def poses(self, world: Map) -> tuple[Array, Array, Array]:
-        """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``."""
-        n = self.count
-        poses = self._relative[:n] @ world.kf_pose[self._reference[:n]]
-        return self._stamp[:n].copy(), poses, self._information[:n].astype(np.float64)
+        """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``.
+
+        Frames of islands that never met the first map are left out: where they were taken in its world is unknown.
+        """
+        rows = np.flatnonzero(world.kf_island[self._reference[: self.count]] == 0)
+        poses = self._relative[rows] @ world.kf_pose[self._reference[rows]]
+        return self._stamp[rows], poses, self._information[rows].astype(np.float64)

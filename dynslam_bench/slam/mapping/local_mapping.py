@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from dynslam_bench.features.matching import CellGrid, search_in_radius
 from dynslam_bench.geometry import se3
 
-from ..bundle.schur import BundleProblem, adjust_bundle
+from ..bundle.schur import adjust_bundle
 from ..localisation.observation import Observations
-from ..settings import BackendSettings, BundleAdjustmentSettings
+from ..settings import BackendSettings
+from .bundles import Bundle, around, whole
 from .map import Map
 from .triangulation import triangulate
 
@@ -43,7 +44,7 @@ class LocalMapper:
         return self.settings.tracking.close_factor * self.world.camera.baseline_m
 
     def insert(
-        self, seen: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float
+        self, seen: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float, island: int = 0
     ) -> tuple[int, dict[str, float]]:
         """Make a frame a keyframe: new points, fusion, bundle adjustment, culling.
 
@@ -53,6 +54,7 @@ class LocalMapper:
             T_cam_world: The frame's pose.
             frame: Index of the frame.
             stamp: Its timestamp.
+            island: The map that it belongs to (`Map.kf_island`).
 
         Returns:
             The keyframe's slot, and the seconds spent on ``mapping`` and ``bundle_adjustment``.
@@ -61,8 +63,8 @@ class LocalMapper:
         world = self.world
         self.merged.clear()
         self.dropped.clear()
-        first = world.keyframe_count == 0
-        slot = world.add_keyframe(seen, T_cam_world, frame, stamp)
+        first = not world.island(island).size
+        slot = world.add_keyframe(seen, T_cam_world, frame, stamp, island)
         features = np.flatnonzero(point >= 0)
         world.observe(slot, features, point[features])
         world.refresh(np.unique(world.kf_point[slot, features][world.kf_point[slot, features] >= 0]).astype(np.int64))
@@ -180,22 +182,28 @@ class LocalMapper:
 
     def adjust(self, slot: int) -> None:
         """Refine the window around a keyframe."""
-        world = self.world
-        chosen = choose_bundle(world, slot, self.settings.bundle_adjustment)
+        settings = self.settings.bundle_adjustment
+        self._refine(around(self.world, slot, settings), settings.iterations)
+
+    def adjust_all(self) -> None:
+        """Refine all keyframes but the oldest, and all points."""
+        self._refine(whole(self.world), self.settings.bundle_adjustment.full_iterations)
+
+    def _refine(self, chosen: Bundle | None, iterations: int) -> None:
         if chosen is None:
             return
-        problem, poses, points, features = chosen
+        world, problem, poses, points = self.world, chosen.problem, chosen.poses, chosen.points
         solver = adjust_bundle
         if self.settings.bundle_adjustment.solver == "gtsam":
             from ..bundle.with_gtsam import adjust_bundle_gtsam as solver
-        result = solver(problem, self.settings.bundle_adjustment.iterations)
+        result = solver(problem, iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
             return
         for k in range(problem.variable):
             world.set_pose(int(poses[k]), result.poses[k])
         world.position[points] = result.points
         out = ~result.inliers
-        world.unobserve(poses[problem.obs_pose[out]], features[out])
+        world.unobserve(poses[problem.obs_pose[out]], chosen.features[out])
         world.refresh(points[world.alive[points]])
 
     # ------------------------------------------------------------------ keyframes
@@ -205,14 +213,16 @@ class LocalMapper:
         neighbours, _ = world.covisible(slot)
         newest = world.keyframes[-2:]
         for other in neighbours.tolist():
-            if world.kf_id[other] == 0 or other in newest:
+            if other in newest or world.kf_id[other] == 0:
                 continue
             total, redundant = world.redundancy(other, self.close_m)
             if total and redundant > s.redundant_share * total:
                 self.drop_keyframe(other)
-        while world.keyframe_count > s.maximum:
+        while world.keyframe_count > s.maximum:  # of an island one stays: its frames hang on it
             shares = []
-            for other in world.keyframes[1:-2].tolist():
+            kept = world.keyframes[1:-2]
+            alone = np.bincount(world.kf_island[world.keyframes])[world.kf_island[kept]] < 2
+            for other in kept[~alone].tolist():
                 total, redundant = world.redundancy(other, self.close_m)
                 shares.append((-redundant / max(total, 1), int(world.kf_id[other]), other))
             self.drop_keyframe(min(shares)[2])
@@ -221,62 +231,9 @@ class LocalMapper:
         """Remove a keyframe; the heirs of its frames are told through `dropped`."""
         world = self.world
         heirs, _ = world.covisible(slot)
-        heir = int(heirs[0]) if len(heirs) else int(world.keyframes[world.keyframes != slot][-1])
+        if not len(heirs):
+            kin = world.island(int(world.kf_island[slot]))
+            heirs = kin[kin != slot][::-1]
+        heir = int(heirs[0])
         self.dropped.append((slot, heir, world.kf_pose[slot] @ se3.inverse(world.kf_pose[heir])))
         world.remove_keyframe(slot)
-
-
-def choose_bundle(
-    world: Map, slot: int, settings: BundleAdjustmentSettings
-) -> tuple[BundleProblem, Slots, Slots, Slots] | None:
-    """The local window around a keyframe, cut to the observation budget.
-
-    Variable are the keyframe and its most covisible ones; fixed are further keyframes that see the same points, and
-    always at least one. The oldest keyframe of all is never variable.
-
-    Returns:
-        The problem, the slots of its poses and points, and the feature number of each observation; None if there is
-        nothing to refine.
-    """
-    near, _ = world.covisible(slot)
-    variable = np.concatenate([[slot], near[: settings.window - 1]]).astype(np.int64)
-    variable = variable[world.kf_id[variable] > 0]
-    if not len(variable):
-        return None
-    table = world.kf_point[variable]
-    counts = np.bincount(table[table >= 0].astype(np.int64), minlength=world.alive.size)
-    points = np.flatnonzero(counts)
-    further, _ = world.covisible_of(points)
-    further = further[~np.isin(further, variable)][: settings.fixed]
-    if not len(further):
-        if len(variable) < 2:
-            return None
-        further, variable = variable[-1:], variable[:-1]
-    poses = np.concatenate([variable, further])
-    rank = np.full(world.kf_alive.size, -1, np.int64)
-    rank[poses] = np.arange(len(poses))
-    n_obs = world.n_obs[points]
-    width = int(n_obs.max())
-    valid = np.arange(width)[None] < n_obs[:, None]
-    keyframe = world.obs_kf[points, :width]
-    pose = np.where(valid, rank[keyframe], -1)
-    used = pose >= 0
-    support = used.sum(axis=1)
-    worth = support >= 2
-    points, pose, used, support = points[worth], pose[worth], used[worth], support[worth]
-    order = np.lexsort((world.id[points], -support))  # long tracks first
-    order = order[np.cumsum(support[order]) <= settings.observations]
-    order.sort()
-    points, pose, used = points[order], pose[order], used[order]
-    if not len(points):
-        return None
-    obs_point, column = np.nonzero(used)
-    obs_pose = pose[obs_point, column]
-    features = world.obs_ft[points[obs_point], column].astype(np.int64)
-    at = poses[obs_pose]
-    problem = BundleProblem(
-        world.kf_pose[poses], len(variable), world.position[points], obs_pose.astype(np.int64),
-        obs_point.astype(np.int64), world.kf_xy[at, features], world.kf_right[at, features],
-        world.kf_info[at, features], world.kf_info_right[at, features], world.camera,
-    )  # fmt: skip
-    return problem, poses, points, features

@@ -30,8 +30,9 @@ class Map:
     """Keyframes, points and who observes what.
 
     Attributes (keyframes, by slot; F is the largest number of features so far):
-        kf_alive, kf_id, kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count,
-        kf_raw ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave,
+        kf_alive, kf_id, kf_island (0 for the map that began first; others began where nothing was recognised),
+        kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count, kf_raw
+        ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave,
         kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``, kf_point ``[S, F]`` (slot of the observed point, -1).
 
     Attributes (points, by slot):
@@ -57,6 +58,7 @@ class Map:
         s, f, w, m, k = 0, self._features, self._words, 0, 8
         self.kf_alive = np.zeros(s, bool)
         self.kf_id = np.zeros(s, np.int64)
+        self.kf_island = np.zeros(s, np.int64)
         self.kf_frame = np.zeros(s, np.int64)
         self.kf_stamp = np.zeros(s)
         self.kf_pose = np.zeros((s, 4, 4))
@@ -88,8 +90,9 @@ class Map:
         self.obs_ft = np.zeros((m, k), np.int32)
 
     _KEYFRAME_TABLES = (
-        "kf_alive", "kf_id", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_raw", "kf_response",
-        "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right", "kf_words", "kf_point",
+        "kf_alive", "kf_id", "kf_island", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_raw",
+        "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right", "kf_words",
+        "kf_point",
     )  # fmt: skip
     _FEATURE_TABLES = (
         "kf_raw", "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right",
@@ -108,12 +111,17 @@ class Map:
         slots = np.flatnonzero(self.kf_alive)
         return slots[np.argsort(self.kf_id[slots], kind="stable")]
 
+    def island(self, number: int) -> Slots:
+        """Slots of the keyframes of an island, oldest first."""
+        slots = self.keyframes
+        return slots[self.kf_island[slots] == number]
+
     @property
     def keyframe_count(self) -> int:
         """Number of keyframes."""
         return int(np.count_nonzero(self.kf_alive))
 
-    def add_keyframe(self, seen: Observations, T_cam_world: Array, frame: int, stamp: float) -> int:
+    def add_keyframe(self, seen: Observations, T_cam_world: Array, frame: int, stamp: float, island: int = 0) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
         if seen.words.shape[1] != self._words:
             if self.next_keyframe:
@@ -135,6 +143,7 @@ class Map:
         self.kf_alive[slot] = True
         self.kf_id[slot] = self.next_keyframe
         self.next_keyframe += 1
+        self.kf_island[slot] = island
         self.kf_frame[slot] = frame
         self.kf_stamp[slot] = stamp
         self.kf_count[slot] = n
@@ -173,6 +182,23 @@ class Map:
         slots = np.flatnonzero(counts)
         order = np.lexsort((-self.kf_id[slots], -counts[slots]))
         return slots[order], counts[slots[order]]
+
+    def move_island(self, island: int, T_new_old: Array, joined_to: int) -> None:
+        """Move all keyframes of an island, and their points, to where they belong in another, and join it to that.
+
+        Args:
+            island: Its number.
+            T_new_old: From the world as the island had it to the world as the other has it, ``[4, 4]``.
+            joined_to: The other's number.
+        """
+        slots = np.flatnonzero(self.kf_alive & (self.kf_island == island))
+        table = self.kf_point[slots]
+        points = np.unique(table[table >= 0]).astype(np.int64)
+        for slot in slots.tolist():
+            self.set_pose(slot, self.kf_pose[slot] @ se3.inverse(T_new_old))
+        self.position[points] = se3.transform(T_new_old, self.position[points])
+        self.kf_island[slots] = joined_to
+        self.refresh(points)
 
     def remove_keyframe(self, slot: int) -> None:
         """Remove a keyframe, its observations, and the points that nobody observes any more."""

@@ -1,0 +1,75 @@
+"""Maps of their own, begun after the camera was lost where nothing was recognised: where they may lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry import se3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Island:
+    """A map that is connected with the first one by nothing.
+
+    Attributes:
+        start: Camera centre of its first frame in its own world ``[3]``, metres.
+        anchor: Camera centre where the first map was left ``[3]``, in that map's world, metres.
+        reach_m: How far from there it began, at most.
+    """
+
+    start: Array
+    anchor: Array
+    reach_m: float
+
+
+class Islands:
+    """All islands so far, by number (`Map.kf_island`)."""
+
+    def __init__(self) -> None:
+        self._islands: dict[int, Island] = {}
+
+    def begin(self, left: int, start: Array, reach_m: float) -> int:
+        """A new island begins where the camera was lost, as far as anybody knows.
+
+        Args:
+            left: The island, or 0, in which the camera was tracked last.
+            start: Camera centre there ``[3]``; the new island takes it for that of its own first frame.
+            reach_m: How far the camera may have gone since.
+
+        Returns:
+            Its number.
+        """
+        number = 1 + len(self._islands)
+        self._islands[number] = Island(start.copy(), *self._from_first(left, start, reach_m))
+        return number
+
+    def within(self, left: int, there: int, last: Array, now: Array, reach_m: float) -> bool:
+        """Whether a camera can have got from one place to another.
+
+        Args:
+            left: The island, or 0, in which it was tracked last.
+            there: The island, or 0, of the place where it may be now; of others nothing is known.
+            last: Its centre then ``[3]``.
+            now: Its centre now.
+            reach_m: How far it may have gone.
+        """
+        anchor, most = (last, reach_m) if there == left else self._from_first(left, last, reach_m)
+        return there in (left, 0) and bool(np.linalg.norm(now - anchor) <= most)
+
+    def may_lie(self, number: int, T_first_island: Array) -> bool:
+        """Whether an island can have begun where a pose ``[4, 4]`` of its world in the first map's puts it."""
+        island = self._islands[number]
+        begun = se3.transform(T_first_island, island.start[None])[0]
+        return bool(np.linalg.norm(begun - island.anchor) <= island.reach_m)
+
+    def _from_first(self, left: int, last: Array, reach_m: float) -> tuple[Array, float]:
+        """Where the first map was left, and how far from there the camera can be now."""
+        island = self._islands.get(left)
+        if island is None:
+            return last.copy(), reach_m
+        return island.anchor, island.reach_m + float(np.linalg.norm(last - island.start)) + reach_m

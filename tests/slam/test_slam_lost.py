@@ -1,0 +1,95 @@
+"""After the camera was lost: what is recognised, what only looks like it, and maps of their own that meet again."""
+
+import numpy as np
+from ring_world import RingWorld
+
+from dynslam_bench.core.settings import apply_overrides
+from dynslam_bench.geometry import se3
+from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.mapping.islands import Islands
+from dynslam_bench.slam.settings import BackendSettings
+
+STEP = 0.15
+QUARTER = round((4.0 + np.pi / 2) / STEP)
+"""Frames from a place to the one that looks the same, a corridor further on."""
+
+
+def drive(world, way, **settings):
+    """States, and errors in metres (infinite: no pose), along frames of a lap, ten a second; None is a blind frame."""
+    backend = RgbdBackend(apply_overrides(BackendSettings(), settings))
+    backend.reset(world.camera, 0)
+    lap = world.lap(max(index for index in way if index is not None) + 1, STEP)
+    states, errors = [], []
+    for number, index in enumerate(way):
+        stamp = number / 10.0
+        frame = world.blind(number, stamp=stamp) if index is None else world.see(lap[index], number, stamp=stamp)
+        found = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
+        states.append(found.state)
+        true = None if index is None else (se3.inverse(lap[way[0]]) @ lap[index])[:3, 3]
+        errors.append(np.inf if true is None else np.linalg.norm(found.T_world_cam[:3, 3] - true))
+    return backend, np.array(states), np.array(errors)
+
+
+def test_what_looks_like_a_place_is_not_it_if_nobody_gets_there_in_the_time():
+    way = [*range(30), None, None, *range(6)]
+    _, states, _ = drive(RingWorld(), way)
+    assert (states[:30] == "ok").all() and (states[30:] == "lost").all(), "4 m in less than a second"
+    _, states, _ = drive(RingWorld(), way, **{"relocalisation.max_speed": 100.0})
+    assert (states[32:] == "ok").all(), "what else would be believed"
+
+
+def test_a_place_that_has_something_in_common_is_not_taken_for_another():
+    way = [*range(15), None, None, *range(QUARTER, QUARTER + 5)]
+    world, fast = RingWorld(alike=0.2), {"relocalisation.max_speed": 100.0}
+    _, states, _ = drive(world, way, **fast)
+    assert (states[15:] == "lost").all()
+    _, states, errors = drive(world, way, **fast, **{"relocalisation.min_share": 0.0})
+    assert (errors[17:][states[17:] == "ok"] > 3.0).any(), "what else would be believed"
+
+
+def test_a_known_place_is_recognised_at_once_wherever_it_is():
+    way = [*range(50), *range(10, 18)]
+    _, states, errors = drive(RingWorld(), way)
+    assert (states[52:] == "ok").all() and errors[52:].max() < 0.1, "put there from one frame to the next"
+
+
+def test_a_map_of_its_own_is_joined_when_the_camera_comes_round():
+    world, lap = RingWorld(), 4 * QUARTER
+    way = [*range(25), *[None] * 20, *range(60, lap + 20)]
+    backend, states, errors = drive(world, way, **{"loop_closing.enabled": True})
+    joined = int(np.flatnonzero(states[45:] == "ok")[0]) + 45
+    assert joined > 100 and (states[25:joined] == "lost").all() and (states[joined:] == "ok").all()
+    assert errors[joined:].max() < 0.2
+    final = backend.finalize()
+    missing = len(way) - len(final)
+    assert 20 <= missing <= 20 + 6, "what was driven on the island is in the final trajectory"
+    lap_poses = world.lap(lap + 20, STEP)
+    index = [way[round(stamp * 10)] for stamp in final.timestamps]
+    true = se3.transform(se3.inverse(lap_poses[0]), lap_poses[index][:, :3, 3])
+    assert np.linalg.norm(final.positions - true, axis=1).max() < 0.3
+
+
+def test_maps_that_never_meet_stay_apart():
+    way = [*range(25), *[None] * 20, *range(60, 90)]
+    backend, states, _ = drive(RingWorld(), way, **{"loop_closing.enabled": True})
+    assert (states[25:] == "lost").all() and len(backend.finalize()) == 25
+    assert set(backend.world.kf_island[backend.world.keyframes].tolist()) == {0, 1}
+    without, states, _ = drive(RingWorld(), way)
+    assert (states[25:] == "lost").all() and set(without.world.kf_island[without.world.keyframes].tolist()) == {0}
+
+
+def test_an_island_lies_where_the_camera_can_have_got():
+    islands, moved = Islands(), np.eye(4)
+    first = islands.begin(0, np.array([1.0, 0.0, 0.0]), 2.0)
+    second = islands.begin(first, np.array([1.0, 3.0, 0.0]), 1.0)
+    for number, reach in ((first, 2.0), (second, 2.0 + 3.0 + 1.0)):
+        start = np.array([1.0, 0.0 if number == first else 3.0, 0.0])
+        for way in (reach - 0.01, reach + 0.01):
+            moved[:3, 3] = np.array([1.0, 0.0, way]) - start
+            assert islands.may_lie(number, moved) == (way < reach)
+    here = np.zeros(3)
+    assert islands.within(0, 0, here, np.array([0.0, 0.0, 1.9]), 2.0)
+    assert not islands.within(0, 0, here, np.array([0.0, 0.0, 2.1]), 2.0)
+    assert not islands.within(0, first, here, here, 2.0), "nothing is known of the way to another island"
+    assert islands.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.4]), 0.5)
+    assert not islands.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.6]), 0.5)
