@@ -209,8 +209,8 @@ class LoopCloser:
         after = optimise_poses(world.kf_id[slots], before[slots], [*self._edges(slots), *self._ties])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
-        points = np.unique(world.kf_point[slots])
-        points = points[points >= 0].astype(np.int64)
+        seen = np.unique(world.kf_point[slots])
+        points = seen[seen >= 0].astype(np.int64)
         reference = world.obs_kf[points, 0]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
         now = se3.inverse(world.kf_pose[reference])

@@ -114,7 +114,7 @@ class Map:
     def island(self, number: int) -> Slots:
         """Slots of the keyframes of an island, oldest first."""
         slots = self.keyframes
-        return slots[self.kf_island[slots] == number]
+        return slots[np.flatnonzero(self.kf_island[slots] == number)]
 
     @property
     def keyframe_count(self) -> int:

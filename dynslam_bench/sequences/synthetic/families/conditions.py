@@ -56,7 +56,7 @@ def _seen_by(optics: Optics) -> Callable[[World, int], World]:
     return lambda world, _: replace(world, optics=optics)
 
 
-_TAGS = {"empty": ("static",), "walking": ("high-dynamic",)}
+_TAGS: dict[str, tuple[str, ...]] = {"empty": ("static",), "walking": ("high-dynamic",)}
 
 CONDITIONS = tuple(
     Family(name, tuple(_TAGS), partial(build_condition, alter), _TAGS)
