@@ -3,4 +3,8 @@
 from __future__ import annotations
 
 FAST = {"fast": {"segmentation.schedule": "every_nth", "segmentation.n": 3}}
-"""The network sees every third frame; between them masks are carried along by optical flow."""
+"""The network sees every third frame; between them masks are carried along by optical flow.
+
+A quarter to a half of the processor time less. Not worse on rendered scenes; on recorded people, who move as they like,
+6 to 11 % more error was measured.
+"""
