@@ -84,7 +84,8 @@ def test_sequences_list(cli):
     code, out, _ = cli("sequences", "list", "tum/fr3/walking*", "--tag", "high-dynamic")
     lines = out.splitlines()
     assert code == 0
-    assert lines[0] == "TUM RGB-D benchmark (licence CC-BY-4.0; layout: verified on the publisher's files)"
+    assert lines[0].startswith("TUM RGB-D benchmark (8 listed, ")
+    assert lines[0].endswith(" here; licence: CC-BY-4.0; layout: verified on the publisher's files)")
     assert lines[1].split()[:3] == ["sequence", "here", "size"]
     assert [line.split()[0] for line in lines[2:6]] == [
         f"tum/fr3/walking_{motion}" for motion in ("static", "xyz", "halfsphere", "rpy")
@@ -95,10 +96,10 @@ def test_sequences_list(cli):
 
 def test_sequences_are_listed_by_data_set(cli):
     code, out, _ = cli("sequences", "list")
-    heads = [line for line in out.splitlines() if " (licence " in line]
+    heads = [line for line in out.splitlines() if " here; licence" in line]
     titles = {entry.title for entry in catalogue().values()}
     assert code == 0 and len(titles) == 8 and len(heads) == 9
-    assert titles < {head.partition(" (licence ")[0] for head in heads}
+    assert titles < {head.partition(" (")[0] for head in heads}
     assert sum("layout: not verified on the publisher's files" in head for head in heads) == 6
     assert sum("by hand: " in head for head in heads) == 3
     _, out, _ = cli("sequences", "list", "openloris/*", "--json")

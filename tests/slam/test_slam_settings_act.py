@@ -16,7 +16,9 @@ from dynslam_bench.slam.settings import BackendSettings
 
 MANY = {"keyframes.tracked_share": 0.95, "keyframes.established": 1, "keyframes.view_share": 0.98}
 """A keyframe nearly every frame."""
-LOST = {**MANY, "relocalisation.min_inliers": 15}
+BELIEVING = {"relocalisation.min_share": 0.0, "relocalisation.max_speed": 1000.0}
+"""A few features that agree make a place, wherever it is."""
+LOST = {**MANY, **BELIEVING, "relocalisation.min_inliers": 15}
 PARAMETERS = {each.name: each for each in parameters(BackendSettings)}
 Story = Callable[[Any], Iterable[FrameBundle]]
 """Frames of the room of `conftest`."""
