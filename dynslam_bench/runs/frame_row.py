@@ -140,7 +140,7 @@ def _from_json(line: str) -> FrameRow:
         pose = [float(number) for number in pose]
         if len(pose) != 7 or not all(map(math.isfinite, pose)) or math.hypot(*pose[3:]) < 1e-8:
             raise ValueError("it holds no pose")
-    numbers = {name: _number(values[name]) for name in FIXED[3:] if values.get(name) is not None}
+    numbers = {name: _number(values[name]) for name in (*FIXED[3:], _SHARE) if values.get(name) is not None}
     timestamp = float(values["timestamp"])
     if not math.isfinite(timestamp):
         raise ValueError(f"stamp {timestamp}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
-from dynslam_bench.runs.frame_row import FrameRow, read_csv, write_csv
+from dynslam_bench.runs.frame_row import FIXED, FrameRow, read_csv, read_log, write_csv
 from dynslam_bench.runs.snapshots import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
 
 SHAPE = (48, 65, 3)
@@ -71,3 +72,11 @@ def test_the_dynamic_share_is_a_column_where_it_is_known(tmp_path: Path) -> None
     assert [row.dynamic_share for row in read_csv(tmp_path / "known.csv")] == [0.25, 0.0]
     write_csv(tmp_path / "unknown.csv", [FrameRow(0, 1.0, "ok")])
     assert "dynamic_share" not in (tmp_path / "unknown.csv").read_text()
+
+
+def test_a_row_comes_back_whole_from_the_log_of_a_run(tmp_path: Path) -> None:
+    numbers = {name: 0.25 + at for at, name in enumerate((*FIXED[3:], "dynamic_share"))}
+    row = FrameRow(3, 1.5, "ok", **numbers, timings={"read": 0.1}, stats={"culled": 7}, pose=[0.0] * 6 + [1.0])
+    assert None not in [getattr(row, each.name) for each in fields(row)]
+    (tmp_path / "log").write_text(row.to_json())
+    assert read_log(tmp_path / "log") == ([row], "")
