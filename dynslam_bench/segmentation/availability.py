@@ -38,7 +38,7 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
     source = resolve_source(group, sequence.id, sequence.masks, optional=masks_are_optional(settings))
     kind, _, argument = source.partition(":")
     path = Path(argument).expanduser()
-    if kind == "oracle":
+    if kind in ("oracle", "oracle-classes"):
         build_oracle(group, SegmenterContext(sequence.id, sequence.masks))
     elif kind == "recorded":
         _check_recorded(path, group, sequence)

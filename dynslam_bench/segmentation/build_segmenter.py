@@ -218,10 +218,19 @@ def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> S
 
     if context.masks is None:
         raise SegmentationError(
-            f"segmentation.source=oracle: sequence '{context.sequence_id}' has no exact masks",
+            f"segmentation.source={settings.source}: sequence '{context.sequence_id}' has no exact masks",
             "only synthetic/* has them; use coco, onnx:PATH or recorded:DIR",
         )
-    return OracleSegmenter(context.masks)
+    return OracleSegmenter(context.masks, motion=settings.source != "oracle-classes")
+
+
+def build_class_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """Exact masks of the sequence, without what moves.
+
+    Raises:
+        SegmentationError: The sequence has no exact masks.
+    """
+    return build_oracle(settings, context)
 
 
 def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:

@@ -12,17 +12,18 @@ from dynslam_bench.core.settings import Settings, tunable
 
 from .classes import expand_classes
 
-PLAIN_SOURCES = ("auto", "none", "oracle", "embedded", "coco")
+PLAIN_SOURCES = ("auto", "none", "oracle", "oracle-classes", "embedded", "coco")
 PREFIXED_SOURCES = ("onnx", "recorded", "weights", "plugin")
-FORMS = "auto, none, oracle, embedded, coco, onnx:PATH, recorded:DIR, weights:PATH, plugin:ID"
+FORMS = "auto, none, oracle, oracle-classes, embedded, coco, onnx:PATH, recorded:DIR, weights:PATH, plugin:ID"
 
 
 class SegmentationSettings(Settings):
     """Everything that decides which pixels are held for dynamic because of what they show.
 
     `source` is one of ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint), ``none``,
-    ``oracle`` (exact masks), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN
-    checkpoint: torchvision's or our own) and ``plugin:ID``. `classes` is a comma-separated list of COCO names and
+    ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes`` (exact masks of the classes alone),
+    ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN checkpoint: torchvision's or
+    our own) and ``plugin:ID``. `classes` is a comma-separated list of COCO names and
     presets (``person``, ``dynaslam19``, ``all``).
 
     Pixel quantities are pixels of the input frame. `dilation_px` is the *radius* of the elliptic structuring element:
@@ -134,8 +135,10 @@ class SegmentationSettings(Settings):
     def unused(self) -> Mapping[str, str]:
         """What no network is asked for: exact masks are certain, and only some networks take another size of input."""
         kind = self.source.partition(":")[0]
+        exact = ("confidence", "mask_threshold", "nms_iou", "network_side")
         fields = {
-            "oracle": ("confidence", "mask_threshold", "nms_iou", "network_side"),
+            "oracle": exact,
+            "oracle-classes": exact,
             "recorded": ("mask_threshold", "nms_iou", "network_side"),
             "embedded": ("network_side", "classes"),  # it knows people alone
             "onnx": ("network_side",),

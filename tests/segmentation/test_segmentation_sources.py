@@ -132,6 +132,8 @@ def test_oracle_gives_everything_and_the_stage_what_is_dynamic():
     stage = build_segmenter(SegmentationSettings(source="oracle"), masks=Masks())
     assert stage.segment(frame(0)).class_names == ("person",)
     assert stage.segment(frame(1)).class_names == ("person", "chair")
+    by_class = build_segmenter(SegmentationSettings(source="oracle-classes"), masks=Masks())
+    assert by_class.segment(frame(1)).class_names == ("person",)
 
 
 def test_oracle_refuses_what_does_not_fit():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dynslam_bench.contracts.segmenter import Instances
@@ -50,10 +52,12 @@ class OracleSegmenter:
 
     Args:
         source: The sequence's masks.
+        motion: Whether to say what moves; without, objects count by their class alone, as a perfect network has them.
     """
 
-    def __init__(self, source: MaskSource) -> None:
+    def __init__(self, source: MaskSource, *, motion: bool = True) -> None:
         self.source = source
+        self.motion = motion
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of frame `frame.index`.
@@ -66,4 +70,5 @@ class OracleSegmenter:
         except (IndexError, KeyError) as error:
             raise SegmentationError(f"there are no exact masks for frame {frame.index}") from error
         check_mask_shape(np.asarray(masks.instances), frame.rgb.shape, f"exact masks of frame {frame.index}")
-        return instances_of(masks, where=f"exact masks of frame {frame.index}")
+        found = instances_of(masks, where=f"exact masks of frame {frame.index}")
+        return found if self.motion else replace(found, moving=None)
