@@ -41,7 +41,7 @@ def test_dynamic_holds_every_ranked_system_on_the_eight_twins() -> None:
     assert load_suite("dynamic-full").trackers == suite.trackers
     objects = load_suite("objects")
     assert set(suite.trackers) - {"emfoa-oft-paper"} < set(objects.trackers), "its dense flow takes seconds a frame"
-    assert objects.settings == {"segmentation.source": "oracle"}
+    assert objects.settings == {"segmentation.source": "oracle-classes"}
 
 
 def write(path: Path, text: str) -> Path:
