@@ -209,7 +209,7 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
 
 
 def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """Exact masks of the sequence.
+    """Exact masks of the sequence; with ``oracle`` also of what moves, whatever its class.
 
     Raises:
         SegmentationError: The sequence has no exact masks.
@@ -222,15 +222,6 @@ def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> S
             "only synthetic/* has them; use coco, onnx:PATH or recorded:DIR",
         )
     return OracleSegmenter(context.masks, motion=settings.source != "oracle-classes")
-
-
-def build_class_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """Exact masks of the sequence, without what moves.
-
-    Raises:
-        SegmentationError: The sequence has no exact masks.
-    """
-    return build_oracle(settings, context)
 
 
 def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:

@@ -15,7 +15,7 @@ def _builtin() -> Iterable[SegmenterSpec]:
     mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
     return (
         SegmenterSpec("oracle", f"{here}:build_oracle", "exact masks of rendered sequences"),
-        SegmenterSpec("oracle-classes", f"{here}:build_class_oracle",
+        SegmenterSpec("oracle-classes", f"{here}:build_oracle",
                       "exact masks of rendered sequences, by class alone: a perfect network"),
         SegmenterSpec("recorded", f"{here}:build_recorded", "PNG masks from a folder (recorded:DIR)"),
         SegmenterSpec("onnx", f"{here}:build_onnx", "YOLO-seg, semantic or torchvision networks (onnx:PATH)"),
