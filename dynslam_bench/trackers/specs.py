@@ -11,8 +11,8 @@ from .systems import dynaslam, emfoa_oft
 
 _SYSTEMS = (
     "blitz_slam", "cfp_slam", "chen_slam", "dai_slam", "detect_slam", "dgs_slam", "di_slam", "ds_slam", "dynatm_slam",
-    "huai_slam", "mask_rcnn", "mor_slam", "ngd_slam", "opf_slam", "orb_slam2", "seg_slam", "sgc_slam", "sof_slam",
-    "yolo_slam",
+    "huai_slam", "mask_rcnn", "mor_slam", "ngd_slam", "opf_slam", "orb_slam2", "orb_slam2_mono", "seg_slam", "sgc_slam",
+    "sof_slam", "yolo_slam",
 )  # fmt: skip
 """Modules of ``systems/`` with one spec each."""
 

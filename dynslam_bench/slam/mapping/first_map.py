@@ -1,0 +1,122 @@
+"""The first map of a camera without depth: two keyframes and what both show, the median depth being one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.geometry.camera import Camera
+
+from ..bundle.schur import BundleProblem, adjust_bundle
+from ..localisation.observation import Observations
+from ..localisation.two_views import Pair, TwoViews, match_views, reconstruct
+from ..monocular_settings import TwoViewSettings
+from .map import Map
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 20
+"""Of the bundle adjustment over the two keyframes (ORB-SLAM2's number)."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame, and its features as the back end uses them."""
+
+    frame: FrameBundle
+    seen: Observations
+
+
+@dataclass(frozen=True, eq=False)
+class FirstMap:
+    """Two views and what they give together; lengths in units of the first view's median depth.
+
+    Attributes:
+        first: The first view; its camera is the world's frame of reference.
+        second: The second.
+        T_cam_world: World-to-camera pose ``[4, 4]`` of the second.
+        pair: Which features show a point.
+        points: World points ``[M, 3]``.
+        flat: Whether they lie on a plane, so far as the views tell.
+    """
+
+    first: View
+    second: View
+    T_cam_world: Array
+    pair: Pair
+    points: Array
+    flat: bool
+
+
+class FirstViews:
+    """Keeps a first view until a later one tells, together with it, how the camera moved."""
+
+    def __init__(self) -> None:
+        self._first: View | None = None
+        self._expected: Array = np.zeros((0, 2))
+
+    def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
+        """Try the next frame with the first view; it takes that one's place where they have too little in common.
+
+        Args:
+            view: The next frame.
+            camera: Intrinsics, without distortion.
+            settings: What is asked of the two views.
+        """
+        first = self._first
+        if first is None:
+            self._begin(view, settings)
+            return None
+        pair = match_views(first.seen, view.seen, self._expected, settings.radius_px)
+        if len(pair) < settings.min_matches:
+            self._begin(view, settings)
+            return None
+        self._expected[pair.first] = view.seen.xy[pair.second]
+        found = reconstruct(first.seen, view.seen, pair, camera, settings)
+        return None if found is None else _adjusted(first, view, found, camera, settings.min_points)
+
+    def _begin(self, view: View, settings: TwoViewSettings) -> None:
+        self._first = view if len(view.seen) >= settings.min_matches else None
+        self._expected = view.seen.xy.copy()
+
+
+def _adjusted(first: View, second: View, found: TwoViews, camera: Camera, min_points: int) -> FirstMap | None:
+    """Motion and points refined together, without what does not fit, and scaled; None if too little is left."""
+    count = len(found.pair)
+    features = np.column_stack([found.pair.first, found.pair.second]).ravel()
+    seen = np.column_stack([np.zeros(count, np.int64), np.ones(count, np.int64)]).ravel()  # which view's
+    both = [first.seen, second.seen]
+
+    def of_views(name: str) -> Array:
+        values = [getattr(each, name) for each in both]
+        return np.array([values[view][feature] for view, feature in zip(seen, features, strict=True)])
+
+    problem = BundleProblem(
+        np.array([found.T_second_first, np.eye(4)]), 1, found.points, 1 - seen, np.repeat(np.arange(count), 2),
+        of_views("xy"), of_views("right"), of_views("info"), of_views("info_right"), camera,
+    )  # fmt: skip
+    result = adjust_bundle(problem, ITERATIONS)
+    kept = result.inliers.reshape(-1, 2).all(axis=1) & (result.points[:, 2] > 0)
+    if np.count_nonzero(kept) < min_points or not np.isfinite(result.poses).all():
+        return None
+    depth = float(np.median(result.points[kept, 2]))
+    pose = result.poses[0].copy()
+    pose[:3, 3] /= depth
+    pair = Pair(found.pair.first[kept], found.pair.second[kept])
+    return FirstMap(first, second, pose, pair, result.points[kept] / depth, found.flat)
+
+
+def put(world: Map, start: FirstMap) -> tuple[int, int]:
+    """Put a first map into an empty one; the slots of its two keyframes."""
+    poses = np.eye(4), start.T_cam_world
+    slots = [
+        world.add_keyframe(view.seen, pose, view.frame.index, view.frame.timestamp)
+        for view, pose in zip((start.first, start.second), poses, strict=True)
+    ]
+    points = world.add_points(start.points, start.first.seen.rgb[start.pair.first], slots[0], start.pair.first)
+    world.observe(slots[1], start.pair.second, points)
+    world.refresh(points)
+    return slots[0], slots[1]
