@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
-from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
 from dynslam_bench.runs.storage.scoring import score
@@ -73,12 +73,14 @@ class Loaded:
         runs: The newest run of every variant, column and repeat.
         superseded: How many older ones there were.
         stopped: How many runs were left out since they were ended on request.
+        without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
         unreadable: Folders without a valid record, with reasons.
     """
 
     runs: list[LoadedRun] = field(default_factory=list)
     superseded: int = 0
     stopped: int = 0
+    without_scale: int = 0
     unreadable: list[str] = field(default_factory=list)
 
     @cached_property
@@ -111,8 +113,11 @@ def load_runs(
     for store in sources:
         records, unreadable = store.all()
         loaded.unreadable += [f"{bad.path}: {bad.reason}" for bad in unreadable]
-        kept += [(store, record) for record in records if record.status != "stopped"]
-        loaded.stopped += sum(record.status == "stopped" for record in records)
+        ended = [record for record in records if record.status != "stopped"]
+        scored = [record for record in ended if record.tracker.sensors == "rgbd" or protocol.finds_scale]
+        kept += [(store, record) for record in scored]
+        loaded.stopped += len(records) - len(ended)
+        loaded.without_scale += len(ended) - len(scored)
     if kept:
         check_reference(reference, [record.tracker.id for _, record in kept])
     rows = _rows(kept, protocol, on_progress, crew)
@@ -122,6 +127,8 @@ def load_runs(
     for run in sorted(found, key=lambda run: run.row.started):
         newest[run.row.variant_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
     loaded.superseded = len(found) - len(newest)
+    if not newest and loaded.without_scale:
+        raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
     if not newest:
         places = ", ".join(str(store.root) for store in sources)
         raise ReportError(
@@ -129,6 +136,14 @@ def load_runs(
         )
     loaded.runs = list(newest.values())
     return loaded
+
+
+def without_scale_words(count: int, protocol: Protocol) -> str:
+    """Why runs of monocular trackers are in no table, and what shows them."""
+    return (
+        f"{count} runs of monocular trackers: their scale is unknown and {protocol.id} aligns without scale; "
+        f"--protocol {MONOCULAR} shows them"
+    )
 
 
 def _rows(

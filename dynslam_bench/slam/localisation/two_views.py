@@ -29,7 +29,7 @@ RATIO = 0.9
 """Largest Hamming distance of a match, and over that of the second nearest (ORB-SLAM's numbers)."""
 CHI2_LINE, CHI2_POINT = 3.841, 5.991
 """95 % quantiles of chi-square: distance from a line, and from a point."""
-FLAT_SHARE = 0.45
+FLAT_SHARE = 0.5
 """The homography is taken where its score is a larger share of both scores (ORB-SLAM 0.40, 0.45 and 0.50)."""
 SURE_SHARE = 0.9
 """Share of the matches that fit the model which must lie before both cameras and project back."""
