@@ -71,8 +71,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     ``episode_metrics`` under the protocol named by ``protocol``. What is not defined is left out, never NaN. Wall-clock
     times are no part of it: see `timings`.
 
-    **Monocular trackers** (`TrackerSpec.sensors` is ``rgb``) give poses in a unit of their own: no pose error is known as
-    frames come, so none is given and the reward is 0; the last step's metrics need a protocol with Sim(3) alignment.
+    **Monocular trackers** (`TrackerSpec.sensors` is ``rgb``) give poses in a unit of their own. No pose error is known
+    as frames come: none is given, and the reward is 0. The last step's metrics need a protocol with Sim(3) alignment.
 
     **End**: ``truncated`` at the end of the sequence, ``terminated`` after `lost_after` lost frames in a row.
 
@@ -207,7 +207,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             tracker.configure(self.settings)  # type: ignore[attr-defined]
         tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
         self.episode = Episode()
-        self._errors = OnlineError(self.sequence.ground_truth if self.tracker_spec.metric else None, self.protocol.max_dt)
+        self._errors = OnlineError(
+            self.sequence.ground_truth if self.tracker_spec.metric else None, self.protocol.max_dt
+        )
         self._final = None
         self._canvas = None
         self._track_next(tracker)

@@ -10,16 +10,12 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.geometry.camera import Camera
 
-from ..bundle.schur import BundleProblem, adjust_bundle
 from ..localisation.observation import Observations
 from ..localisation.two_views import Pair, TwoViews, match_views, reconstruct
 from ..monocular_settings import TwoViewSettings
 from .map import Map
 
 Array = NDArray[np.float64]
-
-ITERATIONS = 20
-"""Of the bundle adjustment over the two keyframes (ORB-SLAM2's number)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +36,6 @@ class FirstMap:
         T_cam_world: World-to-camera pose ``[4, 4]`` of the second.
         pair: Which features show a point.
         points: World points ``[M, 3]``.
-        flat: Whether they lie on a plane, so far as the views tell.
     """
 
     first: View
@@ -48,7 +43,6 @@ class FirstMap:
     T_cam_world: Array
     pair: Pair
     points: Array
-    flat: bool
 
 
 class FirstViews:
@@ -76,37 +70,18 @@ class FirstViews:
             return None
         self._expected[pair.first] = view.seen.xy[pair.second]
         found = reconstruct(first.seen, view.seen, pair, camera, settings)
-        return None if found is None else _adjusted(first, view, found, camera, settings.min_points)
+        return None if found is None else _scaled(first, view, found)
 
     def _begin(self, view: View, settings: TwoViewSettings) -> None:
         self._first = view if len(view.seen) >= settings.min_matches else None
         self._expected = view.seen.xy.copy()
 
 
-def _adjusted(first: View, second: View, found: TwoViews, camera: Camera, min_points: int) -> FirstMap | None:
-    """Motion and points refined together, without what does not fit, and scaled; None if too little is left."""
-    count = len(found.pair)
-    features = np.column_stack([found.pair.first, found.pair.second]).ravel()
-    seen = np.column_stack([np.zeros(count, np.int64), np.ones(count, np.int64)]).ravel()  # which view's
-    both = [first.seen, second.seen]
-
-    def of_views(name: str) -> Array:
-        values = [getattr(each, name) for each in both]
-        return np.array([values[view][feature] for view, feature in zip(seen, features, strict=True)])
-
-    problem = BundleProblem(
-        np.array([found.T_second_first, np.eye(4)]), 1, found.points, 1 - seen, np.repeat(np.arange(count), 2),
-        of_views("xy"), of_views("right"), of_views("info"), of_views("info_right"), camera,
-    )  # fmt: skip
-    result = adjust_bundle(problem, ITERATIONS)
-    kept = result.inliers.reshape(-1, 2).all(axis=1) & (result.points[:, 2] > 0)
-    if np.count_nonzero(kept) < min_points or not np.isfinite(result.poses).all():
-        return None
-    depth = float(np.median(result.points[kept, 2]))
-    pose = result.poses[0].copy()
+def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
+    depth = float(np.median(found.points[:, 2]))
+    pose = found.T_second_first.copy()
     pose[:3, 3] /= depth
-    pair = Pair(found.pair.first[kept], found.pair.second[kept])
-    return FirstMap(first, second, pose, pair, result.points[kept] / depth, found.flat)
+    return FirstMap(first, second, pose, found.pair, found.points / depth)
 
 
 def put(world: Map, start: FirstMap) -> tuple[int, int]:

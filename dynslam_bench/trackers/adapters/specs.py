@@ -133,4 +133,13 @@ OPEN3D_ODOMETRY = TrackerSpec(
 
 def adapter_specs() -> list[TrackerSpec]:
     """The control trackers and the adapters."""
-    return [NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY]
+    return [
+        NEVER_MOVE,
+        CONSTANT_VELOCITY,
+        REPLAY,
+        SUBPROCESS,
+        ORBSLAM3,
+        ORBSLAM3_MONO,
+        OPENCV_ODOMETRY,
+        OPEN3D_ODOMETRY,
+    ]

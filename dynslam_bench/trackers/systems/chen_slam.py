@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 
-from .composition import SemanticSystemSettings, SystemSettings, compose
+from .composition import SemanticSystemSettings, compose
 from .monocular import BACKEND, MonocularSemanticSettings
 from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
