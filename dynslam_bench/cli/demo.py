@@ -27,7 +27,7 @@ TUNED = (
     "flow.refinement_iterations",
 )
 """What the study tunes of it: how long the flow searches."""
-STUDY_FRAMES = 0.2
+STUDY_FRAMES = 0.25
 """Frames of a block of the study, as a share of the runs' frames; `FEWEST_FRAMES` at least."""
 FEWEST_FRAMES = 20
 
@@ -55,12 +55,12 @@ class DemoOutcome:
     failed: int
 
 
-def run_demo(results: Path | str = "results", *, frames: int = 150, jobs: int = 2, trials: int = 6) -> DemoOutcome:
+def run_demo(results: Path | str = "results", *, frames: int = 100, jobs: int = 2, trials: int = 6) -> DemoOutcome:
     """Render walking and sitting people, run the suite ``demo`` on them, report it, and tune `STUDIED`.
 
     Args:
         results: Results folder; the report is ``report/index.html`` in it, the study lies in ``study``.
-        frames: Frames of each sequence; blocks of the study have a fifth of them.
+        frames: Frames of each sequence; blocks of the study have a quarter of them.
         jobs: Runs at a time.
         trials: Trials of the study.
 
