@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from statistics import mean
 from typing import TYPE_CHECKING
@@ -17,8 +16,11 @@ TELLING = 1.5
 SEQUENCES, STUDY_SCENES, SINGLE_RUNS = 2, 6, 24
 RENDER_S, START_S, REPORT_S = 0.12, 1.0, 15.0
 """Processor seconds of a rendered frame, of a run's start, and of the pages, on a two-core machine."""
-TRACK_S = {"never-move": 0.006, PLAIN: 0.018, "mask-rcnn": 0.042, "emfoa-oft": 0.045}
-"""Processor seconds of a frame, reading it included."""
+TRACK_S = {"never-move": 0.015, PLAIN: 0.035, "mask-rcnn": 0.13, "emfoa-oft": 0.16}
+STUDIED_S = 0.09
+"""Processor seconds of a frame, reading it included: of the runs, and of those of the study."""
+COMPILE_S = 80.0
+"""Processor seconds until all kernels are compiled."""
 
 
 def estimate(frames: int, study_frames: int, trials: int, jobs: int) -> str:
@@ -34,11 +36,11 @@ def estimate(frames: int, study_frames: int, trials: int, jobs: int) -> str:
     runs = SEQUENCES * len(TRACK_S)
     studied = SINGLE_RUNS + 3 * (trials - 2)
     seconds = rendered * RENDER_S + (runs + studied) * START_S + REPORT_S
-    seconds += SEQUENCES * frames * sum(TRACK_S.values()) + studied * study_frames * TRACK_S["emfoa-oft"]
-    minutes = max(1, math.ceil(seconds / max(jobs, 1) / 60))
+    seconds += SEQUENCES * frames * sum(TRACK_S.values()) + studied * study_frames * STUDIED_S
+    minutes, first = (max(1, round(each / max(jobs, 1) / 60)) for each in (seconds, seconds + COMPILE_S))
     machine = f"{jobs} quiet core{'s' * (jobs != 1)}"
     return (
-        f"about {minutes} minute{'s' * (minutes > 1)} on {machine}, two or three times that when it first compiles; "
+        f"about {minutes} minute{'s' * (minutes > 1)} on {machine}, {first} when it first compiles; "
         f"{rendered} frames are rendered, {runs} runs made, and {trials} trials of a study"
     )
 

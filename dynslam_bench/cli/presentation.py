@@ -181,7 +181,7 @@ def audit_paper(
 
 def demo(
     results: Results = Path("results"),
-    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 150,
+    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 100,
     jobs: Jobs = 2,
     trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:

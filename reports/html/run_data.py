@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 MOST_FRAMES = 400
 """Frames of a run that its page shows unless something else is asked for."""
 _LOG_BYTES = 20_000
+_WHOLE = ("total_s", "processor_s", "read_s")
+"""Times of a frame that are no stage of it: the figure stacks stages."""
 
 
 def run_content(
@@ -113,7 +115,7 @@ def _series(frames: RunFrames, most: int) -> dict[str, Any]:
         return {}
     step = -(-len(frames) // most)
     stamps, start = columns["timestamp"], float(columns["timestamp"][0])
-    stages = [name for name in columns if name.endswith("_s") and name not in ("total_s", "read_s")]
+    stages = [name for name in columns if name.endswith("_s") and name not in _WHOLE]
     counts = [name for name in COUNTS if f"stat_{name}" in columns]
     rows = [stamps - start, 1000 * frames.errors_m, 100 * frames.share]
     rows += [columns[f"stat_{name}"] for name in counts] + [1000 * columns[name] for name in stages]

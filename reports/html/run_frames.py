@@ -72,7 +72,7 @@ def read_frames(runs: Sequence[LoadedRun], exact: Mapping[int, float]) -> Iterat
         elif exact:
             share = [exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()]
             yield RunFrames(columns, np.array(share), "exact masks")
-        elif (own := columns.get("stat_mask_fraction")) is not None:
+        elif (own := columns.get("stat_mask_fraction")) is not None and own.any():  # else it may have no masks
             yield RunFrames(columns, own.astype(np.float64), "the tracker's own masks")
         else:
             yield RunFrames(columns, np.full(len(columns["index"]), np.nan), "")

@@ -10,7 +10,7 @@ from dynslam_bench.cli.demo_story import estimate, tell
 from dynslam_bench.reports.model.row import RunRow
 
 
-def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz@100?frames=150") -> RunRow:
+def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz@100?frames=100") -> RunRow:
     return RunRow(
         run_id=f"{tracker}{sequence}", kind="run here", tracker=tracker, label=tracker, sequence=sequence,
         protocol_id="p", protocol_digest="d", held_ate_m=ate_m,
@@ -34,7 +34,7 @@ def test_the_verdict_is_that_of_the_numbers(culled_m: float, verdict: str) -> No
 
 
 def test_every_sequence_has_its_sentence_and_what_did_not_run_has_none() -> None:
-    sitting = row("orb-slam2", 0.003, "synthetic/sitting_xyz@104?frames=150")
+    sitting = row("orb-slam2", 0.003, "synthetic/sitting_xyz@104?frames=100")
     lines = tell([sitting, row("orb-slam2", 0.02), row("mask-rcnn", 0.004)], [])
     assert [line.split(":")[0] for line in lines[:2]] == [
         "Where people walk (walking_xyz@100)", "Where people sit (sitting_xyz@104)"
@@ -58,5 +58,5 @@ def test_what_culling_costs_is_the_median_frame_of_the_runs_that_ended_well() ->
 
 
 def test_the_estimate_grows_with_what_is_asked_for() -> None:
-    assert estimate(150, 37, 6, 2).startswith("about 2 minutes on 2 quiet cores")
-    assert estimate(600, 150, 30, 1).startswith("about 21 minutes on 1 quiet core,")
+    assert estimate(100, 25, 6, 2).startswith("about 2 minutes on 2 quiet cores, 3 when it first compiles; 350 frames")
+    assert estimate(600, 150, 30, 1).startswith("about 37 minutes on 1 quiet core,")

@@ -1,6 +1,8 @@
 """Damaged files of a store, and failures among repeats: the report is made, and says what it left out."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 from reports_fake_store import add_run
@@ -14,8 +16,10 @@ from dynslam_bench.reports.html.run_frames import read_tables
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.runs import repeatability
+from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
 
+BEFORE_REBUILD = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
 HEAD = b"index,timestamp,state,frame_error_trans_m,dynamic_share\n"
 DAMAGE = {
     "no text": b"\xff\xfe\x00\x01",
@@ -81,6 +85,16 @@ def test_what_is_left_out_is_named(store, tmp_path):
     page = build_report(store, tmp_path / "report", picture_seconds=0).html.read_text()
     assert "2 folders without a valid record" in page
     assert all(f"runs/{name}" in page for name in ("d" * 16, "e" * 16))
+
+
+def test_old_runs_scored_under_another_protocol_and_new_unscored_ones_stand_in_one_report(store, tmp_path):
+    old = RunStore(shutil.copytree(BEFORE_REBUILD, tmp_path / "old"))
+    for record in old.all()[0]:
+        score(old, record, "evo-default")
+    paths = build_report([old.root, store.root], tmp_path / "report", picture_seconds=0)
+    rows = rows_of(paths.csv["runs"])
+    assert len(rows) == 6 and len({row["protocol_digest"] for row in rows}) == 1
+    assert {"old-slam", "never-move", "a", "b"} == {row["tracker"] for row in rows}
 
 
 def test_a_tracker_that_always_crashes_is_not_called_repeatable():

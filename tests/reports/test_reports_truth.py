@@ -1,9 +1,12 @@
 """What a glance at the report says is true: on uneven, failing, repeated, cached and confusable results."""
 
+import json
+
 import pandas as pd
 import pytest
 from reports_fake_store import add_run
 from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
+from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
 from dynslam_bench.reports.model.board import make_board
@@ -271,6 +274,22 @@ def test_the_share_without_fundamental_matrix_stands_beside_every_number():
         assert cell_of(each, "OURS").small == "F skipped 98 %"
         assert cell_of(each, "PLAIN").small == ""
     assert "F skipped" not in [c.name for c in leaderboard(make_board([row()]), PROTOCOL).columns]
+
+
+def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_where_there_are_no_masks(tmp_path):
+    store = RunStore(tmp_path / "r")
+    shown = {}
+    for name, known in {"exact": {}, "own": {"exact": False}, "none": {"exact": False, "masks": False}}.items():
+        run_id = add_run(store, name, f"s/{name}", n=40)
+        add_frames(store.folder(run_id), 40, **known)
+        shown[name] = run_id
+    data = build_report(store, tmp_path / "report", picture_seconds=0).html.parent / "data"
+    pages = {name: (data / f"run-{run_id}.js").read_text() for name, run_id in shown.items()}
+    frames = {name: json.loads(text.partition(",")[2].removesuffix(");\n"))["frames"] for name, text in pages.items()}
+    assert {name: set(found["stages"]) for name, found in frames.items()} == {name: {"features"} for name in shown}
+    sources = {"exact": "exact masks", "own": "the tracker's own masks", "none": ""}
+    assert {name: found["share_source"] for name, found in frames.items()} == sources
+    assert {name for name, found in frames.items() if "share" in found} == {"exact", "own"}
 
 
 def test_numbers_have_three_digits_and_no_more():

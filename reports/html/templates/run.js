@@ -54,7 +54,7 @@ const logOf = (run) => section("s-log", "Log", make("pre", { tabIndex: 0, textCo
 function stagesOf(run) {
   if (!run.stages.length) return [];
   const rows = run.stages.map(([name, ...times]) => [name, ...times.map((time) => digits(time))]);
-  const parts = [table(["stage", "median ms", "p95 ms", "mean ms"], rows), make("p", { className: "caption", textContent: "total is the frame time: segmentation included, read (decoding) excluded." })];
+  const parts = [table(["stage", "median ms", "p95 ms", "mean ms"], rows), make("p", { className: "caption", textContent: "total is the frame time: segmentation included, read (decoding) excluded; processor is what all its threads took." })];
   if (run.frames.stages) parts.unshift(figure("stage-stack", "Time of every frame, stage above stage; the first frames, which load and compile, may rise above the figure."));
   return [section("s-stages", "Time by stage", ...parts)];
 }
