@@ -5,13 +5,13 @@
 
 ATE is the RMSE of the translation under --protocol (SE(3) alignment unless told otherwise), over the frames that both
 trackers of a pair of runs have; "own" is over each one's own tracked frames. Online and final trajectory are scored
-apart; a tracker without a final one shows a dash. A frame's time is that of `track()`, decoding excluded; medians and 95th percentiles
-are taken over the frames of a run, then the median over the runs. CPU times include the programs that a tracker has
-started; that of the main threads is what a frame takes on a machine that does nothing else. --offsets starts the
-sequence later, as other samples of the same scene; a last table then pools them. --threads sets the threads of OpenCV,
-OpenMP, torch and the tracker's context; with --pin the process and its children are also held to that many cores, which
-is the only limit that ORB-SLAM3's own threads know. Vary nothing but the trackers: the machine's other load hits both
-alike because the runs alternate.
+apart; a tracker without a final one shows a dash. A frame's time is that of `track()`, decoding excluded; medians and
+95th percentiles are taken over the frames of a run, then the median over the runs. CPU times include the programs that
+a tracker has started; that of the main threads is what a frame takes on a machine that does nothing else. --offsets
+starts the sequence later, as other samples of the same scene; a last table then pools them. --threads sets the threads
+of OpenCV, OpenMP, torch and the tracker's context; with --pin the process and its children are also held to that many
+cores, which is the only limit that ORB-SLAM3's own threads know. Vary nothing but the trackers: the machine's other
+load hits both alike because the runs alternate.
 """
 
 from __future__ import annotations

@@ -39,6 +39,8 @@ RIVAL_SHARE = 0.75
 """A motion that explains a smaller share of what the best one does is no rival."""
 RIVAL_COST, RIVAL_FACTOR = 20.0, 1.2
 """So much more chi-square, on top of so many times the best motion's, must be left to every rival."""
+SAME_SHAPE = 0.08
+"""Two pairs of views tell the same shape if depths differ by less, as a share and in the median, after scaling."""
 SAME_DEG = 1.0, 5.0
 """Motions whose rotations and whose directions differ by less are one."""
 WIDE_POINTS = 50
@@ -87,6 +89,14 @@ class TwoViews:
         lengths = np.linalg.norm(self.points, axis=1) * np.linalg.norm(to_second, axis=1)
         cosine = np.sort((self.points * to_second).sum(axis=1) / np.maximum(lengths, 1e-12))
         return float(np.degrees(np.arccos(np.clip(cosine[min(WIDE_POINTS, len(cosine)) - 1], -1.0, 1.0))))
+
+    def has_shape_of(self, other: TwoViews) -> bool:
+        """Whether features of the first view have the same depths as in another pair with it, up to scale."""
+        _, ours, theirs = np.intersect1d(self.pair.first, other.pair.first, return_indices=True)
+        if len(ours) < WIDE_POINTS:
+            return False
+        ratio = np.log(self.points[ours, 2] / other.points[theirs, 2])
+        return bool(np.median(np.abs(ratio - np.median(ratio))) < SAME_SHAPE)
 
     def is_as(self, other: TwoViews) -> bool:
         """Whether it is the same motion as another."""

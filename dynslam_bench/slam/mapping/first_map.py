@@ -46,11 +46,16 @@ class FirstMap:
 
 
 class FirstViews:
-    """Keeps a first view until a later one tells, together with it, how the camera moved."""
+    """Keeps a first view until later ones tell, together with it, how the camera moved.
+
+    The shutter rolls, people walk, and a turn looks like a step: one frame may tell a wrong motion with a good fit. The
+    next ones then tell another shape of the scene, so that a motion is believed when two frames in turn tell the same.
+    """
 
     def __init__(self) -> None:
         self._first: View | None = None
         self._expected: Array = np.zeros((0, 2))
+        self._told: TwoViews | None = None
 
     def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
         """Try the next frame with the first view; it takes that one's place where they have too little in common.
@@ -70,11 +75,15 @@ class FirstViews:
             return None
         self._expected[pair.first] = view.seen.xy[pair.second]
         found = reconstruct(first.seen, view.seen, pair, camera, settings)
-        return None if found is None else _scaled(first, view, found)
+        if found is None:
+            return None
+        before, self._told = self._told, found
+        return _scaled(first, view, found) if before is not None and found.has_shape_of(before) else None
 
     def _begin(self, view: View, settings: TwoViewSettings) -> None:
         self._first = view if len(view.seen) >= settings.min_matches else None
         self._expected = view.seen.xy.copy()
+        self._told = None
 
 
 def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
