@@ -39,7 +39,7 @@ RIVAL_SHARE = 0.75
 """A motion that explains a smaller share of what the best one does is no rival."""
 RIVAL_COST, RIVAL_FACTOR = 20.0, 1.2
 """So much more chi-square, on top of so many times the best motion's, must be left to every rival."""
-SAME_SHAPE = 0.08
+SAME_SHAPE = 0.1
 """Two pairs of views tell the same shape if depths differ by less, as a share and in the median, after scaling."""
 SAME_DEG = 1.0, 5.0
 """Motions whose rotations and whose directions differ by less are one."""

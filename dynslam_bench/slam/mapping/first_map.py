@@ -18,6 +18,10 @@ from .map import Map
 Array = NDArray[np.float64]
 
 
+STEADY_S = 0.09
+"""Seconds: so long a hand shakes one way."""
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A frame, and its features as the back end uses them."""
@@ -49,13 +53,15 @@ class FirstViews:
     """Keeps a first view until later ones tell, together with it, how the camera moved.
 
     The shutter rolls, people walk, and a turn looks like a step: one frame may tell a wrong motion with a good fit. The
-    next ones then tell another shape of the scene, so that a motion is believed when two frames in turn tell the same.
+    next ones then tell another shape of the scene, so that a motion is believed when all that was told for `STEADY_S`
+    is the same.
     """
 
     def __init__(self) -> None:
         self._first: View | None = None
         self._expected: Array = np.zeros((0, 2))
         self._told: TwoViews | None = None
+        self._since = 0.0
 
     def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
         """Try the next frame with the first view; it takes that one's place where they have too little in common.
@@ -78,7 +84,10 @@ class FirstViews:
         if found is None:
             return None
         before, self._told = self._told, found
-        return _scaled(first, view, found) if before is not None and found.has_shape_of(before) else None
+        if before is None or not found.has_shape_of(before):
+            self._since = view.frame.timestamp
+            return None
+        return _scaled(first, view, found) if view.frame.timestamp - self._since >= STEADY_S else None
 
     def _begin(self, view: View, settings: TwoViewSettings) -> None:
         self._first = view if len(view.seen) >= settings.min_matches else None
