@@ -10,7 +10,8 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
 from .evaluating import DEFAULT_PROTOCOL
-from .run_index import FIELDS, Line, Row, index_file, make_line, read_index, stamp_of, write_index
+from .run_index import FIELDS, FIRST, RUN, STARTED, Line, Row, Stamps, index_file, make_line, read_index, write_index
+from .states import NO_FILE, stamp_if_there, stamp_of
 from .store import RUN_FILE, RunStore, Unreadable
 
 OnProgress = Callable[[int, int], None]
@@ -24,7 +25,7 @@ def list_runs(
 ) -> tuple[list[Row], list[Unreadable]]:
     """Every run as `run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
 
-    Rows are taken from the store's index (see `run_index`) while size and time of the run's record are the same; a
+    Rows are taken from the store's index (see `run_index`) while size and time of the run's record and of its errors are the same; a
     store that cannot be written is read without it.
 
     Args:
@@ -41,7 +42,7 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
     known, is_whole = read_index(path)
     kept: list[Line] = []
     unreadable: list[Unreadable] = []
-    stored, runs = store.ids(), str(store.runs)
+    stored, runs, errors = store.ids(), str(store.runs), str(store.root / "metrics" / protocol.digest())
     there = set(stored)
     ids = [run_id for run_id in known if run_id in there]  # in their order: nearly that of the list
     is_whole &= len(ids) == len(known)
@@ -50,17 +51,25 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
         if position % 100 == 0:
             on_progress(position, len(ids))
         try:
-            stamp = stamp_of(f"{runs}/{run_id}/{RUN_FILE}")
+            stamps = (*stamp_of(f"{runs}/{run_id}/{RUN_FILE}"), *stamp_if_there(f"{errors}/{run_id}.json"))
             line = known.get(run_id)
-            if line is None or (line[0], line[1]) != stamp:
+            if line is None or (*line[:FIRST],) != stamps:
                 is_whole = False
-                record = store.read_whole(run_id)
-                line = make_line(stamp, record, None if record.status == "stopped" else store.score(record, protocol))
+                line = _read(store, run_id, protocol, stamps)
             kept.append(line)
         except (DynslamError, OSError) as error:
             is_whole &= run_id not in known
             unreadable.append(Unreadable(store.folder(run_id), str(error)))
-    kept.sort(key=itemgetter(-1, 2))  # when it began, and its id
+    kept.sort(key=itemgetter(STARTED, RUN))
     if not is_whole:
         write_index(path, kept)
-    return [dict(zip(FIELDS, line[2:], strict=True)) for line in kept], unreadable
+    return [dict(zip(FIELDS, line[FIRST:], strict=True)) for line in kept], unreadable
+
+
+def _read(store: RunStore, run_id: str, protocol: Protocol, stamps: Stamps) -> Line:
+    """The line of a run that is in no index, or has changed since."""
+    record = store.read_whole(run_id)
+    scored = None if record.status == "stopped" else store.score(record, protocol)
+    if stamps[2:] == NO_FILE:  # they have just been written
+        stamps = (*stamps[:2], *stamp_if_there(store.metric_file(run_id, protocol.digest())))
+    return make_line(stamps, record, scored)
