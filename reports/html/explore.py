@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -213,6 +213,7 @@ def write_pages(
         told: Called after every run.
     """
     pages = Pages()
+    runs = [replace(run) for run in runs]  # with records that go when these pages are written
     for run, frames in zip(runs, read_frames(runs, share), strict=True):
         write_side(
             book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth(), most_frames)
@@ -229,7 +230,7 @@ def write_pages(
 def _shares(pieces: Sequence[Sequence[LoadedRun]]) -> list[dict[int, float]]:
     """For each piece the exact share of dynamic pixels of its column's frames, as far as a run has recorded it."""
     by_column: dict[str, list[LoadedRun]] = {}
-    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.record.offset):
+    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.row.offset):
         by_column.setdefault(run.row.column_id, []).append(run)
     known = {column: exact_shares(some) for column, some in by_column.items()}
     return [known[piece[0].row.column_id] for piece in pieces]

@@ -41,9 +41,7 @@ class Tracked:
     def of(cls, run: LoadedRun) -> Tracked:
         """What of a run is needed."""
         row = run.row
-        return cls(
-            str(run.store.root), row.run_id, run.record.sequence.part, row.variant_key, row.metrics["ate_rmse_m"]
-        )
+        return cls(str(run.store.root), row.run_id, run.part, row.variant_key, row.metrics["ate_rmse_m"])
 
     def trajectory(self, which: str) -> Trajectory | None:
         """Its trajectory; None if there is none with a pose, or it is damaged."""

@@ -1,4 +1,4 @@
-"""A file of JSON lines that may be deleted at any time: several processes add to it, damaged lines count as not there."""
+"""A file of JSON lines that any process may add to or delete; of what is damaged nothing counts as there."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """What a list says of each run, a line each in a file of the store, so that a list need not read the records.
 
 A line joins the file when its run is scored for the first time; `run_list` adds those that are missing. Lines hold for
-one state of the run's record and of its stored errors (time and size of both files). The file may be deleted at any time, and whatever of it is damaged
-or out of date counts as not there.
+one state of the run's record and of its stored errors (time and size of both files). The file may be deleted at any
+time, and whatever of it is damaged or out of date counts as not there.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ def list_runs(
 ) -> tuple[list[Row], list[Unreadable]]:
     """Every run as `run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
 
-    Rows are taken from the store's index (see `run_index`) while size and time of the run's record and of its errors are the same; a
-    store that cannot be written is read without it.
+    Rows are taken from the store's index (see `run_index`) while the run's record and its stored errors are the same;
+    a store that cannot be written is read without it.
 
     Args:
         store: The store.
