@@ -77,7 +77,9 @@ def test_a_helper_whose_report_is_gone_ends_without_a_word():
     helper.stdout.close()
     setup = {"protocol": get_protocol("tum-rgbd/v1").model_dump_json(), "output": "x", "picture_seconds": 0}
     setup |= {"most_frames": 1}
-    helper.stdin.write(json.dumps(setup) + "\n" + json.dumps({"kind": "rows", "job": {"store": "x", "runs": []}}) + "\n")
+    helper.stdin.write(
+        json.dumps(setup) + "\n" + json.dumps({"kind": "rows", "job": {"store": "x", "runs": []}}) + "\n"
+    )
     helper.stdin.close()
     said = helper.stderr.read()
     helper.stderr.close()
