@@ -28,7 +28,9 @@ PICTURE_SECONDS = 12.0
 """Time that drawing pictures may take of the making of one report; the next one goes on there."""
 
 MOST_PAGES = 5000
-"""Runs that have a page of their own in one report unless something else is asked for."""
+"""Runs of which all have a page of their own unless something else is asked for."""
+FEWER_PAGES = 2000
+"""Pages of a report of more runs than that: those of the median run of every cell, and others up to this number."""
 
 Progress = Callable[[int, int], None]
 
@@ -87,7 +89,7 @@ def write_explore(
     title: str,
     picture_seconds: float = PICTURE_SECONDS,
     most_frames: int = MOST_FRAMES,
-    most_pages: int = MOST_PAGES,
+    most_pages: int | None = None,
     progress: Progress | None = None,
     crew: Crew | None = None,
 ) -> Explored:
@@ -103,7 +105,7 @@ def write_explore(
         title: Title of the report.
         picture_seconds: Time that opening sequences and drawing pictures may take.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
-        most_pages: Runs that have a page, those with the median error of their cell first.
+        most_pages: Runs that have a page, those with the median error of their cell first; None for `pages_for`.
         progress: Told of the runs that are done, and of all.
         crew: Helpers that write the pages; None to write them here.
 
@@ -111,7 +113,9 @@ def write_explore(
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
     typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
-    paged = _paged(board, loaded, typical, most_pages)
+    paged = _paged(
+        board, loaded, typical, pages_for(len(loaded.runs), len(typical)) if most_pages is None else most_pages
+    )
     shown = (typical | {row.run_id for row in board.rows if row.failed}) & {run.row.run_id for run in paged}
     runs = sorted(paged, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
     done = 0
@@ -163,6 +167,16 @@ def _summed(pieces: Sequence[Sequence[LoadedRun]], written: Sequence[Pages]) -> 
         total.pictured |= pages.pictured
         total.missing += pages.missing
     return sums, total
+
+
+def pages_for(runs: int, typical: int) -> int:
+    """How many pages a report has where nobody asks for another number: of very many runs most are never opened.
+
+    Args:
+        runs: Runs of the report.
+        typical: Those of them with the median error of their cell.
+    """
+    return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
 
 def _paged(board: Board, loaded: Loaded, typical: Set[str], most: int) -> list[LoadedRun]:

@@ -11,7 +11,7 @@ from typing import TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.files import replacing
+from dynslam_bench.core.files import write_lines
 from dynslam_bench.core.reading import MEGABYTE, TABLE_BYTES
 
 T = TypeVar("T")
@@ -55,8 +55,7 @@ def write_line_file(path: Path, lines: Iterable[str], older: str) -> None:
         older: Pattern of the names of its older versions, which go.
     """
     with contextlib.suppress(DynslamError, OSError):
-        with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-            file.writelines(f"{line}\n" for line in lines)
+        write_lines(path, lines)
         for other in path.parent.glob(older):
             if other != path:
                 other.unlink()
