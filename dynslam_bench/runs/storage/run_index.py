@@ -1,14 +1,17 @@
 """What a list says of each run, a line each in a file of the store, so that a list need not read the records.
 
 A line joins the file when its run is scored for the first time; `run_list` adds those that are missing. Lines hold for
-one state of the run's record and of its stored errors (time and size of both files). The file may be deleted at any
-time, and whatever of it is damaged or out of date counts as not there.
+one state of the run's record and of its stored errors (time and size of both files). Errors are always replaced by a
+rename, so that none of them need be looked at while their folder has the time that is noted. The file may be deleted at
+any time, and whatever of it is damaged or out of date counts as not there.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from .line_file import add_lines, read_line_file, write_line_file
 from .record import MetricRecord, RunRecord
+from .states import stamp_if_there
 
 Row = dict[str, Any]
 Stamps = tuple[int, int, int, int]
@@ -36,6 +40,10 @@ FIRST = 4
 """Where the values begin in a line; before them stand the stamps."""
 RUN, STARTED = FIRST + FIELDS.index("run"), FIRST + FIELDS.index("started")
 _LENGTH = FIRST + len(FIELDS)
+_SETTLED_NS = 1_000_000_000
+"""A folder as young as this, when the file was written, may change again without another time."""
+_MOST_VERIFIED = 100
+"""Such notes that a file may have."""
 
 
 def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
@@ -91,11 +99,31 @@ def make_line(stamps: Stamps, record: RunRecord, metrics: MetricRecord | None) -
     return [*stamps, *run_row(record, metrics).values()]
 
 
-def read_index(path: Path) -> tuple[dict[str, Line], bool]:
-    """The last line of each run, and whether the file holds nothing but these."""
+@dataclass(frozen=True)
+class Index:
+    """What the file of a store's lines holds.
+
+    Attributes:
+        lines: The last line of each run, by its id.
+        is_whole: Whether it holds nothing but these.
+        verified_ns: Time of the folder of errors when those of all lines were last found unchanged; 0 if it is so young
+            that it may have changed since without another time.
+    """
+
+    lines: dict[str, Line]
+    is_whole: bool
+    verified_ns: int
+
+
+def read_index(path: Path) -> Index:
+    """What the file holds; nothing if there is none."""
+    written_ns, _ = stamp_if_there(path)
     lines, damaged = read_line_file(path, _LINES)
     found = {line[RUN]: line for line in lines if _is_line(line)}
-    return found, len(found) == len(lines) + damaged
+    verified = [line[0] for line in lines if len(line) == 1 and type(line[0]) is int]
+    is_whole = len(found) + len(verified) == len(lines) + damaged and len(verified) < _MOST_VERIFIED
+    is_settled = bool(verified) and 0 <= verified[-1] < written_ns - _SETTLED_NS
+    return Index(found, is_whole, verified[-1] if is_settled else 0)
 
 
 def add_to_index(path: Path, line: Line) -> None:
@@ -103,9 +131,20 @@ def add_to_index(path: Path, line: Line) -> None:
     add_lines(path, [_text(line)])
 
 
-def write_index(path: Path, lines: Iterable[Line]) -> None:
-    """Write the file anew; those of other versions go. A store that can only be read keeps what it has."""
-    write_line_file(path, map(_text, lines), f"{path.name.partition('-')[0]}*")
+def add_verified(path: Path, folder_ns: int) -> None:
+    """Note that the errors of all lines were unchanged when their folder had that time."""
+    add_lines(path, [_text([folder_ns])])
+
+
+def write_index(path: Path, lines: Iterable[Line], folder_ns: int) -> None:
+    """Write the file anew; those of other versions go. A store that can only be read keeps what it has.
+
+    Args:
+        path: The file.
+        lines: The lines.
+        folder_ns: Time of the folder of errors before theirs were looked at.
+    """
+    write_line_file(path, map(_text, chain([[folder_ns]], lines)), f"{path.name.partition('-')[0]}*")
 
 
 def _text(line: Line) -> str:

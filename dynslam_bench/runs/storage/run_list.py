@@ -10,7 +10,20 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
 from .evaluating import DEFAULT_PROTOCOL
-from .run_index import FIELDS, FIRST, RUN, STARTED, Line, Row, Stamps, index_file, make_line, read_index, write_index
+from .run_index import (
+    FIELDS,
+    FIRST,
+    RUN,
+    STARTED,
+    Line,
+    Row,
+    Stamps,
+    add_verified,
+    index_file,
+    make_line,
+    read_index,
+    write_index,
+)
 from .states import NO_FILE, stamp_if_there, stamp_of
 from .store import RUN_FILE, RunStore, Unreadable
 
@@ -39,10 +52,13 @@ def list_runs(
 
 def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> tuple[list[Row], list[Unreadable]]:
     path = index_file(store.root, protocol)
-    known, is_whole = read_index(path)
+    index = read_index(path)
+    known, is_whole = index.lines, index.is_whole
     kept: list[Line] = []
     unreadable: list[Unreadable] = []
     stored, runs, errors = store.ids(), str(store.runs), str(store.root / "metrics" / protocol.digest())
+    errors_ns, _ = stamp_if_there(errors)
+    as_verified = errors_ns == index.verified_ns != 0
     there = set(stored)
     ids = [run_id for run_id in known if run_id in there]  # in their order: nearly that of the list
     is_whole &= len(ids) == len(known)
@@ -51,8 +67,10 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
         if position % 100 == 0:
             on_progress(position, len(ids))
         try:
-            stamps = (*stamp_of(f"{runs}/{run_id}/{RUN_FILE}"), *stamp_if_there(f"{errors}/{run_id}.json"))
             line = known.get(run_id)
+            time_ns, size = stamp_of(f"{runs}/{run_id}/{RUN_FILE}")
+            scored = line[2:FIRST] if line is not None and as_verified else stamp_if_there(f"{errors}/{run_id}.json")
+            stamps = (time_ns, size, *scored)
             if line is None or (*line[:FIRST],) != stamps:
                 is_whole = False
                 line = _read(store, run_id, protocol, stamps)
@@ -62,7 +80,9 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
             unreadable.append(Unreadable(store.folder(run_id), str(error)))
     kept.sort(key=itemgetter(STARTED, RUN))
     if not is_whole:
-        write_index(path, kept)
+        write_index(path, kept, errors_ns)
+    elif not as_verified:
+        add_verified(path, errors_ns)
     return [dict(zip(FIELDS, line[FIRST:], strict=True)) for line in kept], unreadable
 
 
