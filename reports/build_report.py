@@ -18,7 +18,7 @@ from dynslam_bench.runs.storage.store import RunStore
 
 from .html import sections
 from .html.draft import Draft
-from .html.explore import MOST_PAGES, PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
+from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
 from .html.page import render
 from .html.paper_section import add_paper
 from .html.run_data import MOST_FRAMES
@@ -63,7 +63,7 @@ def build_report(
     rank_seen: bool = False,
     picture_seconds: float = PICTURE_SECONDS,
     most_frames: int = MOST_FRAMES,
-    most_pages: int = MOST_PAGES,
+    most_pages: int | None = None,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = unheard,
@@ -82,7 +82,8 @@ def build_report(
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
-        most_pages: Runs that have a page of their own, those with the median error of their cell first.
+        most_pages: Runs that have a page of their own, those with the median error of their cell first; None for all
+            of up to `MOST_PAGES` runs, and of more for some `FEWER_PAGES`.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -143,12 +144,12 @@ def _drafted(
     return draft
 
 
-def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int) -> str:
+def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None) -> str:
     """The command that makes the report again."""
     words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
     words += ["--on", board.on] if board.on != "common" else []
     words += ["--reference", board.asked_reference] if board.asked_reference else []
-    words += ["--most-pages", str(most_pages)] if most_pages != MOST_PAGES else []
+    words += ["--most-pages", str(most_pages)] if most_pages is not None else []
     return shlex.join(words + ["--rank-seen"] * board.rank_seen)
 
 
@@ -175,7 +176,7 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
         to_latex(table, board.rows[0].protocol_id) for table in draft.tables if table.id not in ("machines", "failures")
     ]
     write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
-    write_atomic(paths.data, data.to_json())
+    data.write(paths.data)
     write_atomic(paths.html, page)
     return paths
 

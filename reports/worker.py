@@ -19,8 +19,9 @@ from dynslam_bench.runs.storage.store import RunStore
 from .html.explore import write_pages
 from .html.pictures import PictureBook
 from .model.common import Tracked, common_of
+from .model.known_rows import KnownRows
 from .model.row import RunRow
-from .model.rows import LoadedRun, make_row
+from .model.rows import LoadedRun
 
 Job = Mapping[str, Any]
 Told = Callable[[str], None]
@@ -47,14 +48,10 @@ class Worker:
         return {"rows": self.rows, "pages": self.pages, "common": self.common}[kind](job)
 
     def rows(self, job: Job) -> list[Any]:
-        """The rows of some runs: ``runs`` holds the store's folder and the run's id of each."""
-        found = []
-        for place, run_id in job["runs"]:
-            store = RunStore(place)
-            record = store.read_whole(run_id)
-            found.append(make_row(store, record, self._protocol).model_dump(mode="json"))
-            self._told(f"scoring {record.tracker.id} on {record.sequence.id}")
-        return found
+        """The rows of some runs: ``store`` is the folder of their store, ``runs`` holds their ids."""
+        rows = KnownRows(RunStore(job["store"]), self._protocol)
+        taken, unreadable = rows.take_all(job["runs"], self._told)
+        return [[each.answer() for each in taken], unreadable]
 
     def pages(self, job: Job) -> list[Any]:
         """Write the pages of some runs of one column; see `write_pages`."""
@@ -72,7 +69,7 @@ def _loaded(job: Job) -> list[LoadedRun]:
     runs = []
     for each in job["runs"]:
         store, row = RunStore(each["store"]), RunRow.model_validate(each["row"])
-        runs.append(LoadedRun(row, store.read_whole(row.run_id), store))
+        runs.append(LoadedRun(row, each["part"], store))
     return runs
 
 

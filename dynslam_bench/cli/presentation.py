@@ -48,7 +48,10 @@ def make(
     rank_seen: Annotated[
         bool, typer.Option("--rank-seen", help="Rank also where the network behind the masks was trained.")
     ] = False,
-    most_pages: Annotated[int, typer.Option(min=0, help="Runs that have a page of their own.")] = 5000,
+    most_pages: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=0, help="Runs that have a page of their own; default all of up to 5000, of more some 2000."),
+    ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     as_json: AsJson = False,
 ) -> None:

@@ -14,7 +14,7 @@ import secrets
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -54,9 +54,25 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     Raises:
         DynslamError: The folder cannot be written (full disk, permissions); nothing is left behind.
     """
+    with _told(path), replacing(path) as temporary:
+        temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """The same of lines that are never all held at once; each gets its newline here.
+
+    Raises:
+        DynslamError: As `write_atomic`.
+    """
+    with _told(path), replacing(path) as temporary, temporary.open("wb") as file:
+        file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in lines)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """What goes wrong in writing a file, as one line."""
     try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+        yield
     except OSError as error:
         reason = f"cannot write {path}: {error.strerror}"
         raise DynslamError(reason, "check the permissions and the free space") from error

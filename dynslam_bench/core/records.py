@@ -36,11 +36,18 @@ class Record(BaseModel):
 
     def to_json(self) -> str:
         """The record as indented JSON with a final newline; no password, and nothing that UTF-8 cannot hold."""
+        return self._json(2) + "\n"
+
+    def to_line(self) -> str:
+        """The same as one line without its newline."""
+        return self._json(None)
+
+    def _json(self, indent: int | None) -> str:
         try:
-            text = self.model_dump_json(indent=2)
+            text = self.model_dump_json(indent=indent)
         except ValueError:  # half characters, e.g. of a foreign command line
-            text = type(self).model_validate(storable(self.model_dump())).model_dump_json(indent=2)
-        return without_passwords(text) + "\n"
+            text = type(self).model_validate(storable(self.model_dump())).model_dump_json(indent=indent)
+        return without_passwords(text)
 
     @classmethod
     def read(cls: type[R], path: Path) -> R:

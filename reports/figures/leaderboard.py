@@ -13,6 +13,8 @@ from ..model.statistics import Interval
 from ..tables.leaderboard import CACHED_MARK, timed
 from .style import COLOURS, GRID, Figure, axis, colours, guide, layout_of, log_axis, rounded, safe, significant, wrapped
 
+MOST_POINTS = 400
+"""Points of one tracker in figures that have one for every run; of more runs as many, from the best to the worst."""
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "pentagon", "hexagon", "star")
 
 
@@ -138,10 +140,13 @@ def repeat_figure(board: Board) -> Figure | None:
             if cell is None or len(cell.succeeded) < 2:
                 continue
             scores = [row.score_m or 0.0 for row in cell.succeeded]
-            values += [max(score, 1e-6) / max(median(scores), 1e-6) for score in scores]
+            base = max(median(scores), 1e-6)
+            values += [max(score, 1e-6) / base for score in scores]
             notes += [f"{safe(sequence)}, {row.repeat}" for row in cell.succeeded]
         if values:
             everything += values
+            shown = _spread(values)
+            values, notes = [values[at] for at in shown], [notes[at] for at in shown]
             traces.append(
                 {
                     "type": "box",
@@ -181,6 +186,7 @@ def mask_figure(board: Board) -> Figure | None:
             row for row in board.runs(key) if row.mask_iou is not None and row.score_m is not None and not row.failed
         ]
         if rows:
+            rows = [rows[at] for at in _spread([row.score_m or 0.0 for row in rows])]
             everything += [1000 * max(float(row.score_m or 0.0), 1e-6) for row in rows]
             traces.append(
                 {
@@ -204,6 +210,14 @@ def mask_figure(board: Board) -> Figure | None:
         yaxis=log_axis("ATE (mm)", everything),
     )
     return {"data": traces, "layout": layout}
+
+
+def _spread(values: Sequence[float]) -> list[int]:
+    """Which of some values are drawn: all of up to `MOST_POINTS`; of more, from the smallest to the largest."""
+    if len(values) <= MOST_POINTS:
+        return list(range(len(values)))
+    order = np.argsort(values, kind="stable")
+    return np.sort(order[np.linspace(0, len(values) - 1, MOST_POINTS).round().astype(int)]).tolist()
 
 
 def _pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

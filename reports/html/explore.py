@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,9 @@ PICTURE_SECONDS = 12.0
 """Time that drawing pictures may take of the making of one report; the next one goes on there."""
 
 MOST_PAGES = 5000
-"""Runs that have a page of their own in one report unless something else is asked for."""
+"""Runs of which all have a page of their own unless something else is asked for."""
+FEWER_PAGES = 2000
+"""Pages of a report of more runs than that: those of the median run of every cell, and others up to this number."""
 
 Progress = Callable[[int, int], None]
 
@@ -87,7 +89,7 @@ def write_explore(
     title: str,
     picture_seconds: float = PICTURE_SECONDS,
     most_frames: int = MOST_FRAMES,
-    most_pages: int = MOST_PAGES,
+    most_pages: int | None = None,
     progress: Progress | None = None,
     crew: Crew | None = None,
 ) -> Explored:
@@ -103,7 +105,7 @@ def write_explore(
         title: Title of the report.
         picture_seconds: Time that opening sequences and drawing pictures may take.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
-        most_pages: Runs that have a page, those with the median error of their cell first.
+        most_pages: Runs that have a page, those with the median error of their cell first; None for `pages_for`.
         progress: Told of the runs that are done, and of all.
         crew: Helpers that write the pages; None to write them here.
 
@@ -111,7 +113,9 @@ def write_explore(
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
     typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
-    paged = _paged(board, loaded, typical, most_pages)
+    paged = _paged(
+        board, loaded, typical, pages_for(len(loaded.runs), len(typical)) if most_pages is None else most_pages
+    )
     shown = (typical | {row.run_id for row in board.rows if row.failed}) & {run.row.run_id for run in paged}
     runs = sorted(paged, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
     done = 0
@@ -165,6 +169,16 @@ def _summed(pieces: Sequence[Sequence[LoadedRun]], written: Sequence[Pages]) -> 
     return sums, total
 
 
+def pages_for(runs: int, typical: int) -> int:
+    """How many pages a report has where nobody asks for another number: of very many runs most are never opened.
+
+    Args:
+        runs: Runs of the report.
+        typical: Those of them with the median error of their cell.
+    """
+    return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
+
+
 def _paged(board: Board, loaded: Loaded, typical: Set[str], most: int) -> list[LoadedRun]:
     """The runs that have a page: the typical one of every cell, then its first, its second, ... repeat."""
     if len(loaded.runs) <= most:
@@ -213,6 +227,7 @@ def write_pages(
         told: Called after every run.
     """
     pages = Pages()
+    runs = [replace(run) for run in runs]  # with records that go when these pages are written
     for run, frames in zip(runs, read_frames(runs, share), strict=True):
         write_side(
             book.output, f"run-{run.row.run_id}", run_content(run, frames, protocol, run.ground_truth(), most_frames)
@@ -229,7 +244,7 @@ def write_pages(
 def _shares(pieces: Sequence[Sequence[LoadedRun]]) -> list[dict[int, float]]:
     """For each piece the exact share of dynamic pixels of its column's frames, as far as a run has recorded it."""
     by_column: dict[str, list[LoadedRun]] = {}
-    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.record.offset):
+    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.row.offset):
         by_column.setdefault(run.row.column_id, []).append(run)
     known = {column: exact_shares(some) for column, some in by_column.items()}
     return [known[piece[0].row.column_id] for piece in pieces]

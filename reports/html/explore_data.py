@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..figures.style import COLOURS, significant
 from ..model.board import Board
+from ..model.cell import Cell
 from ..model.row import SEEN, RunRow
 from ..tables.leaderboard import middle, rank_cell, timed
 
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 
 SHARE_EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 1.0)
 """Bins of the share of dynamic pixels."""
+MOST_LISTED = 5000
+"""Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
 FEWEST_FRAMES = 5
 """Frames below which a bin shows nothing."""
 
@@ -110,12 +113,12 @@ def explore_content(
     names = [*board.sequences, *board.unscored]
     column = {name: at for at, name in enumerate(names)}
     metrics = _metrics(protocol)
+    listed = _listed(board, paged)
     kept = {row.run_id for cells in board.cells.values() for cell in cells.values() for row in cell.kept}
     runs = []
-    for row in sorted(board.rows, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
+    for row in sorted(listed, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
         values = [significant(_value(row, metric), 5) for metric in metrics]
-        flags = (row.run_id in kept) + 2 * (row.run_id in pictured) + 4 * (not row.rotation_reliable)
-        flags += 8 * (row.seen_in_training and not board.rank_seen) + 16 * (row.run_id not in paged)
+        flags = (row.run_id in kept) + 2 * (row.run_id in pictured) + 4 * (row.run_id not in paged)
         five = sums.quartiles.get(row.run_id)
         where = [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat]
         runs.append([*where, row.ending, flags, values, five or []])
@@ -135,10 +138,32 @@ def explore_content(
             for n in names
         ],
         "still": [significant(board.never_move.get(name), 5) for name in names],
+        "cells": [
+            [at, column[name], *_cell(cell, metrics, board.rank_seen)]
+            for key, at in place.items()
+            for name, cell in board.cells[key].items()
+        ],
         "runs": runs,
+        "unlisted": len(board.rows) - len(listed),
         "shareEdges": SHARE_EDGES,
         "byShare": {place[key]: found for key in keys if (found := sums.by_share(key))},
     }
+
+
+def _listed(board: Board, paged: Collection[str]) -> list[RunRow]:
+    """The rows that are listed one by one: a page of a hundred thousand would open slowly, and nobody reads them."""
+    if len(board.rows) <= MOST_LISTED:
+        return board.rows
+    first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
+    return [row for row in board.rows if row.run_id in paged or row.run_id in first]
+
+
+def _cell(cell: Cell, metrics: Sequence[Mapping[str, str]], rank_seen: bool) -> list[Any]:
+    """How many runs of a cell there are and failed, what speaks against it, and the median of every number."""
+    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.seen and not rank_seen)
+    values = [[_value(row, metric) for row in cell.kept] for metric in metrics]
+    medians = [middle(value for value in some if value is None or np.isfinite(value)) for some in values]
+    return [len(cell.rows), cell.failed, doubt, [significant(value, 5) for value in medians]]
 
 
 def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def read_frames(runs: Sequence[LoadedRun], exact: Mapping[int, float]) -> Iterat
         elif columns is None:
             yield RunFrames({}, np.zeros(0), "")
         elif exact:
-            share = [exact.get(index + run.record.offset, np.nan) for index in columns["index"].tolist()]
+            share = [exact.get(index + run.row.offset, np.nan) for index in columns["index"].tolist()]
             yield RunFrames(columns, np.array(share), "exact masks")
         elif (own := columns.get("stat_mask_fraction")) is not None and own.any():  # else it may have no masks
             yield RunFrames(columns, own.astype(np.float64), "the tracker's own masks")
@@ -87,7 +87,7 @@ def exact_shares(runs: Sequence[LoadedRun]) -> dict[int, float]:
             continue  # what is damaged is said on the page of that run
         known = np.isfinite(columns["dynamic_share"])
         if known.any():
-            indices = (columns["index"][known] + run.record.offset).tolist()
+            indices = (columns["index"][known] + run.row.offset).tolist()
             return dict(zip(indices, columns["dynamic_share"][known].tolist(), strict=True))
     return {}
 

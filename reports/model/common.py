@@ -18,6 +18,9 @@ from .board import Board
 from .crew import Crew, unheard_run
 from .rows import Loaded, LoadedRun
 
+MOST_COMPARED = 100
+"""Runs on one sequence of which the common frames are taken, about: of more, as many of every tracker."""
+
 
 @dataclass(frozen=True)
 class Tracked:
@@ -41,9 +44,7 @@ class Tracked:
     def of(cls, run: LoadedRun) -> Tracked:
         """What of a run is needed."""
         row = run.row
-        return cls(
-            str(run.store.root), row.run_id, run.record.sequence.part, row.variant_key, row.metrics["ate_rmse_m"]
-        )
+        return cls(str(run.store.root), row.run_id, run.part, row.variant_key, row.metrics["ate_rmse_m"])
 
     def trajectory(self, which: str) -> Trajectory | None:
         """Its trajectory; None if there is none with a pose, or it is damaged."""
@@ -56,8 +57,13 @@ class Tracked:
 def common_errors(
     board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None
 ) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
-    """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are."""
-    runs = {name: [Tracked.of(run) for run in successful(board, name, loaded)] for name in board.sequences}
+    """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are.
+
+    Of more than `MOST_COMPARED` runs on a sequence these are the runs of each tracker around its median error.
+    """
+    runs = {
+        name: [Tracked.of(run) for run in _around_medians(successful(board, name, loaded))] for name in board.sequences
+    }
     if crew is None:
         answers = [common_of(found, protocol) for found in runs.values()]
     else:
@@ -104,11 +110,26 @@ def common_of(runs: Sequence[Tracked], protocol: Protocol) -> tuple[dict[str, fl
 
 def representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, LoadedRun]:
     """Of each tracker the successful run on a sequence whose error is the (lower) median one."""
-    runs = successful(board, sequence, loaded)
-    by_key: dict[str, list[LoadedRun]] = {key: [] for key in board.trackers}
+    by_key = _by_error(successful(board, sequence, loaded))
+    return {key: by_key[key][(len(by_key[key]) - 1) // 2] for key in board.trackers if key in by_key}
+
+
+def _around_medians(runs: Sequence[LoadedRun]) -> Sequence[LoadedRun]:
+    """All of few runs on a sequence; of many, as many of each tracker: those around its (lower) median error."""
+    if len(runs) <= MOST_COMPARED:
+        return runs
+    by_key = _by_error(runs)
+    most = max(MOST_COMPARED // len(by_key), 1)
+    starts = {key: max((len(ordered) - most) // 2, 0) for key, ordered in by_key.items()}
+    return [run for key, ordered in by_key.items() for run in ordered[starts[key] : starts[key] + most]]
+
+
+def _by_error(runs: Sequence[LoadedRun]) -> dict[str, list[LoadedRun]]:
+    """Runs by tracker, from the smallest to the largest error."""
+    by_key: dict[str, list[LoadedRun]] = {}
     for run in sorted(runs, key=lambda run: run.row.metrics["ate_rmse_m"]):
-        by_key.get(run.row.variant_key, []).append(run)
-    return {key: ordered[(len(ordered) - 1) // 2] for key, ordered in by_key.items() if ordered}
+        by_key.setdefault(run.row.variant_key, []).append(run)
+    return by_key
 
 
 def successful(board: Board, sequence: str, loaded: Loaded) -> list[LoadedRun]:

@@ -84,13 +84,20 @@ class Crew:
             with suppress(OSError):  # what was not sent yet goes nowhere
                 helper.communicate()
 
-    def work(self, kind: str, jobs: Sequence[Mapping[str, Any]], heard: Heard) -> list[Any]:
+    def work(
+        self,
+        kind: str,
+        jobs: Sequence[Mapping[str, Any]],
+        heard: Heard,
+        understood: Callable[[Any], Any] = lambda answer: answer,
+    ) -> list[Any]:
         """Share jobs out among the helpers, the next job to whoever is free.
 
         Args:
             kind: A function of `reports.worker`.
             jobs: What each is called with.
             heard: Told of every run that is done.
+            understood: Makes of an answer, as soon as it is there, what is kept of it.
 
         Returns:
             The answers in the order of the jobs.
@@ -115,7 +122,7 @@ class Crew:
                 while not faults:
                     number = open_jobs.get_nowait()
                     try:
-                        answers[number] = _asked(helper, kind, jobs[number], tell)
+                        answers[number] = understood(_asked(helper, kind, jobs[number], tell))
                     except Exception as error:  # raised again below, by the thread that asked
                         faults.append(error)
 

@@ -48,14 +48,11 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     metrics = sorted({name for row in rows for name in row.metrics})
     kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
     kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "Float64")
-    own_names = [name for name in kinds if name not in set(metrics)]
-    lines = []
-    for row in ordered:
-        own: dict[str, Any] = {
-            "label": labels[row.variant_key],
-            "sequence": columns[row.column_id],
-            "settings": "; ".join(f"{name}={value}" for name, value in row.variant.items()),
-        }
-        values = {name: own[name] if name in own else getattr(row, name) for name in own_names}
-        lines.append(values | {name: row.metrics.get(name) for name in metrics})
-    return pd.DataFrame(lines, columns=list(kinds)).astype(kinds)
+    own: dict[str, list[Any]] = {
+        "label": [labels[row.variant_key] for row in ordered],
+        "sequence": [columns[row.column_id] for row in ordered],
+        "settings": ["; ".join(f"{name}={value}" for name, value in row.variant.items()) for row in ordered],
+    }
+    own |= {name: [row.metrics.get(name) for row in ordered] for name in metrics}
+    found = {name: own[name] if name in own else [getattr(row, name) for row in ordered] for name in kinds}
+    return pd.DataFrame({name: pd.array(values, dtype=kinds[name]) for name, values in found.items()})

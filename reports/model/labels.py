@@ -16,15 +16,25 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     variants: dict[str, RunRow] = {}
     for row in rows:
         variants.setdefault(row.variant_key, row)
+    by_tracker: dict[str, list[RunRow]] = {}
+    by_label: dict[str, set[str]] = {}
+    for row in variants.values():
+        by_tracker.setdefault(row.tracker, []).append(row)
+        by_label.setdefault(row.label, set()).add(row.tracker)
+    differing_of = {tracker: _differing(others) for tracker, others in by_tracker.items()}
+    kinds = {tracker: {other.kind for other in others} for tracker, others in by_tracker.items()}
     labels = {}
     for key, row in variants.items():
-        others = [other for other in variants.values() if other.tracker == row.tracker]
-        names = sorted({name for other in others for name in other.variant})
-        differing = [name for name in names if len({str(other.variant.get(name)) for other in others}) > 1]
+        differing = differing_of[row.tracker]
         parts = [f"{name}={row.variant[name]}" for name in differing if name in row.variant]
-        if row.imported and any(other.kind != row.kind for other in others):
+        if row.imported and len(kinds[row.tracker]) > 1:
             parts.append("imported")
-        same_label = [other for other in variants.values() if other.label == row.label and other.tracker != row.tracker]
-        base = f"{row.label} <{row.tracker}>" if same_label else row.label
+        base = f"{row.label} <{row.tracker}>" if len(by_label[row.label]) > 1 else row.label
         labels[key] = base + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in seen)
     return labels
+
+
+def _differing(variants: Sequence[RunRow]) -> list[str]:
+    """The settings that set the variants of one tracker apart."""
+    names = sorted({name for row in variants for name in row.variant})
+    return [name for name in names if len({str(row.variant.get(name)) for row in variants}) > 1]

@@ -34,7 +34,10 @@ def missing_note(board: Board) -> str:
 
 def missing_commands(board: Board) -> list[str]:
     """Commands that make the runs of the missing cells of all that can be run here."""
-    commands = []
+    commands: list[str] = []
+    plainest: dict[str, RunRow] = {}  # of every sequence a run without offset or noise, if there is one
+    for row in sorted(board.rows, key=lambda row: (row.noise is not None, row.offset)):
+        plainest.setdefault(board.sequence(row), row)
     for key in _candidates(board):
         row = board.first(key)
         lacking = board.lacking(key)
@@ -42,9 +45,7 @@ def missing_commands(board: Board) -> list[str]:
             continue
         wanted: dict[tuple[str, ...], list[str]] = {}
         for name in lacking:
-            other = min(
-                (o for o in board.rows if board.sequence(o) == name), key=lambda o: (o.noise is not None, o.offset)
-            )
+            other = plainest[name]
             wanted.setdefault(tuple(other.part_options), []).append(other.place or other.sequence)
         seeds = sorted({run.seed for run in board.runs(key)})
         offsets = sorted({run.offset for run in board.runs(key)})

@@ -11,24 +11,12 @@ from typing import Any
 from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
-from dynslam_bench.runs.storage.scoring import score
+from dynslam_bench.runs.storage.record import RunRecord
 from dynslam_bench.runs.storage.store import RunStore
-from dynslam_bench.segmentation.training_set import seen_in_training
 
 from .crew import JOB, Crew
+from .known_rows import KnownRow, KnownRows
 from .row import RunRow, Which
-from .row_values import (
-    camera_words,
-    column_of,
-    command_line,
-    held_error,
-    machine_words,
-    never_move_error,
-    part_options,
-    part_words,
-    variant_of,
-)
 
 OnProgress = Callable[[float, float | None, str], None]
 """Called as ``on_progress(done, total, what)``; the total is None where it is not known."""
@@ -40,27 +28,42 @@ def unheard(done: float, total: float | None, what: str) -> None:
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A row with the place where its trajectory lies."""
+    """A row with the place where its trajectory lies.
+
+    Attributes:
+        row: The row.
+        part: The run's part of a sequence.
+        store: Where it lies.
+    """
 
     row: RunRow
-    record: RunRecord
+    part: str
     store: RunStore
+
+    @cached_property
+    def record(self) -> RunRecord:
+        """The whole record, many times as large as the row: read when it is first asked for.
+
+        Raises:
+            DynslamError: It is damaged, or no longer there.
+        """
+        return self.store.read_whole(self.row.run_id)
 
     def as_job(self) -> dict[str, Any]:
         """The run for a helper process, see `reports.worker`."""
-        return {"store": str(self.store.root), "row": self.row.model_dump(mode="json")}
+        return {"store": str(self.store.root), "part": self.part, "row": self.row.model_dump(mode="json")}
 
     def trajectory(self, which: Which) -> Trajectory | None:
         """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
         try:
-            return self.store.trajectory(self.record.run_id, which)
+            return self.store.trajectory(self.row.run_id, which)
         except DynslamError:
             return None
 
     def ground_truth(self) -> Trajectory | None:
         """The ground truth of its part of the sequence; None if there is none, or it is damaged."""
         try:
-            return self.store.ground_truth(self.record.sequence.part)
+            return self.store.ground_truth(self.part)
         except DynslamError:
             return None
 
@@ -108,23 +111,20 @@ def load_runs(
     Raises:
         ReportError: There is no run at all, or none of the reference.
     """
-    loaded = Loaded()
-    kept: list[tuple[RunStore, RunRecord]] = []
-    for store in sources:
-        records, unreadable = store.all()
-        loaded.unreadable += [f"{bad.path}: {bad.reason}" for bad in unreadable]
-        ended = [record for record in records if record.status != "stopped"]
-        scored = [record for record in ended if record.tracker.sensors == "rgbd" or protocol.finds_scale]
-        kept += [(store, record) for record in scored]
-        loaded.stopped += len(records) - len(ended)
-        loaded.without_scale += len(ended) - len(scored)
-    if kept:
-        check_reference(reference, [record.tracker.id for _, record in kept])
-    rows = _rows(kept, protocol, on_progress, crew)
-    found = [LoadedRun(row, record, store) for row, (store, record) in zip(rows, kept, strict=True)]
+    on_progress(0, None, "looking for what has changed")
+    opened = [KnownRows(store, protocol) for store in sources]
+    kept = [rows.read() for rows in opened]
+    _look_for(reference, opened, kept)
+    taken, unreadable = _take(opened, [unread for _, unread in kept], on_progress, crew)
+    everything = [
+        (store, each) for store, (known, _), new in zip(sources, kept, taken, strict=True) for each in (*known, *new)
+    ]
+    ended = [LoadedRun(each.row, each.part, store) for store, each in everything if each.row is not None]
+    found = [run for run in ended if protocol.finds_scale or not run.row.monocular]
+    loaded = Loaded(stopped=len(everything) - len(ended), without_scale=len(ended) - len(found), unreadable=unreadable)
     _join_old_imports(found)
     newest: dict[tuple[object, ...], LoadedRun] = {}
-    for run in sorted(found, key=lambda run: run.row.started):
+    for run in sorted(found, key=lambda run: (run.row.started, run.row.run_id)):
         newest[run.row.variant_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
     loaded.superseded = len(found) - len(newest)
     if not newest and loaded.without_scale:
@@ -146,30 +146,46 @@ def without_scale_words(count: int, protocol: Protocol) -> str:
     )
 
 
-def _rows(
-    runs: Sequence[tuple[RunStore, RunRecord]], protocol: Protocol, on_progress: OnProgress, crew: Crew | None
-) -> list[RunRow]:
-    """The rows of some runs, in their order."""
-    if crew is None:
-        rows = []
-        for position, (store, record) in enumerate(runs):
-            on_progress(position, len(runs), f"scoring {record.tracker.id} on {record.sequence.id}")
-            rows.append(make_row(store, record, protocol))
-        return rows
-    done = 0
+def _take(
+    opened: Sequence[KnownRows], unread: Sequence[Sequence[str]], on_progress: OnProgress, crew: Crew | None
+) -> tuple[list[list[KnownRow]], list[str]]:
+    """The rows of the runs that are to be read, by store, and the folders without a valid record, with reasons."""
+    pieces = [(at, ids[first : first + JOB]) for at, ids in enumerate(unread) for first in range(0, len(ids), JOB)]
+    total, done = sum(map(len, unread)), 0
 
     def heard(count: int, what: str) -> None:
         nonlocal done
-        on_progress(done, len(runs), what)
+        on_progress(done, total, what)
         done += count
 
-    by_part = sorted(range(len(runs)), key=lambda at: runs[at][1].sequence.part)  # a helper reads few ground truths
-    pieces = [by_part[at : at + JOB] for at in range(0, len(runs), JOB)]
-    jobs = [{"runs": [(str(runs[at][0].root), runs[at][1].run_id) for at in piece]} for piece in pieces]
-    found: dict[int, RunRow] = {}
-    for piece, answer in zip(pieces, crew.work("rows", jobs, heard), strict=True):
-        found |= dict(zip(piece, map(RunRow.model_validate, answer), strict=True))
-    return [found[at] for at in range(len(runs))]
+    if crew is None:
+        answers = [opened[at].take_all(ids, lambda what: heard(1, what)) for at, ids in pieces]
+    else:
+        jobs = [{"store": str(opened[at].store.root), "runs": ids} for at, ids in pieces]
+        answers = crew.work("rows", jobs, heard, lambda answer: ([*map(KnownRow.answered, answer[0])], answer[1]))
+    taken: list[list[KnownRow]] = [[] for _ in opened]
+    for (at, _), (rows, _) in zip(pieces, answers, strict=True):
+        taken[at] += rows
+    return taken, [reason for _, unreadable in answers for reason in unreadable]
+
+
+def _look_for(
+    reference: str | None, opened: Sequence[KnownRows], kept: Sequence[tuple[list[KnownRow], list[str]]]
+) -> None:
+    """Refuse a reference of which there is no run, before any run is scored.
+
+    Raises:
+        ReportError: As `check_reference`.
+    """
+    trackers = {each.row.tracker for known, _ in kept for each in known if each.row is not None}
+    for rows, (_, unread) in zip(opened, kept, strict=True):
+        for run_id in unread:
+            if reference is None or reference in trackers:
+                return
+            record = rows.store.get(run_id)
+            trackers |= set() if record is None or record.status == "stopped" else {record.tracker.id}
+    if trackers:
+        check_reference(reference, sorted(trackers))
 
 
 def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
@@ -177,83 +193,11 @@ def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
     columns: dict[str, set[str]] = {}
     for run in runs:
         if not run.row.imported:
-            columns.setdefault(run.record.sequence.part, set()).add(run.row.column_id)
+            columns.setdefault(run.part, set()).add(run.row.column_id)
     for run in runs:
-        part = run.record.sequence.part
+        part = run.part
         if run.row.imported and run.row.block == part and len(columns.get(part, ())) == 1:
             (run.row.block,) = columns[part]
-
-
-def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
-    """The row of one stored run."""
-    scored = score(store, record, protocol)
-    which, failed, reason = _judge(record, scored, protocol)
-    evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    alignment = None if evaluation is None else evaluation.alignment
-    tracker, sequence = record.tracker, record.sequence
-    still = never_move_error(store, record, protocol, evaluation)
-    return RunRow(
-        run_id=record.run_id,
-        kind="run here" if record.kind == "run" else "imported",
-        tracker=tracker.id,
-        label=tracker.label or tracker.id,
-        variant=variant_of(record),
-        provenance=tracker.provenance,
-        ranked=tracker.ranked,
-        sequence=sequence.id,
-        frames=part_words(record),
-        part_options=part_options(record),
-        block=column_of(record),
-        content=sequence.content,
-        camera=camera_words(record),
-        place=record.place,
-        duration_s=sequence.duration_s,
-        tags=sequence.tags,
-        split=sequence.split,
-        seed=record.seed,
-        offset=record.offset,
-        noise=sequence.noise,
-        status=record.status,
-        reason=reason,
-        failed=failed,
-        protocol_id=scored.protocol_id,
-        protocol_digest=scored.protocol_digest,
-        trajectory=which,
-        metrics={} if evaluation is None else dict(evaluation.metrics),
-        final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
-        final_metrics={} if scored.final is None else dict(scored.final.metrics),
-        rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
-        held_ate_m=held_error(store, record, protocol, evaluation, still),
-        never_move_m=still,
-        n_frames=record.n_frames,
-        n_processed=record.n_processed,
-        n_tracked=record.n_tracked,
-        coverage=record.coverage,
-        epipolar_skipped=record.epipolar_skipped,
-        cached=bool(record.identity.get("cache")),
-        frame_ms=None if record.frame_time_s is None else 1000 * record.frame_time_s,
-        real_time_factor=record.real_time_factor,
-        peak_memory_mb=record.peak_memory_mb,
-        mask_iou=record.mask_iou,
-        segmentation=record.segmentation,
-        seen_in_training=seen_in_training(record.segmentation, sequence.id),
-        started=record.started,
-        log=str(store.folder(record.run_id) / "log.txt"),
-        command=command_line(record.command),
-        machine=machine_words(record),
-        notes=[*record.notes, *(evaluation.diagnostics if evaluation is not None else [])],
-    )
-
-
-def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple[Which, bool, str]:
-    """Whose errors a row holds, whether it counts as a failure, and why it is not ``ok``."""
-    only_final = record.kind == "imported" and scored.online is None and scored.final is not None
-    which: Which = "final" if only_final else protocol.trajectory
-    evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    failed = record.failed or record.status == "lost"
-    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
-        return which, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
-    return which, failed, record.reason
 
 
 def check_reference(reference: str | None, trackers: Sequence[str]) -> None:

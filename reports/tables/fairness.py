@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from ..model.board import Board, rank
+from ..model.common import MOST_COMPARED
 from ..model.row import SEEN, RunRow
 from .formats import mm
 from .leaderboard import interval_cell, rank_cell, sequence_columns, skipped_words
@@ -49,6 +50,14 @@ def common_frames_table(
         "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
         "tracker gains nothing here by losing the hard frames. Failed runs take no part."
     )
+    if any(
+        sum(len(cells[name].kept) for cells in board.cells.values() if name in cells) > MOST_COMPARED
+        for name in board.sequences
+    ):
+        caption += (
+            f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
+            "error, as many of each."
+        )
     columns = [Column("tracker", numeric=False), *sequence_columns(board)]
     brief = "Absolute trajectory error on the common frames (RMSE, mm)"
     return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, separators, brief)

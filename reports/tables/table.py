@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import pandas as pd
+from pandas.api.types import is_numeric_dtype
 
 from dynslam_bench.core.harmless import printable
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
+MOST_ROWS = 1000
+"""Rows that pages and Markdown show; CSV has all."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +142,18 @@ class Table:
         return pd.DataFrame(list(zip(*columns, strict=True)), columns=self.values.columns, dtype=object)
 
     def displayed(self) -> Table:
-        """The table as pages, Markdown and LaTeX show it: without columns in which nothing is written; CSV has all."""
+        """The table as pages, Markdown and LaTeX show it; CSV has all.
+
+        Columns in which nothing is written are left out, and rows behind `MOST_ROWS`, which the caption says.
+        """
         kept = [at for at in range(len(self.columns)) if not self.rows or any(_words(row[at]) for row in self.rows)]
-        if len(kept) == len(self.columns):
+        if len(kept) == len(self.columns) and len(self.rows) <= MOST_ROWS:
             return self
-        columns, rows = [self.columns[at] for at in kept], [[row[at] for at in kept] for row in self.rows]
-        return Table(self.id, self.title, self.caption, columns, rows, self.muted_rows, self.separators, self.brief)
+        columns, rows = [self.columns[at] for at in kept], [[row[at] for at in kept] for row in self.rows[:MOST_ROWS]]
+        caption = self.caption
+        if len(rows) < len(self.rows):
+            caption += f" These are the first {len(rows)} of {len(self.rows)} rows; all stand in csv/{self.id}.csv."
+        return Table(self.id, self.title, caption, columns, rows, self.muted_rows, self.separators, self.brief)
 
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
@@ -185,9 +194,19 @@ def csv_text(frame: pd.DataFrame) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(map(_harmless, frame.columns))
-    columns = [[_harmless(value) for value in values.astype(object)] for _, values in frame.items()]
-    writer.writerows(zip(*columns, strict=True))
+    writer.writerows(zip(*(_written(values) for _, values in frame.items()), strict=True))
     return text.getvalue()
+
+
+def _written(values: pd.Series) -> list[object]:
+    """What CSV says of a column; what cannot be harmful is not looked at one by one: there may be millions of it."""
+    found = values.astype(object)
+    if is_numeric_dtype(values.dtype):
+        return found.where(values.notna(), None).tolist()
+    if values.dtype == "string":
+        known = {word: _harmless(word) for word in set(found)}
+        return [known[word] for word in found]
+    return [_harmless(value) for value in found]
 
 
 def emphasise(values: Sequence[float | None]) -> list[Emphasis]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import pickle
 import tempfile
 import zipfile
@@ -18,9 +19,11 @@ from dynslam_bench.core import array_files, reading
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the cache reads
 from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports.model import known_rows
+from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.runs import RunRecord, RunStore, snapshots
 from dynslam_bench.runs import frame_row as rows
-from dynslam_bench.runs.storage import packing, run_index, run_list
+from dynslam_bench.runs.storage import line_file, packing, run_index, run_list
 from dynslam_bench.runs.storage.evaluating import evaluate_run
 from dynslam_bench.runs.storage.frame_table import load_frames
 from dynslam_bench.runs.storage.frames import FrameLog
@@ -83,6 +86,27 @@ def _index() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         _read_list(None, Path(folder))
         (path,) = Path(folder).glob("results/index/*.jsonl")
+        return path.read_bytes()
+
+
+def _read_known_rows(data: bytes | None, folder: Path) -> None:
+    """Whatever an earlier report has kept, this one has a row of every run that lies there, and no other."""
+    store, protocol = _store(folder, _stored(f"runs/{RUN}/run.json")), get_protocol("tum-rgbd/v1")
+    at(store.root / "metrics" / protocol.digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
+    for file in store.root.rglob("*.*"):
+        os.utime(file, (1, 1))  # lines that were made of another copy hold
+    path = known_rows.KnownRows(store, protocol)._path  # only it knows the name
+    at(path.parent, path.name, data)
+    loaded = load_runs([store], protocol)
+    assert [run.row.run_id for run in loaded.runs] == [RUN] and not loaded.unreadable
+    assert loaded.runs[0].row.log == str(store.folder(RUN) / "log.txt")
+
+
+@cache
+def _known_rows() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        _read_known_rows(None, Path(folder))
+        (path,) = Path(folder).glob("results/index/rows-*")
         return path.read_bytes()
 
 
@@ -256,6 +280,8 @@ def _state_seeds() -> list[bytes]:
     return [*(pickle.dumps(state, protocol) for protocol in (4, 5)), pickle.dumps(print), b"(lr\xff\xff\xff\x7f."]
 
 
+_LINE_FILE = (line_file.read_line_file, line_file._pieces, line_file._valid, line_file._line)
+
 TARGETS = [
     Target(
         "run record",
@@ -268,7 +294,14 @@ TARGETS = [
         "list of runs",
         _read_list,
         lambda: [_index()],
-        (run_list._list_runs, run_index.read_index, run_index._parsed, run_index._is_line, run_index.run_row),
+        (run_list._list_runs, run_index.read_index, run_index._is_line, run_index.run_row, *_LINE_FILE),
+        mutate_lines,
+    ),
+    Target(
+        "known rows of a report",
+        _read_known_rows,
+        lambda: [_known_rows()],
+        (known_rows.KnownRows.read, known_rows.KnownRows._holds, known_rows.KnownRow.of, *_LINE_FILE),
         mutate_lines,
     ),
     Target(

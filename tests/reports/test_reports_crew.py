@@ -1,17 +1,21 @@
 """Helper processes of a report: the same report as without them, and one line where one of them fails."""
 
 import json
+import shutil
 import subprocess
 import sys
 
 import pytest
 from reports_fake_store import add_run, fill
+from reports_rows import row
 
 from dynslam_bench.core.errors import InfrastructureError, ReportError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report
 from dynslam_bench.reports.model import crew
+from dynslam_bench.reports.model.rows import LoadedRun
 from dynslam_bench.runs.process.server import child_environment
+from dynslam_bench.runs.storage.store import RunStore
 
 
 def contents(folder):
@@ -33,6 +37,7 @@ def store(tmp_path_factory):
 def test_helpers_make_the_same_report(store, tmp_path, monkeypatch):
     command = "dynslam-bench report here"
     build_report(store, tmp_path / "alone", command=command)
+    shutil.rmtree(store.root / "index")  # or the helpers would have nothing to read
     heard = []
     monkeypatch.setattr(crew, "MANY", 1)
     monkeypatch.setattr(crew.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
@@ -51,9 +56,10 @@ def test_a_job_that_cannot_be_done_is_one_line_and_a_dead_helper_is_said(tmp_pat
         "most_frames": 9,
     }
     with crew.Crew(1, setup) as helpers, pytest.raises(ReportError, match="cannot read"):
-        helpers.work("rows", [{"runs": [(str(tmp_path), "0" * 16)]}], crew.unheard_run)
+        gone = LoadedRun(row(run_id="0" * 16), "0" * 16, RunStore(tmp_path)).as_job()
+        helpers.work("pages", [{"runs": [gone], "shown": [], "share": {}}], crew.unheard_run)
     with crew.Crew(1, {}) as helpers, pytest.raises(InfrastructureError, match="ended early"):
-        helpers.work("rows", [{"runs": []}], crew.unheard_run)
+        helpers.work("rows", [{"store": "x", "runs": []}], crew.unheard_run)
 
 
 def test_few_runs_need_no_helpers(monkeypatch):
@@ -71,7 +77,9 @@ def test_a_helper_whose_report_is_gone_ends_without_a_word():
     helper.stdout.close()
     setup = {"protocol": get_protocol("tum-rgbd/v1").model_dump_json(), "output": "x", "picture_seconds": 0}
     setup |= {"most_frames": 1}
-    helper.stdin.write(json.dumps(setup) + "\n" + json.dumps({"kind": "rows", "job": {"runs": []}}) + "\n")
+    helper.stdin.write(
+        json.dumps(setup) + "\n" + json.dumps({"kind": "rows", "job": {"store": "x", "runs": []}}) + "\n"
+    )
     helper.stdin.close()
     said = helper.stderr.read()
     helper.stderr.close()

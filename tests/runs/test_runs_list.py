@@ -1,7 +1,9 @@
 """The list of a store: read once, kept until a record changes, never wrong and never in the way."""
 
 import json
+import os
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 
 from reports_fake_store import add_run
 
+from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunStore
+from dynslam_bench.runs.storage import run_index, run_list
 from dynslam_bench.runs.storage.run_index import FIELDS, run_row
 from dynslam_bench.runs.storage.run_list import list_runs
 
@@ -64,11 +68,10 @@ def test_what_changed_is_read_again(filled, reads):
 def test_a_damaged_index_is_made_again(filled, text):
     store, _ = filled
     rows, _ = list_runs(store)
-    (index,) = (store.root / "index").iterdir()
-    whole = index.read_bytes()
-    index.write_text(text)
+    whole = lines_of(store)
+    index_of(store).write_text(text)
     assert list_runs(store)[0] == rows
-    assert index.read_bytes() == whole
+    assert lines_of(store) == whole and text not in index_of(store).read_text()
 
 
 def test_an_unreadable_record_is_named_every_time(filled):
@@ -94,6 +97,11 @@ def index_of(store):
     return index
 
 
+def lines_of(store):
+    """Those of runs."""
+    return [line for line in index_of(store).read_bytes().splitlines(keepends=True) if b"," in line]
+
+
 def test_a_run_joins_the_index_when_it_is_scored(filled, reads):
     store, ids = filled
     for run_id in ids:
@@ -103,7 +111,7 @@ def test_a_run_joins_the_index_when_it_is_scored(filled, reads):
     assert reads == [] and [row["run"] for row in rows] == ids[::-1]
     assert rows == [run_row(record, store.score(record)) for record in store.all()[0]]
     store.score(store.read_whole(ids[0]), again=True)
-    assert len(index_of(store).read_text().splitlines()) == 3
+    assert len(lines_of(store)) == 3
 
 
 def test_a_run_that_is_made_again_is_listed_as_it_is_now(filled, reads):
@@ -117,18 +125,18 @@ def test_a_run_that_is_made_again_is_listed_as_it_is_now(filled, reads):
     reads.clear()
     rows, _ = list_runs(store)
     assert reads == [] and next(row for row in rows if row["run"] == ids[0])["reason"] == "second"
-    assert len(index_of(store).read_text().splitlines()) == 3
+    assert len(lines_of(store)) == 3
 
 
 def test_a_torn_line_costs_no_other(filled, reads):
     store, ids = filled
     rows, _ = list_runs(store)
     index = index_of(store)
-    lines = index.read_bytes().splitlines(keepends=True)
+    lines = lines_of(store)
     index.write_bytes(lines[0] + lines[1][:40] + b"\n" + lines[2])
     reads.clear()
     assert list_runs(store) == (rows, []) and reads == [ids[1]]
-    assert sorted(index.read_bytes().splitlines(keepends=True)) == sorted(lines)
+    assert sorted(lines_of(store)) == sorted(lines)
 
 
 def test_an_index_of_another_version_goes(filled, monkeypatch):
@@ -138,3 +146,71 @@ def test_an_index_of_another_version_goes(filled, monkeypatch):
     monkeypatch.setattr("dynslam_bench.__version__", "99")
     assert list_runs(store) == (rows, [])
     assert index_of(store) != first
+
+
+@pytest.fixture
+def stats(monkeypatch):
+    """Files whose times are asked for."""
+    asked = []
+    for module in (run_index, run_list):
+        real = module.stamp_if_there
+        monkeypatch.setattr(module, "stamp_if_there", lambda file, real=real: asked.append(str(file)) or real(file))
+    return asked
+
+
+def rescore(store, run, error):
+    scored = store.score(store.read_whole(run))
+    changed = scored.online.model_copy(update={"metrics": scored.online.metrics | {"ate_rmse_m": error}})
+    store.add_metrics(scored.model_copy(update={"online": changed}))
+
+
+def errors_of(store):
+    return {row["run"]: row["ate_rmse_m"] for row in list_runs(store)[0]}
+
+
+def made_long_ago(store, seconds=10):
+    (folder,) = (store.root / "metrics").iterdir()
+    then = time.time() - seconds
+    os.utime(folder, (then, then))
+
+
+def test_a_run_that_is_scored_again_is_listed_with_its_new_error(filled):
+    store, ids = filled
+    before = errors_of(store)
+    made_long_ago(store)
+    assert errors_of(store) == errors_of(store) == before
+    rescore(store, ids[0], 0.125)
+    assert errors_of(store) == before | {ids[0]: 0.125}
+    rescore(store, ids[1], 0.25)
+    assert errors_of(store) == errors_of(store) == before | {ids[0]: 0.125, ids[1]: 0.25}
+    store.metric_file(ids[0], get_protocol("tum-rgbd/v1").digest()).unlink()
+    assert errors_of(store) == before | {ids[1]: 0.25}
+
+
+def test_errors_are_not_looked_at_while_their_folder_is_as_it_was(filled, stats):
+    store, _ = filled
+    list_runs(store)
+    made_long_ago(store)
+    list_runs(store)  # notes its time
+    stats.clear()
+    rows, _ = list_runs(store)
+    assert len(rows) == 3 and [path for path in stats if path.endswith(".json")] == []
+
+
+def test_errors_are_looked_at_while_their_folder_is_young(filled, stats):
+    """It may change again within one tick of the file system's clock."""
+    store, ids = filled
+    for _ in range(3):
+        list_runs(store)
+    stats.clear()
+    list_runs(store)
+    assert len([path for path in stats if path.endswith(".json")]) == len(ids)
+
+
+def test_notes_do_not_pile_up(filled):
+    store, _ = filled
+    list_runs(store)
+    for seconds in range(5, 120):
+        made_long_ago(store, seconds)
+        list_runs(store)
+    assert len(lines_of(store)) == 3 and len(index_of(store).read_bytes().splitlines()) < 3 + 110

@@ -1,41 +1,49 @@
 """What a list says of each run, a line each in a file of the store, so that a list need not read the records.
 
 A line joins the file when its run is scored for the first time; `run_list` adds those that are missing. Lines hold for
-one state of the run's record (its time and size). The file may be deleted at any time, and whatever of it is damaged
-or out of date counts as not there.
+one state of the run's record and of its stored errors (time and size of both files). Errors are always replaced by a
+rename, so that none of them need be looked at while their folder has the time that is noted. The file may be deleted at
+any time, and whatever of it is damaged or out of date counts as not there.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 import dynslam_bench
-from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
-from dynslam_bench.core.records import digest, write_atomic
+from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import Protocol
 
+from .line_file import add_lines, read_line_file, write_line_file
 from .record import MetricRecord, RunRecord
+from .states import stamp_if_there
 
 Row = dict[str, Any]
-Stamp = tuple[int, int]
+Stamps = tuple[int, int, int, int]
+"""Time and size of a run's record, and of its errors under the protocol: (0, 0) where they are not stored."""
 Line = list[Any]
 
 FIELDS = (
     *("run", "tracker", "sequence", "part", "seed", "offset", "noise", "repeat", "settings", "status"),
     *("ate_rmse_m", "never_move_m", "coverage", "frame_ms", "masks", "seen_in_training", "reason", "started"),
 )
-"""Names of a row's values, in order; the values of a line, before which it has its stamp."""
+"""Names of a row's values, in order; the values of a line, before which it has its stamps."""
 _LINES: TypeAdapter[list[Line]] = TypeAdapter(list[Line])
-_LENGTH = len(FIELDS) + 2
-_RUN, _STARTED = 2 + FIELDS.index("run"), 2 + FIELDS.index("started")
+FIRST = 4
+"""Where the values begin in a line; before them stand the stamps."""
+RUN, STARTED = FIRST + FIELDS.index("run"), FIRST + FIELDS.index("started")
+_LENGTH = FIRST + len(FIELDS)
+_SETTLED_NS = 1_000_000_000
+"""A folder as young as this, when the file was written, may change again without another time."""
+_MOST_VERIFIED = 100
+"""Such notes that a file may have."""
 
 
 def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
@@ -90,69 +98,66 @@ def part_words(record: RunRecord) -> str:
 
 def index_file(root: Path, protocol: Protocol) -> Path:
     """Where the lines of a store under a protocol lie, as this version writes them."""
-    return root / "index" / f"{protocol.digest()}-{digest([dynslam_bench.__version__, *FIELDS])}.jsonl"
+    return root / "index" / f"{protocol.digest()}-{digest([dynslam_bench.__version__, FIRST, *FIELDS])}.jsonl"
 
 
-def stamp_of(record_file: str | Path) -> Stamp:
-    """Time and size of a run's record.
+def make_line(stamps: Stamps, record: RunRecord, metrics: MetricRecord | None) -> Line:
+    """The line of a run whose files had those stamps before they were read, or when they were written."""
+    return [*stamps, *run_row(record, metrics).values()]
 
-    Raises:
-        OSError: It is not there.
+
+@dataclass(frozen=True)
+class Index:
+    """What the file of a store's lines holds.
+
+    Attributes:
+        lines: The last line of each run, by its id.
+        is_whole: Whether it holds nothing but these.
+        verified_ns: Time of the folder of errors when those of all lines were last found unchanged; 0 if it is so young
+            that it may have changed since without another time.
     """
-    found = os.stat(record_file)  # noqa: PTH116 - a hundred thousand of them: pathlib takes twice as long
-    return found.st_mtime_ns, found.st_size
+
+    lines: dict[str, Line]
+    is_whole: bool
+    verified_ns: int
 
 
-def make_line(stamp: Stamp, record: RunRecord, metrics: MetricRecord | None) -> Line:
-    """The line of a run whose record had that stamp before it was read, or when it was written."""
-    return [*stamp, *run_row(record, metrics).values()]
+def read_index(path: Path) -> Index:
+    """What the file holds; nothing if there is none."""
+    written_ns, _ = stamp_if_there(path)
+    lines, damaged = read_line_file(path, _LINES)
+    found = {line[RUN]: line for line in lines if _is_line(line)}
+    verified = [line[0] for line in lines if len(line) == 1 and type(line[0]) is int]
+    is_whole = len(found) + len(verified) == len(lines) + damaged and len(verified) < _MOST_VERIFIED
+    is_settled = bool(verified) and 0 <= verified[-1] < written_ns - _SETTLED_NS
+    return Index(found, is_whole, verified[-1] if is_settled else 0)
 
 
-def read_index(path: Path) -> tuple[dict[str, Line], bool]:
-    """The last line of each run, and whether the file holds nothing but these."""
-    try:
-        data = read_bytes(path, limit=TABLE_BYTES).rstrip(b"\n")
-    except DynslamError:
-        return {}, False
-    try:
-        lines = _LINES.validate_json(b"[" + data.replace(b"\n", b",") + b"]")
-    except ValidationError:  # one is damaged: a kill tore it
-        lines = [line for text in data.split(b"\n") for line in _parsed(text)]
-    found = {line[_RUN]: line for line in lines if _is_line(line)}
-    return found, len(found) == data.count(b"\n") + bool(data)
-
-
-def add_line(path: Path, line: Line) -> None:
+def add_to_index(path: Path, line: Line) -> None:
     """Add a run's line to the file; one that cannot be written is left out: the next list reads that record."""
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        try:
-            os.write(handle, _text([line]))  # at once: lines of other processes come before or after it
-        finally:
-            os.close(handle)
+    add_lines(path, [_text(line)])
 
 
-def write_index(path: Path, lines: Iterable[Line]) -> None:
-    """Write the file anew; those of other versions go. A store that can only be read keeps what it has."""
-    with contextlib.suppress(DynslamError, OSError):
-        write_atomic(path, _text(lines))
-        for other in path.parent.glob(f"{path.name.partition('-')[0]}*"):
-            if other != path:
-                other.unlink()
+def add_verified(path: Path, folder_ns: int) -> None:
+    """Note that the errors of all lines were unchanged when their folder had that time."""
+    add_lines(path, [_text([folder_ns])])
 
 
-def _text(lines: Iterable[Line]) -> bytes:
-    return "".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines).encode()
+def write_index(path: Path, lines: Iterable[Line], folder_ns: int) -> None:
+    """Write the file anew; those of other versions go. A store that can only be read keeps what it has.
+
+    Args:
+        path: The file.
+        lines: The lines.
+        folder_ns: Time of the folder of errors before theirs were looked at.
+    """
+    write_line_file(path, map(_text, chain([[folder_ns]], lines)), f"{path.name.partition('-')[0]}*")
 
 
-def _parsed(text: bytes) -> list[Line]:
-    try:
-        return _LINES.validate_json(b"[" + text + b"]")
-    except ValidationError:
-        return []
+def _text(line: Line) -> str:
+    return json.dumps(line, separators=(",", ":"))
 
 
 def _is_line(line: Line) -> bool:
     """Whether a line of an index that somebody may have made by hand can be sorted and shown."""
-    return len(line) == _LENGTH and isinstance(line[_RUN], str) and isinstance(line[_STARTED], str)
+    return len(line) == _LENGTH and isinstance(line[RUN], str) and isinstance(line[STARTED], str)

@@ -10,7 +10,21 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 
 from .evaluating import DEFAULT_PROTOCOL
-from .run_index import FIELDS, Line, Row, index_file, make_line, read_index, stamp_of, write_index
+from .run_index import (
+    FIELDS,
+    FIRST,
+    RUN,
+    STARTED,
+    Line,
+    Row,
+    Stamps,
+    add_verified,
+    index_file,
+    make_line,
+    read_index,
+    write_index,
+)
+from .states import NO_FILE, stamp_if_there, stamp_of
 from .store import RUN_FILE, RunStore, Unreadable
 
 OnProgress = Callable[[int, int], None]
@@ -24,8 +38,8 @@ def list_runs(
 ) -> tuple[list[Row], list[Unreadable]]:
     """Every run as `run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
 
-    Rows are taken from the store's index (see `run_index`) while size and time of the run's record are the same; a
-    store that cannot be written is read without it.
+    Rows are taken from the store's index (see `run_index`) while the run's record and its stored errors are the same;
+    a store that cannot be written is read without it.
 
     Args:
         store: The store.
@@ -38,10 +52,13 @@ def list_runs(
 
 def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> tuple[list[Row], list[Unreadable]]:
     path = index_file(store.root, protocol)
-    known, is_whole = read_index(path)
+    index = read_index(path)
+    known, is_whole = index.lines, index.is_whole
     kept: list[Line] = []
     unreadable: list[Unreadable] = []
-    stored, runs = store.ids(), str(store.runs)
+    stored, runs, errors = store.ids(), str(store.runs), str(store.root / "metrics" / protocol.digest())
+    errors_ns, _ = stamp_if_there(errors)
+    as_verified = errors_ns == index.verified_ns != 0
     there = set(stored)
     ids = [run_id for run_id in known if run_id in there]  # in their order: nearly that of the list
     is_whole &= len(ids) == len(known)
@@ -50,17 +67,29 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
         if position % 100 == 0:
             on_progress(position, len(ids))
         try:
-            stamp = stamp_of(f"{runs}/{run_id}/{RUN_FILE}")
             line = known.get(run_id)
-            if line is None or (line[0], line[1]) != stamp:
+            time_ns, size = stamp_of(f"{runs}/{run_id}/{RUN_FILE}")
+            scored = line[2:FIRST] if line is not None and as_verified else stamp_if_there(f"{errors}/{run_id}.json")
+            stamps = (time_ns, size, *scored)
+            if line is None or (*line[:FIRST],) != stamps:
                 is_whole = False
-                record = store.read_whole(run_id)
-                line = make_line(stamp, record, None if record.status == "stopped" else store.score(record, protocol))
+                line = _read(store, run_id, protocol, stamps)
             kept.append(line)
         except (DynslamError, OSError) as error:
             is_whole &= run_id not in known
             unreadable.append(Unreadable(store.folder(run_id), str(error)))
-    kept.sort(key=itemgetter(-1, 2))  # when it began, and its id
+    kept.sort(key=itemgetter(STARTED, RUN))
     if not is_whole:
-        write_index(path, kept)
-    return [dict(zip(FIELDS, line[2:], strict=True)) for line in kept], unreadable
+        write_index(path, kept, errors_ns)
+    elif not as_verified:
+        add_verified(path, errors_ns)
+    return [dict(zip(FIELDS, line[FIRST:], strict=True)) for line in kept], unreadable
+
+
+def _read(store: RunStore, run_id: str, protocol: Protocol, stamps: Stamps) -> Line:
+    """The line of a run that is in no index, or has changed since."""
+    record = store.read_whole(run_id)
+    scored = None if record.status == "stopped" else store.score(record, protocol)
+    if stamps[2:] == NO_FILE:  # they have just been written
+        stamps = (*stamps[:2], *stamp_if_there(store.metric_file(run_id, protocol.digest())))
+    return make_line(stamps, record, scored)

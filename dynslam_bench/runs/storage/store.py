@@ -27,7 +27,8 @@ from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
 from .evaluating import DEFAULT_PROTOCOL, evaluate_run
 from .record import MetricRecord, RunRecord
-from .run_index import Stamp, add_line, index_file, make_line, stamp_of
+from .run_index import add_to_index, index_file, make_line
+from .states import Stamp, check_plain, stamp_if_there, stamp_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,6 +77,14 @@ class RunStore:
             RunError: It is no run's id, which is 16 hexadecimal digits: anything else could lead out of the store.
         """
         return self.runs / _checked(run_id, A_RUN)
+
+    def metric_file(self, run_id: str, protocol_digest: str) -> Path:
+        """Where the errors of a run under a protocol lie, whether they exist or not.
+
+        Raises:
+            RunError: As `folder`.
+        """
+        return self.root / "metrics" / protocol_digest / f"{_checked(run_id, A_RUN)}.json"
 
     def _part(self, part: str) -> Path:
         """Folder of the stamps and the ground truth of a sequence's part."""
@@ -160,7 +169,7 @@ class RunStore:
 
     def add_metrics(self, metrics: MetricRecord) -> None:
         """Write a run's metrics under a protocol."""
-        write_atomic(self._metric_file(metrics.run_id, metrics.protocol_digest), metrics.to_json())
+        write_atomic(self.metric_file(metrics.run_id, metrics.protocol_digest), metrics.to_json())
 
     def remove(self, run_id: str) -> None:
         """Delete a run and its metrics.
@@ -211,20 +220,11 @@ class RunStore:
             DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more than plain files.
         """
         path = self.folder(run_id) / RUN_FILE
-        self._check_plain(path.parent)
+        check_plain(path.parent, self.root)
         record = RunRecord.read(path)
         if record.run_id != run_id:
             raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
         return record
-
-    def _check_plain(self, folder: Path) -> None:
-        """A folder holds plain files of this store: no link to a file elsewhere, no pipe that is never written."""
-        with contextlib.suppress(OSError), os.scandir(folder) as entries:  # what reads it says that it is not there
-            for entry in entries:
-                if entry.is_symlink() and not Path(entry.path).resolve().is_relative_to(self.root.resolve()):
-                    raise RunError(f"{entry.path} is a link that leads out of {self.root}", "put the file in its place")
-                if not entry.is_file() and not entry.is_dir():
-                    raise RunError(f"{entry.path} is no plain file")
 
     def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
         """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
@@ -255,7 +255,7 @@ class RunStore:
 
     def metrics(self, run_id: str, protocol: Protocol) -> MetricRecord | None:
         """A run's stored metrics under a protocol; None if it was not scored under it, or they are damaged."""
-        path = self._metric_file(run_id, protocol.digest())
+        path = self.metric_file(run_id, protocol.digest())
         if not path.is_file():
             return None
         try:
@@ -290,7 +290,8 @@ class RunStore:
             LOGGER.info("the metrics of run %s are not kept: %s", record.run_id, error)
         stamp = self._published.pop(record.run_id, None)
         if stamp is not None:
-            add_line(index_file(self.root, protocol), make_line(stamp, record, metrics))
+            stamps = (*stamp, *stamp_if_there(self.metric_file(record.run_id, metrics.protocol_digest)))
+            add_to_index(index_file(self.root, protocol), make_line(stamps, record, metrics))
         return metrics
 
     def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL) -> pd.DataFrame:
@@ -317,7 +318,7 @@ class RunStore:
     def ground_truth(self, part: str) -> Trajectory | None:
         """The ground truth of a sequence's part; None if it has none."""
         path = self._part(part) / "groundtruth.txt"
-        self._check_plain(path.parent)
+        check_plain(path.parent, self.root)
         return _read_truth(path, path.stat().st_mtime_ns) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
@@ -327,14 +328,11 @@ class RunStore:
             RunError: They are not stored, or damaged.
         """
         path = self._part(part) / "timestamps.txt"
-        self._check_plain(path.parent)
+        check_plain(path.parent, self.root)
         try:
             return _read_stamps(path, path.stat().st_mtime_ns)
         except OSError as error:
             raise RunError(f"cannot read {path}: {error.strerror}", "the results folder is incomplete") from error
-
-    def _metric_file(self, run_id: str, protocol_digest: str) -> Path:
-        return self.root / "metrics" / protocol_digest / f"{_checked(run_id, A_RUN)}.json"
 
     def _forget_metrics(self, run_id: str) -> None:
         for metrics in (self.root / "metrics").glob(f"*/{run_id}.json"):

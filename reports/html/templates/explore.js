@@ -2,25 +2,13 @@
 const KINDS = [["ate", "ATE"], ["rpe", "RPE"], ["rotation", "Rotation"]];
 const EXTRA = [["rank", "rank"], ["ratio", "ATE ratio"], ["success", "success"], ["coverage", "coverage"], ["speed", "× real time"], ["memory", "MB"]];
 const SHOWN_AT_FIRST = ["rank", "success"];
-const median = (values) => quantile([...values].sort((a, b) => a - b), 0.5);
 const $ = (id) => document.getElementById(id);
 
-/** Runs by "tracker,sequence", with the median of every metric over those that count. */
+/** What is known of all runs of a cell, by "tracker,sequence", with those of them that are listed. */
 function cellsOf(data) {
-  const cells = new Map();
-  for (const [id, t, s, repeat, ending, flags, values, quartiles] of data.runs) {
-    const key = `${t},${s}`, run = { id, repeat, ending, kept: flags & 1, pictured: flags & 2, doubt: flags & 4, seen: flags & 8, paged: !(flags & 16), values, quartiles };
-    if (!cells.has(key)) cells.set(key, { t, s, runs: [] });
-    cells.get(key).runs.push(run);
-  }
-  for (const cell of cells.values()) {
-    cell.failed = cell.runs.filter((run) => run.ending).length;
-    cell.seen = cell.runs.some((run) => run.seen);
-    cell.medians = data.metrics.map((_, at) => {
-      const values = cell.runs.filter((run) => run.kept && run.values[at] !== null).map((run) => run.values[at]);
-      return values.length ? median(values) : null;
-    });
-  }
+  const cells = new Map(data.cells.map(([t, s, count, failed, against, medians]) => [`${t},${s}`, { t, s, count, failed, doubt: against & 1, seen: against & 2, medians, runs: [] }]));
+  for (const [id, t, s, repeat, ending, flags, values, quartiles] of data.runs)
+    cells.get(`${t},${s}`).runs.push({ id, repeat, ending, kept: flags & 1, pictured: flags & 2, paged: !(flags & 4), values, quartiles });
   return cells;
 }
 
@@ -129,7 +117,7 @@ class Explore {
     return values.length > 1 ? Math.min(...values) : null;
   }
 
-  doubted(cell, metric) { return metric.key.startsWith("ape_rot") && cell.runs.some((run) => run.doubt); }
+  doubted(cell, metric) { return metric.key.startsWith("ape_rot") && cell.doubt; }
 
   base(sequence, metric) {
     const cell = this.data.reference === null ? null : this.cells.get(`${this.data.reference},${sequence.at}`);
@@ -141,7 +129,7 @@ class Explore {
     if (!cell || !metric) return make("td", { className: "n muted", textContent: "–", title: "not run" });
     const td = make("td", { className: "n" }), runs = cell.runs, chosen = standing(cell, metric.at);
     const link = (run, text) => make("a", { href: `run.html#${run.id}`, textContent: text, title: run.repeat + (run.ending ? `, ${run.ending}` : "") });
-    if (cell.failed === runs.length) {
+    if (cell.failed === cell.count) {
       td.className = "n failed";
       td.append(link(chosen, chosen.ending));
     } else {

@@ -17,7 +17,7 @@ const table = (heads, rows, kind = "n") => {
 function addChoices(all, id) {
   const here = all.runs.find((run) => run[0] === id);
   if (!here) return null;
-  const [, tracker, sequence] = here, paged = all.runs.filter((run) => run === here || !(run[5] & 16));
+  const [, tracker, sequence] = here, paged = all.runs.filter((run) => run === here || !(run[5] & 4));
   const nearest = (fits) => paged.filter(fits).sort((a, b) => (b[3] === here[3]) - (a[3] === here[3]))[0];
   const choice = (name, entries, chosen) => {
     const select = make("select", { ariaLabel: name }, ...entries.map(([value, text]) => make("option", { value, textContent: text, selected: value === chosen })));
@@ -29,7 +29,7 @@ function addChoices(all, id) {
   const repeats = paged.filter((run) => run[1] === tracker && run[2] === sequence).map((run) => [run[0], run[3] + (run[4] ? ` (${run[4]})` : "")]);
   const own = (entries, at) => entries.find(([value]) => all.runs.find((run) => run[0] === value)[at] === here[at])?.[0];
   $("run-choice").replaceChildren(choice("Tracker", trackers, own(trackers, 1)), choice("Sequence", sequences, own(sequences, 2)), choice("Repeat", repeats, id));
-  return { label: all.trackers[tracker].label, colour: all.trackers[tracker].colour, sequence: all.sequences[sequence].name, repeat: here[3], pictured: here[5] & 2, paged: !(here[5] & 16) };
+  return { label: all.trackers[tracker].label, colour: all.trackers[tracker].colour, sequence: all.sequences[sequence].name, repeat: here[3], pictured: here[5] & 2, paged: !(here[5] & 4) };
 }
 
 function factsOf(run) {
@@ -87,6 +87,7 @@ async function render(id) {
   const main = $("run");
   try {
     const all = await side("explore"), where = addChoices(all, id);
+    if (!where && id && all.unlisted) throw new Error(`Run ${id} has no page here, if it is in this report at all. ${all.pageless}`);
     if (!where) throw new Error(id ? `There is no run ${id} in this report.` : "No run is named behind # in the address.");
     if (!where.paged) throw new Error(`Run ${id} has no page here. ${all.pageless}`);
     const run = unpacked(await side(`run-${id}`));
