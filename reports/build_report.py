@@ -82,8 +82,7 @@ def build_report(
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
-        most_pages: Runs that have a page of their own, those with the median error of their cell first; None for all
-            of up to `MOST_PAGES` runs, and of more for some `FEWER_PAGES`.
+        most_pages: Runs that have a page of their own, typical ones of their cells first; None for `pages_for`.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -96,8 +95,8 @@ def build_report(
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
     count = helpers_for(sum(len(store.ids()) for store in stores))
-    shown = {"picture_seconds": picture_seconds, "most_frames": most_frames}
-    setup = {"protocol": protocol.model_dump_json(), "output": str(output), **shown}
+    setup = {"protocol": protocol.model_dump_json(), "output": str(output)}
+    setup |= {"picture_seconds": picture_seconds, "most_frames": most_frames}
     hired: AbstractContextManager[Crew | None] = Crew(count, setup) if count else nullcontext()
     with hired as crew:
         if crew is not None:  # what only this process needs is loaded while it waits for them

@@ -113,9 +113,7 @@ def write_explore(
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
     typical = {run.row.run_id for name in board.sequences for run in representatives(board, name, loaded).values()}
-    paged = _paged(
-        board, loaded, typical, pages_for(len(loaded.runs), len(typical)) if most_pages is None else most_pages
-    )
+    paged = _paged(board, loaded, typical, most_pages)
     shown = (typical | {row.run_id for row in board.rows if row.failed}) & {run.row.run_id for run in paged}
     runs = sorted(paged, key=lambda run: (run.row.run_id not in shown, run.row.column_id))
     done = 0
@@ -179,8 +177,9 @@ def pages_for(runs: int, typical: int) -> int:
     return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
 
-def _paged(board: Board, loaded: Loaded, typical: Set[str], most: int) -> list[LoadedRun]:
+def _paged(board: Board, loaded: Loaded, typical: Set[str], most: int | None) -> list[LoadedRun]:
     """The runs that have a page: the typical one of every cell, then its first, its second, ... repeat."""
+    most = pages_for(len(loaded.runs), len(typical)) if most is None else most
     if len(loaded.runs) <= most:
         return loaded.runs
     cells = [cell.rows for cells in board.cells.values() for cell in cells.values()]
