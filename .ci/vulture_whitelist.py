@@ -32,6 +32,7 @@ NeverMove  # trackers.adapters.specs
 Open3dOdometry  # trackers.adapters.specs
 OpenCvOdometry  # trackers.adapters.specs
 OrbSlam3  # trackers.adapters.specs
+OrbSlam3Monocular  # trackers.adapters.specs
 Replay  # trackers.adapters.specs
 build_masks_only  # trackers.systems.dynaslam: a variant's spec
 build_object_mode  # trackers.systems.emfoa_oft: a variant's spec
