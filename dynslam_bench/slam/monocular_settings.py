@@ -65,7 +65,9 @@ class MonocularMappingSettings(MappingSettings):
     neighbours: int = tunable(
         20, low=3, high=40, limits=(1, 100), meaning="covisible keyframes that new points are sought in and fused with"
     )
-    triangulate_below: Literal[1.0] = Field(1.0, description="no effect: whatever has no point yet is triangulated")
+    triangulate_below: float = Field(
+        1.0, ge=1, le=1, description="no effect: whatever has no point yet is triangulated"
+    )
 
 
 class MonocularBackendSettings(BackendSettings):
