@@ -196,7 +196,10 @@ def _step(
     if not cholesky_solve(s, g):
         return False
     for c in range(variable):
-        new_poses[c] = apply_twist(poses[c], g[6 * c : 6 * c + 6])
+        moved = apply_twist(poses[c], g[6 * c : 6 * c + 6])
+        for m in range(4):
+            for o in range(4):
+                new_poses[c, m, o] = moved[m, o]
     for i in range(q):
         b0, b1, b2 = b[i, 0], b[i, 1], b[i, 2]
         for k in range(start[i], start[i + 1]):
@@ -235,7 +238,8 @@ def _adjust(
             )
             if new < cost:
                 poses, points = new_poses, new_points
-                chi2[:] = trial
+                for k in range(chi2.shape[0]):
+                    chi2[k] = trial[k]
                 gain = cost - new
                 cost = new
                 damping = max(damping * 0.2, 1e-8)

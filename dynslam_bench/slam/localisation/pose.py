@@ -211,13 +211,12 @@ def _optimise(
     inlier = np.ones(n, np.bool_)
     error = np.zeros(n)
     h, g = np.zeros((6, 6)), np.zeros(6)
-    work = np.zeros((6, 6))
     for turn in range(rounds):
         huber = turn < rounds - 1
         damping = 1e-6
         cost = _linearise(pose, points, uv, right, info, info_right, inlier, huber, fx, fy, cx, cy, bf, h, g)
         for _ in range(iterations):
-            work[:] = h
+            work = h.copy()
             for m in range(6):
                 work[m, m] += damping * h[m, m] + 1e-9
             step = g.copy()
@@ -229,7 +228,7 @@ def _optimise(
             if new <= cost:
                 gain = cost - new
                 pose, cost = candidate, new
-                h[:], g[:] = h2, g2
+                h, g = h2, g2
                 damping = max(damping * 0.1, 1e-9)
                 if gain < 1e-4 * (cost + 1e-12):
                     break

@@ -129,17 +129,17 @@ def refresh(
         if n == 0:
             continue
         m = min(n, 12)  # the newest observations stand for all
+        best = n - 1
         if m > 2:
-            best, best_score = 0, 1 << 40
+            best_score = 1 << 40
             for a in range(n - m, n):
                 score = 0
                 for b in range(n - m, n):
                     score += distance(kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]])
                 if score < best_score:
                     best, best_score = a, score
-            words[p] = kf_words[obs_kf[p, best], obs_ft[p, best]]
-        else:
-            words[p] = kf_words[obs_kf[p, n - 1], obs_ft[p, n - 1]]
+        for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
+            words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
         sx, sy, sz = 0.0, 0.0, 0.0
         reach = 0.0
         for k in range(n):
