@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import median
 
 from .row import RunRow
@@ -21,22 +22,22 @@ class Cell:
     rows: tuple[RunRow, ...]
     kept: tuple[RunRow, ...]
 
-    @property
+    @cached_property
     def scores(self) -> tuple[float, ...]:
         """Errors in metres of the runs that count, failures imputed."""
         return tuple(score for row in self.kept if (score := row.score_m) is not None)
 
-    @property
+    @cached_property
     def succeeded(self) -> tuple[RunRow, ...]:
         """The runs that count, ended and have an error."""
         return tuple(row for row in self.kept if not row.failed and row.score_m is not None)
 
-    @property
+    @cached_property
     def median(self) -> float | None:
         """Median error in metres; None without ground truth."""
         return median(self.scores) if self.scores else None
 
-    @property
+    @cached_property
     def failed(self) -> int:
         """Runs that failed."""
         return sum(row.failed for row in self.rows)
@@ -51,18 +52,18 @@ class Cell:
         """Whether several seeds gave one result to the last digit."""
         return len(self.kept) == 1 < len(self.rows)
 
-    @property
+    @cached_property
     def typical(self) -> RunRow:
         """The run that stands for the cell: the successful one with the (lower) median error, else its first."""
         ordered = sorted(self.succeeded, key=lambda row: row.score_m or 0.0)
         return ordered[(len(ordered) - 1) // 2] if ordered else self.rows[0]
 
-    @property
+    @cached_property
     def seen(self) -> bool:
         """Whether masks of it come from a network that was trained on the scene."""
         return any(row.seen_in_training for row in self.rows)
 
-    @property
+    @cached_property
     def ending(self) -> str:
         """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from .row import RunRow
 
@@ -16,6 +19,7 @@ _WHOLE = ["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"]
 _FLAGS = ["ranked", "failed", "cached", "seen_in_training"]
 _NUMBERS = ["coverage", "score_m", "held_ate_m", "final_ate_m", "never_move_m", "frame_ms", "real_time_factor"]
 _NUMBERS += ["peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
+_OWN = ("label", "sequence", "settings")
 
 
 def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
@@ -48,11 +52,24 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     metrics = sorted({name for row in rows for name in row.metrics})
     kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
     kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "Float64")
-    own: dict[str, list[Any]] = {
-        "label": [labels[row.variant_key] for row in ordered],
-        "sequence": [columns[row.column_id] for row in ordered],
-        "settings": ["; ".join(f"{name}={value}" for name, value in row.variant.items()) for row in ordered],
-    }
-    own |= {name: [row.metrics.get(name) for row in ordered] for name in metrics}
-    found = {name: own[name] if name in own else [getattr(row, name) for row in ordered] for name in kinds}
-    return pd.DataFrame({name: pd.array(values, dtype=kinds[name]) for name, values in found.items()})
+    plain = [name for name in kinds if name not in {*_OWN, *metrics}]
+    of_row = attrgetter(*plain)
+    lines = [  # row by row: a hundred thousand of them lie far apart in memory
+        (*_own(row, columns, labels), *map(row.metrics.get, metrics), *of_row(row)) for row in ordered
+    ]
+    values = zip(*lines, strict=True) if lines else [()] * len(kinds)
+    found = dict(zip([*_OWN, *metrics, *plain], values, strict=True))
+    return pd.DataFrame({name: _array(found[name], kind) for name, kind in kinds.items()})
+
+
+def _own(row: RunRow, columns: Mapping[str, str], labels: Mapping[str, str]) -> tuple[str, str, str]:
+    """What a row alone does not know, under the names `_OWN`."""
+    settings = "; ".join(f"{name}={value}" for name, value in row.variant.items())
+    return labels[row.variant_key], columns[row.column_id], settings
+
+
+def _array(values: Sequence[Any], kind: str) -> Any:
+    """A column of a kind; numbers by way of numpy, which takes a tenth of the time."""
+    import pandas as pd
+
+    return pd.array(np.array(values, dtype=np.float64) if kind == "Float64" else list(values), dtype=kind)

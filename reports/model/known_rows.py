@@ -21,7 +21,7 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import Digest, digest
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.storage.line_file import add_lines, read_line_file, write_line_file
+from dynslam_bench.runs.storage.line_file import add_lines, read_line_file, remove_older, write_line_file
 from dynslam_bench.runs.storage.states import NO_FILE, Stamp, folder_state, stamp_if_there
 from dynslam_bench.runs.storage.store import RunStore
 
@@ -106,8 +106,10 @@ class KnownRows:
             known = (KnownRow.of(newest[run_id]) for run_id in stored if run_id in newest)
             found = {each.run_id: each for each in known if self._holds(each)}
         count = len(lines) + damaged
-        if not count or count - len(found) > _MOST_STALE * count:
+        if count - len(found) > _MOST_STALE * count:
             write_line_file(self._path, _lines(found.values()), self._older)
+        elif not count:
+            remove_older(self._path, self._older)
         for run_id, known in found.items():
             if known.row is not None:
                 known.row.log = log_of(self.store, run_id)
@@ -133,7 +135,8 @@ class KnownRows:
             except DynslamError as error:
                 unreadable.append(f"{self.store.folder(run_id)}: {error}")
                 told("")
-        add_lines(self._path, _lines(taken))
+        if taken:
+            add_lines(self._path, _lines(taken))
         return taken, unreadable
 
     def _take(self, run_id: str) -> KnownRow:

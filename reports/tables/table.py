@@ -8,8 +8,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import pandas as pd
-from pandas.api.types import is_numeric_dtype
+from pandas.api.types import is_float_dtype, is_numeric_dtype
 
 from dynslam_bench.core.harmless import printable
 
@@ -200,6 +201,9 @@ def csv_text(frame: pd.DataFrame) -> str:
 
 def _written(values: pd.Series) -> list[object]:
     """What CSV says of a column; what cannot be harmful is not looked at one by one: there may be millions of it."""
+    if is_float_dtype(values.dtype):
+        numbers = values.to_numpy(dtype=np.float64, na_value=np.nan).tolist()
+        return [None if number != number else number for number in numbers]
     found = values.astype(object)
     if is_numeric_dtype(values.dtype):
         return found.where(values.notna(), None).tolist()

@@ -11,6 +11,7 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum
+from dynslam_bench.reports.model.known_rows import KnownRows
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.runs import RunStore
 
@@ -234,3 +235,10 @@ def test_a_reference_is_looked_for_among_known_and_new_rows(store, reads):
     assert load_runs([store], PROTOCOL, reference="newcomer").runs and set(reads) == {new}
     with pytest.raises(ReportError, match="no run of the reference 'nobody'"):
         load_runs([store], PROTOCOL, reference="nobody")
+
+
+def test_nothing_is_made_where_no_run_is(tmp_path):
+    with pytest.raises(ReportError, match="no runs"):
+        load_runs([RunStore(tmp_path / "nowhere")], PROTOCOL)
+    assert KnownRows(RunStore(tmp_path / "nowhere"), PROTOCOL).take_all([], print) == ([], [])
+    assert list(tmp_path.iterdir()) == []

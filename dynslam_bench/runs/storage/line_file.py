@@ -54,8 +54,14 @@ def write_line_file(path: Path, lines: Iterable[str], older: str) -> None:
         lines: Its lines.
         older: Pattern of the names of its older versions, which go.
     """
-    with contextlib.suppress(DynslamError, OSError):
+    with contextlib.suppress(DynslamError):
         write_lines(path, lines)
+        remove_older(path, older)
+
+
+def remove_older(path: Path, older: str) -> None:
+    """Remove the older versions of a file, as far as the folder can be written."""
+    with contextlib.suppress(OSError):
         for other in path.parent.glob(older):
             if other != path:
                 other.unlink()

@@ -52,8 +52,8 @@ class RunStore:
 
     ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``, ``frames.csv``,
     ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``metrics/<protocol digest>/<run_id>.json`` the errors under a
-    protocol; ``index/`` what a list says of each run; ``sequences/<part>/`` stamps and ground truth, so that a run can
-    be scored again without its data; ``latest`` links the newest run.
+    protocol; ``index/`` what lists and reports have said of each run; ``sequences/<part>/`` stamps and ground truth,
+    so that a run can be scored again without its data; ``latest`` links the newest run.
 
     Args:
         root: The folder; it is made when something is written.

@@ -1,0 +1,141 @@
+"""Reports of very many runs: what is read, and that what is left out is said while every number counts all runs."""
+
+import json
+
+import pandas as pd
+import pytest
+from reports_fake_store import add_run, fill
+from reports_rows import row
+
+from dynslam_bench.core import reading
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports import ReportData, build_report
+from dynslam_bench.reports.figures import leaderboard as figures
+from dynslam_bench.reports.html import explore_data, sections
+from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
+from dynslam_bench.reports.model import common
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.rows import Loaded, LoadedRun, load_runs
+from dynslam_bench.reports.tables import table as tables
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
+from dynslam_bench.runs import RunStore
+
+PROTOCOL = get_protocol("tum-rgbd/v1")
+
+
+def written(folder, name):
+    text = (folder / "data" / f"{name}.js").read_text()
+    return json.loads(text[text.index(",") + 1 : text.rindex(")")])
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Files that are read."""
+    found = []
+    real = reading.read_bytes
+    monkeypatch.setattr(reading, "read_bytes", lambda path, **how: found.append(path.name) or real(path, **how))
+    return found
+
+
+def test_fifty_known_runs_cost_no_file_each(tmp_path, opened):
+    store = RunStore(tmp_path / "results")
+    for number in range(50):
+        add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
+    load_runs([store], PROTOCOL)
+    assert opened.count("run.json") == 50
+    opened.clear()
+    assert len(load_runs([store], PROTOCOL).runs) == 50 and opened == []
+    build_report(store, tmp_path / "report", most_pages=7, picture_seconds=0)
+    assert opened.count("run.json") == 7  # those that have a page, and every one once
+
+
+def test_of_very_many_runs_few_have_a_page():
+    assert pages_for(MOST_PAGES, 10) == MOST_PAGES
+    assert pages_for(MOST_PAGES + 1, 10) == pages_for(100_000, 1000) == FEWER_PAGES
+    assert pages_for(100_000, 3000) == 3000 and pages_for(100_000, 90_000) == MOST_PAGES
+
+
+def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
+    store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"])
+    add_run(store, "dies", "synthetic/walking_xyz", status="crashed", reason="RuntimeError: no")
+    build_report(store, tmp_path / "whole", picture_seconds=0)
+    monkeypatch.setattr(explore_data, "MOST_LISTED", 3)
+    build_report(store, tmp_path / "short", most_pages=2, picture_seconds=0)
+    whole, short = written(tmp_path / "whole", "explore"), written(tmp_path / "short", "explore")
+    assert len(whole["runs"]) == len(store.ids()) == len(short["runs"]) + short["unlisted"] and short["unlisted"] > 5
+    assert short["cells"] == whole["cells"] and whole["unlisted"] == 0
+    assert {(run[1], run[2]) for run in short["runs"]} == {(cell[0], cell[1]) for cell in whole["cells"]}
+
+
+def test_common_frames_of_many_runs_are_those_around_every_median(monkeypatch):
+    errors = {"a": [0.5, 0.1, 0.3, 0.2, 0.4], "b": [1.0], "c": [3.0, 1.0, 2.0, 4.0]}
+    rows = [
+        row(key, "s", error, seed=at, run_id=f"{key}{at}")
+        for key, some in errors.items()
+        for at, error in enumerate(some)
+    ]
+    board = make_board(rows)
+    loaded = Loaded([LoadedRun(each, "0" * 16, RunStore("nowhere")) for each in rows])
+    runs = common.successful(board, "s", loaded)
+    assert len(common._around_medians(runs)) == 10  # the choice that `common_errors` makes of what it would read
+    monkeypatch.setattr(common, "MOST_COMPARED", 9)
+    kept = {(run.row.tracker, run.row.metrics["ate_rmse_m"]) for run in common._around_medians(runs)}
+    assert kept == {("a", 0.2), ("a", 0.3), ("a", 0.4), ("b", 1.0), ("c", 1.0), ("c", 2.0), ("c", 3.0)}
+    monkeypatch.setattr(common, "MOST_COMPARED", 1)
+    kept = {(run.row.tracker, run.row.metrics["ate_rmse_m"]) for run in common._around_medians(runs)}
+    assert kept == {("a", 0.3), ("b", 1.0), ("c", 2.0)}
+
+
+def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
+    monkeypatch.setattr(tables, "MOST_ROWS", 3)
+    long = Table("long", "Long", "All of it.", [Column("x")], [[TableCell(str(at), value=at)] for at in range(5)])
+    assert len(long.displayed().rows) == 3 and to_csv(long).splitlines() == ["x", *"01234"]
+    assert "All of it. These are the first 3 of 5 rows; all stand in csv/long.csv." in to_markdown(long)
+
+
+def test_figures_thin_many_points_and_say_so(tmp_path, monkeypatch):
+    store = fill(tmp_path / "results", sequences=["s/a", "s/b"], seeds=range(4))
+    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    whole = figures.repeat_figure(board)
+    assert sections._thinned(board) == ""
+    monkeypatch.setattr(figures, "MOST_POINTS", 3)
+    thin = figures.repeat_figure(board)
+    assert "more than 3 runs" in sections._thinned(board)
+    ends = [[(min(trace["x"]), max(trace["x"])) for trace in figure["data"]] for figure in (whole, thin)]
+    assert ends[0] == ends[1] and {len(trace["x"]) for trace in thin["data"]} == {3}
+    assert all(len(trace["text"]) == len(trace["x"]) for trace in thin["data"])
+    assert {len(trace["x"]) for trace in figures.mask_figure(board)["data"]} == {3}
+
+
+def test_long_lists_end_in_how_many_more_there_are():
+    assert sections._few(["a", "b"], 2, "and {}") == ["a", "b"]
+    assert sections._few(["a", "b", "c", "d"], 2, "and {}") == ["a", "b", "and 2"]
+
+
+def test_csv_of_every_kind_of_column():
+    frame = pd.DataFrame(
+        {
+            "number": pd.array([0.1, None, 1e-17], dtype="Float64"),
+            "whole": pd.array([1, None, 3], dtype="Int64"),
+            "flag": pd.array([True, None, False], dtype="boolean"),
+            "word": pd.array(["=1+1", None, "\x1b[31m"], dtype="string"),
+            "any": pd.Series([1, "-x", None], dtype=object),
+        }
+    )
+    assert csv_text(frame).splitlines() == [
+        "number,whole,flag,word,any",
+        "0.1,1,True,'=1+1,1",
+        ",,,,'-x",
+        "1e-17,3,False,\\x1b[31m,",
+    ]
+
+
+def test_rows_are_written_one_a_line_and_read_back(tmp_path):
+    rows = [row(run_id=str(at), reason="postgresql://me:secret@db/x") for at in range(3)]
+    for some in (rows, rows[:1], []):
+        data = ReportData(title="t", protocol="p", reference="r", version="1", rows=some)
+        data.write(tmp_path / "report.json")
+        text = (tmp_path / "report.json").read_text()
+        read = ReportData.read(tmp_path / "report.json")
+        assert [each.run_id for each in read.rows] == [each.run_id for each in some]
+        assert "secret" not in text and len(text.splitlines()) == len(some) + 2
