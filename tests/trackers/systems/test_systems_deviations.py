@@ -31,7 +31,7 @@ WITH_MASKS = [
     if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source != "none"
 ]
 WITH_FLOW = [spec for spec in PUBLISHED if isinstance(getattr(spec.settings(), "flow", None), PublishedFlowSettings)]
-GROW_UNSTATED = ("sof-slam", "seg-slam", "chen-slam", "huai-slam", "cfp-slam")
+GROW_UNSTATED = ("sof-slam", "seg-slam", "chen-slam", "chen-slam-mono", "huai-slam", "cfp-slam")
 """Systems whose masks are grown although no source says how far; DynaSLAM's 15 px are its own."""
 OBJECTS = ("ds-slam", "di-slam", "yolo-slam", "dynatm-slam", "ngd-slam", "sgc-slam", "detect-slam", "dgs-slam")
 """Systems that judge by boxes or by whole objects."""

@@ -23,6 +23,7 @@ TESTED = {
     "di-slam": "keep",
     "blitz-slam": "keep",
     "chen-slam": "keep",
+    "chen-slam-mono": "keep",
     "mor-slam": "keep",
     "sof-slam": "keep",
     "seg-slam": "keep",
