@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.checks import check_trajectory
+from dynslam_bench.contracts.checks import check_sensors, check_trajectory
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
@@ -70,6 +70,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     ``frame_error_rot_deg`` (motion since the previous frame) where there is ground truth. The last step adds
     ``episode_metrics`` under the protocol named by ``protocol``. What is not defined is left out, never NaN. Wall-clock
     times are no part of it: see `timings`.
+
+    **Monocular trackers** (`TrackerSpec.sensors` is ``rgb``) give poses in a unit of their own. No pose error is known
+    as frames come: none is given, and the reward is 0. The last step's metrics need a protocol with Sim(3) alignment.
 
     **End**: ``truncated`` at the end of the sequence, ``terminated`` after `lost_after` lost frames in a row.
 
@@ -204,7 +207,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             tracker.configure(self.settings)  # type: ignore[attr-defined]
         tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
         self.episode = Episode()
-        self._errors = OnlineError(self.sequence.ground_truth, self.protocol.max_dt)
+        self._errors = OnlineError(
+            self.sequence.ground_truth if self.tracker_spec.metric else None, self.protocol.max_dt
+        )
         self._final = None
         self._canvas = None
         self._track_next(tracker)
@@ -265,7 +270,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         final = self.final_trajectory() if self.protocol.trajectory == "final" else None
         trajectory = final if final is not None else self.online_trajectory()
         due = self.sequence.timestamps if self.episode.over else self.sequence.timestamps[: self.episode.next_index]
-        return episode_metrics(self.protocol, trajectory, self.episode.tracked, due, self.sequence.ground_truth)
+        truth = self.sequence.ground_truth if self.tracker_spec.metric or self.protocol.finds_scale else None
+        return episode_metrics(self.protocol, trajectory, self.episode.tracked, due, truth)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The current frame with its features and masks beside the trajectory, uint8 ``[H, W, 3]``."""
@@ -307,6 +313,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if len(opened) < 2:
             raise SequenceError(f"'{opened.id}' has {len(opened)} frames here, an episode needs 2 or more")
         self.protocol.check_sequence(opened.id)
+        check_sensors(self.tracker_spec, opened)
         self.sequence = opened
         self._source = sequence
 

@@ -14,6 +14,7 @@ import numpy as np
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs import RunEvent, RunRecord, RunStore, run_many, score
+from dynslam_bench.trackers.registry import TRACKERS
 
 from .blocks import Block
 
@@ -93,6 +94,7 @@ def evaluate(
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     held, blocks, stop = held_protocol(protocol), list(blocks), [False]
+    held.check_scale(tracker, TRACKERS.get(tracker).sensors)
 
     def ended() -> bool:
         return stop[0] or (cancelled is not None and cancelled())

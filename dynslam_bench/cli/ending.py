@@ -7,7 +7,8 @@ import signal
 import sys
 from types import FrameType
 
-INTERRUPTED = "interrupted; what is finished is stored, the same command goes on from there"
+STORING = ("run", "bench", "tune", "demo", "report", "segmenter", "sequences")
+"""Verbs that keep what they have finished."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _TOLD = 128
 """A shell's exit code for a signal is this and the signal's number."""
@@ -31,7 +32,8 @@ def code() -> int:
 
 def leave_interrupted() -> None:
     """Say how to go on, and exit."""
-    sys.stderr.write(f"{INTERRUPTED}\n")
+    goes_on = "; what is finished is stored, the same command goes on from there"
+    sys.stderr.write(f"interrupted{goes_on if sys.argv[1:2] and sys.argv[1] in STORING else ''}\n")
     sys.exit(code())
 
 

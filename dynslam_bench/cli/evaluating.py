@@ -13,8 +13,11 @@ from .output import write, write_json, write_table
 from .panels import MEASURE
 
 protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
-Estimate = Annotated[Path, typer.Argument(help="Trajectory file in TUM format, or in KITTI's with --timestamps.")]
-GroundTruth = Annotated[Path, typer.Argument(help="Ground-truth file in either format.")]
+Estimate = Annotated[
+    Path,
+    typer.Argument(help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."),
+]
+GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
 
 
 def add(app: typer.Typer) -> None:
@@ -31,9 +34,11 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Evaluate a trajectory file against a ground-truth file."""
-    from dynslam_bench.evaluation import evaluate_files
+    from dynslam_bench.evaluation.evaluate import evaluate_loaded
+    from dynslam_bench.runs import read_trajectory
 
-    result = evaluate_files(estimate, ground_truth, protocol, timestamps=timestamps)
+    loaded = [read_trajectory(path, timestamps) for path in (estimate, ground_truth)]
+    result = evaluate_loaded(*loaded, protocol)
     if as_json:
         write_json(result)
         return
@@ -61,9 +66,9 @@ def compare(
 ) -> None:
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation import compare_protocols
-    from dynslam_bench.geometry.trajectory_file import load_trajectory
+    from dynslam_bench.runs import read_trajectory
 
-    loaded = [load_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth)]
+    loaded = [read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth)]
     rows = compare_protocols(loaded[0], loaded[1], of_file=True)
     if as_json:
         write_json([asdict(row) for row in rows])

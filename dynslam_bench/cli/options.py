@@ -65,7 +65,7 @@ Assignments = Annotated[
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="Set a setting, e.g. epipolar.threshold_px=1.5; repeatable.",
+        help="Set a setting, e.g. features.n_features=800; repeatable.",
         rich_help_panel=SETTINGS,
         autocompletion=completion.settings,
     ),
@@ -120,7 +120,7 @@ Degrade = Annotated[
     typer.Option(
         "--degrade",
         metavar="KIND=STRENGTH",
-        help="Spoil the images: lighting, glare, shadow, blur, noise; repeatable.",
+        help="Spoil the frames: lighting, glare, shadow, blur, noise, depth_noise; repeatable.",
         rich_help_panel=FRAMES,
     ),
 ]

@@ -174,7 +174,8 @@ def bench(
     suite: Annotated[
         str,
         typer.Argument(
-            help="dynamic, dynamic-full, objects, real, robustness, or a TOML file.", autocompletion=completion.suites
+            help="demo, dynamic, dynamic-full, objects, real, robustness, smoke, or a TOML file.",
+            autocompletion=completion.suites,
         ),
     ],
     results: Results = Path("results"),
@@ -263,7 +264,7 @@ def make_runs(
     """`run_many` with a progress bar; the ids of runs that were stored already are added to `reused`."""
     from dynslam_bench.runs import run_many
 
-    with progress(f"{len(specs)} runs") as advance:
+    with progress(f"{len(specs)} run{'s' * (len(specs) != 1)}") as advance:
         shares: dict[str, float] = {}
 
         def told(event: RunEvent) -> None:

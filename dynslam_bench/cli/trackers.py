@@ -30,6 +30,7 @@ def list_(as_json: AsJson = False) -> None:
         {
             "id": found.spec.id,
             "label": found.spec.label,
+            "sensors": found.spec.sensors,
             "provenance": found.spec.provenance,
             "ranked": found.spec.ranked,
             "available": not found.spec.missing(),
@@ -42,7 +43,7 @@ def list_(as_json: AsJson = False) -> None:
     if as_json:
         write_json(rows)
         return
-    columns = ("id", "provenance", "ranked", "available", "summary")
+    columns = ("id", "sensors", "provenance", "ranked", "available", "summary")
     write_table(columns, [[row[column] for column in columns] for row in rows], shrink=("summary",))
 
 

@@ -18,7 +18,8 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .result import TrackingState, TrackResult
-from .sequence import Frame
+from .sequence import Frame, Sequence
+from .tracker import TrackerSpec
 
 STATES = get_args(TrackingState)
 
@@ -103,6 +104,19 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
     assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
     return replace(result, stats=stats)
+
+
+def check_sensors(spec: TrackerSpec, sequence: Sequence) -> None:
+    """Refuse, before anything runs, a tracker that needs depth on a sequence that says that it has none.
+
+    Raises:
+        TrackerError: Names both.
+    """
+    if spec.sensors == "rgbd" and not getattr(sequence, "has_depth", True):
+        raise TrackerError(
+            f"tracker '{spec.id}' needs depth, and sequence '{sequence.id}' has colour images alone",
+            "run a monocular one, e.g. emfoa-oft-mono or orb-slam2-mono (`trackers list`: sensors rgb)",
+        )
 
 
 def check_trajectory(trajectory: object, tracker: str) -> Trajectory:

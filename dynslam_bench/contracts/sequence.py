@@ -53,7 +53,10 @@ class MaskSource(Protocol):
 
 @runtime_checkable
 class Sequence(Protocol):
-    """A recorded or rendered RGB-D sequence; frames are decoded (or rendered) when they are asked for."""
+    """A recorded or rendered RGB-D sequence; frames are decoded (or rendered) when they are asked for.
+
+    One without depth images says so with an attribute ``has_depth`` that is False; its frames' depth is 0 everywhere.
+    """
 
     @property
     def id(self) -> str:

@@ -67,7 +67,8 @@ class TrackerSpec:
         label: Shown in tables, e.g. ``ORB-SLAM2 (our back end)``.
         settings: Class of its settings; the default instance is the default configuration.
         summary: One line.
-        sensors: What it needs.
+        sensors: What it looks at: ``rgbd``; or ``rgb``, colour alone: it runs without depth, and the unit of length of
+            its poses is its own, so that it is scored under protocols with Sim(3) alignment only.
         deterministic: Same seed, same bits.
         provenance: How closely it follows its source.
         ranked: Whether leaderboards rank it by default.
@@ -111,6 +112,11 @@ class TrackerSpec:
     bound: Mapping[str, Any] = field(default_factory=dict)
     check: str = ""
     files: str = ""
+
+    @property
+    def metric(self) -> bool:
+        """Whether its poses are in metres."""
+        return self.sensors == "rgbd"
 
     def missing(self) -> list[str]:
         """Install hints of what is required but not there; empty if the tracker can run."""

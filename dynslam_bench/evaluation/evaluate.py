@@ -12,6 +12,7 @@ from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_file import load_trajectory
+from dynslam_bench.geometry.tum_file import TumFile
 
 from . import frames
 from .alignment import Similarity, align
@@ -196,14 +197,21 @@ def evaluate_files(
         TrajectoryError: A file cannot be read.
         EvaluationError: As `evaluate`.
     """
+    return evaluate_loaded(load_trajectory(estimate, timestamps), load_trajectory(ground_truth, timestamps), protocol)
+
+
+def evaluate_loaded(estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str) -> Evaluation:
+    """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
+
+    Raises:
+        EvaluationError: As `evaluate`.
+    """
     protocol = get_protocol(protocol)
-    loaded = {
-        "estimate": load_trajectory(estimate, timestamps),
-        "ground truth": load_trajectory(ground_truth, timestamps),
-    }
-    truth = truth_of_file(loaded["ground truth"].trajectory, protocol)
-    result = evaluate(loaded["estimate"].trajectory, truth, protocol)
+    result = evaluate(estimate.trajectory, truth_of_file(ground_truth.trajectory, protocol), protocol)
+    loaded = {"estimate": estimate, "ground truth": ground_truth}
     notes = [f"{name}: {note}" for name, file in loaded.items() for note in file.notes.describe()]
+    if protocol.only_for:
+        notes.append(f"{protocol.id} means something for {protocol.only_for}* only, which files do not tell")
     return result.model_copy(update={"diagnostics": notes + result.diagnostics})
 
 

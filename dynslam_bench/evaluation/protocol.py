@@ -19,6 +19,8 @@ DeltaUnit = Literal["f", "s", "m", "rad", "deg"]
 PairMode = Literal["tum-fixed", "tum-random", "consecutive", "all"]
 Truth = Literal["as-is", "bonn-camera", "bonn-droid-w"]
 
+MONOCULAR = "tum-rgbd/v1-sim3"
+"""Id of the protocol for trackers whose scale is unknown: that of TUM with a Sim(3) alignment."""
 _UNIT_NAMES = {"f": "frame", "s": "s", "m": "m", "rad": "rad", "deg": "deg"}
 
 
@@ -136,6 +138,27 @@ class Protocol(_Frozen):
         if not sequence.startswith(self.only_for):
             raise EvaluationError(f"protocol {self.id} holds for {self.only_for}* only, not for '{sequence}'")
 
+    @property
+    def finds_scale(self) -> bool:
+        """Whether the alignment finds the estimate's scale."""
+        return self.alignment == "sim3"
+
+    def check_scale(self, tracker: str, sensors: str) -> None:
+        """Refuse poses of a camera alone, whose unit of length nobody knows, unless the alignment finds their scale.
+
+        Args:
+            tracker: Id of the tracker, for the message.
+            sensors: What it looks at (`TrackerSpec.sensors`).
+
+        Raises:
+            EvaluationError: They are, and it does not.
+        """
+        if sensors == "rgb" and not self.finds_scale:
+            raise EvaluationError(
+                f"'{tracker}' is monocular: its scale is unknown, and protocol {self.id} aligns without scale",
+                f"score it under a protocol with Sim(3) alignment: --protocol {MONOCULAR}",
+            )
+
     def describe(self) -> str:
         """One line for captions: everything that the numbers depend on."""
         alignment = {
@@ -171,6 +194,8 @@ PROTOCOLS: dict[str, Protocol] = {
     protocol.id: protocol
     for protocol in (
         Protocol(id="tum-rgbd/v1", rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f"))),
+        # relative errors are taken under the alignment's scale, too
+        Protocol(id=MONOCULAR, alignment="sim3", rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f"))),
         Protocol(id="tum-rgbd/v1-random-pairs", rpe=(RPESpec(pairs="tum-random"),)),
         Protocol(
             id="evo-default",

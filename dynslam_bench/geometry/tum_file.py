@@ -29,6 +29,8 @@ MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
 _UNIT_TOLERANCE = 0.01
+_LATEST_S = 1e11
+"""Seconds, some 3,000 years: larger stamps are nanoseconds or something else."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,11 @@ def load_tum(path: str | Path) -> TumFile:
     stamps = kept[order, 0]
     last_of_stamp = np.append(np.diff(stamps) > 0, True)
     chosen = kept[order][last_of_stamp]
+    if chosen[-1, 0] > _LATEST_S:
+        raise TrajectoryError(
+            f"{path} has stamps up to {chosen[-1, 0]:.4g}, which are no seconds",
+            "nanoseconds? EuRoC's tables are read by `eval` and `import` where their heading is left in",
+        )
     notes = FileNotes(
         **counted,
         duplicates=int((~last_of_stamp).sum()),

@@ -7,6 +7,7 @@ from functools import cache
 from importlib.metadata import packages_distributions, version
 from typing import Any
 
+from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.errors import RunError, SequenceError
@@ -70,7 +71,8 @@ def resolve(spec: RunSpec) -> ResolvedRun:
 
     Raises:
         DynslamError: Unknown tracker, setting, sequence, device or degradation; a sequence that is missing or has fewer
-            than two frames; a semantic source that is not available; a tracker that needs a missing package.
+            than two frames; a semantic source that is not available; a tracker that needs a missing package, or
+            depth that the sequence has not.
     """
     spec = spec.absolute()
     tracker = TRACKERS.get(spec.tracker)
@@ -83,6 +85,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     )
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
+    check_sensors(tracker, sequence)
     _check_degradation(spec.degrade)
     device = resolve_device(spec.device)
     source = segmentation_source(settings, sequence)

@@ -203,7 +203,7 @@ _AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_
 
 def _tracker_info(resolved: ResolvedRun) -> TrackerInfo:
     tracker = resolved.tracker
-    same = ("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks")
+    same = ("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks", "sensors")
     return TrackerInfo(
         label=resolved.spec.label or tracker.label,
         distribution=resolved.identity["distribution"],

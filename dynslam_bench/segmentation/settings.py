@@ -20,7 +20,8 @@ FORMS = "auto, none, oracle, oracle-classes, embedded, coco, onnx:PATH, recorded
 class SegmentationSettings(Settings):
     """Everything that decides which pixels are held for dynamic because of what they show.
 
-    `source` is one of ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint), ``none``,
+    `source` is one of ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it
+    was fetched), ``none``,
     ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes`` (exact masks of the classes alone),
     ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN checkpoint: torchvision's or
     our own) and ``plugin:ID``. `classes` is a comma-separated list of COCO names and

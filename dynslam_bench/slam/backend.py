@@ -47,6 +47,9 @@ class RgbdBackend:
         levels: Number of pyramid levels of the features that will come.
     """
 
+    uses_depth = True
+    """Whether depth is read; where it is not, the pipeline shows it to nobody."""
+
     def __init__(self, settings: BackendSettings | None = None, *, scale_factor: float = 1.2, levels: int = 8) -> None:
         self.settings = settings or BackendSettings()
         self._scales = scale_factor ** np.arange(max(levels, 1), dtype=np.float64)

@@ -6,7 +6,7 @@ Every published system runs this file; it differs only in its list of filters, i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import cv2
@@ -138,6 +138,8 @@ class SlamPipeline:
         """
         camera = self._begun("track")
         check_frame(frame, camera)
+        if not self._backend.uses_depth:
+            frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
         clock = StageClock(self._cached)
         seen = self._see(frame, camera, clock)
         culled = self._cull(seen, self._known(seen, camera), clock)

@@ -195,7 +195,7 @@ def _read(name: str) -> tuple[str, str]:
         return files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8"), f"{name}.toml"
     path = Path(name).expanduser()
     if path.suffix != ".toml":
-        raise RunError(f"unknown suite '{name}'", did_you_mean(name, suite_names()) + ", or name a .toml file")
+        raise RunError(f"unknown suite '{name}'", did_you_mean(name, suite_names()) + " Or name a .toml file")
     return read_text(path, kind=RunError), str(path)
 
 

@@ -12,7 +12,7 @@ from ..model.crew import Crew
 from ..model.missing import missing_commands, missing_note
 from ..model.published import is_excerpt, least_length_s, reported_for
 from ..model.records import records_for
-from ..model.rows import Loaded
+from ..model.rows import Loaded, without_scale_words
 from ..model.statistics import FEWEST, power_note
 from ..tables import fairness as fairness_tables
 from ..tables import leaderboard as tables
@@ -30,7 +30,7 @@ _MOST_COMMANDS = 200
 
 def add_leaderboard(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
     """The ranking, what is missing for more of it, and the commands that fill the gaps."""
-    section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=_leaderboard_notes(board, loaded))
+    section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=_leaderboard_notes(board, protocol, loaded))
     section.blocks.append(draft.table(tables.leaderboard(board, protocol)))
     ratio = figures.ratio_figure(board)
     if ratio is not None:
@@ -45,7 +45,7 @@ def add_leaderboard(draft: Draft, board: Board, protocol: Protocol, loaded: Load
     draft.add(section)
 
 
-def _leaderboard_notes(board: Board, loaded: Loaded) -> list[str]:
+def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list[str]:
     cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
     notes = [power_note(board.standings, len(board.common), min((len(c.scores) for c in cells if c.scores), default=0))]
     missing = missing_note(board)
@@ -63,6 +63,8 @@ def _leaderboard_notes(board: Board, loaded: Loaded) -> list[str]:
     ]
     if any(count for count, _ in left):
         notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
+    if loaded.without_scale:
+        notes.append(f"Left out: {without_scale_words(loaded.without_scale, protocol)}.")
     return notes
 
 

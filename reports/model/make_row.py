@@ -38,6 +38,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         variant=variant_of(record),
         provenance=tracker.provenance,
         ranked=tracker.ranked,
+        monocular=tracker.sensors == "rgb",
         sequence=sequence.id,
         frames=part_words(record),
         part_options=part_options(record),

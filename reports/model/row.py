@@ -29,6 +29,7 @@ class RunRow(Record):
         variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
         provenance: How closely the tracker follows its source.
         ranked: Whether its spec lets it be ranked.
+        monocular: Whether its scale is unknown: a protocol whose alignment finds none leaves it out.
         sequence: Sequence id.
         frames: Part of the sequence in words, empty for all of it.
         part_options: The same as command-line options.
@@ -83,6 +84,7 @@ class RunRow(Record):
     variant: dict[str, Any] = Field(default_factory=dict)
     provenance: str = ""
     ranked: bool = True
+    monocular: bool = False
     sequence: str
     frames: str = ""
     part_options: list[str] = Field(default_factory=list)

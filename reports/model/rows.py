@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
-from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.storage.record import RunRecord
 from dynslam_bench.runs.storage.store import RunStore
@@ -76,12 +76,14 @@ class Loaded:
         runs: The newest run of every variant, column and repeat.
         superseded: How many older ones there were.
         stopped: How many runs were left out since they were ended on request.
+        without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
         unreadable: Folders without a valid record, with reasons.
     """
 
     runs: list[LoadedRun] = field(default_factory=list)
     superseded: int = 0
     stopped: int = 0
+    without_scale: int = 0
     unreadable: list[str] = field(default_factory=list)
 
     @cached_property
@@ -117,13 +119,16 @@ def load_runs(
     everything = [
         (store, each) for store, (known, _), new in zip(sources, kept, taken, strict=True) for each in (*known, *new)
     ]
-    found = [LoadedRun(each.row, each.part, store) for store, each in everything if each.row is not None]
-    loaded = Loaded(stopped=len(everything) - len(found), unreadable=unreadable)
+    ended = [LoadedRun(each.row, each.part, store) for store, each in everything if each.row is not None]
+    found = [run for run in ended if protocol.finds_scale or not run.row.monocular]
+    loaded = Loaded(stopped=len(everything) - len(ended), without_scale=len(ended) - len(found), unreadable=unreadable)
     _join_old_imports(found)
     newest: dict[tuple[object, ...], LoadedRun] = {}
     for run in sorted(found, key=lambda run: (run.row.started, run.row.run_id)):
         newest[run.row.variant_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
     loaded.superseded = len(found) - len(newest)
+    if not newest and loaded.without_scale:
+        raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
     if not newest:
         places = ", ".join(str(store.root) for store in sources)
         raise ReportError(
@@ -131,6 +136,14 @@ def load_runs(
         )
     loaded.runs = list(newest.values())
     return loaded
+
+
+def without_scale_words(count: int, protocol: Protocol) -> str:
+    """Why runs of monocular trackers are in no table, and what shows them."""
+    return (
+        f"{count} runs of monocular trackers: their scale is unknown and {protocol.id} aligns without scale; "
+        f"--protocol {MONOCULAR} shows them"
+    )
 
 
 def _take(

@@ -3,15 +3,15 @@
     python tests/benchmarks/compare_trackers.py --a orb-slam2 --b orbslam3 \\
         --sequences ../shared/data/bonn/rgbd_bonn_crowd --repeats 5 --offsets 0 5 10 --threads 2 --json out.json
 
-ATE is the RMSE of the translation after SE(3) alignment (protocol tum-rgbd/v1), over the frames that both trackers of a
-pair of runs have; "own" is over each one's own tracked frames. Online and final trajectory are scored apart; a tracker
-without a final one shows a dash. A frame's time is that of `track()`, decoding excluded; medians and 95th percentiles
-are taken over the frames of a run, then the median over the runs. CPU times include the programs that a tracker has
-started; that of the main threads is what a frame takes on a machine that does nothing else. --offsets starts the
-sequence later, as other samples of the same scene; a last table then pools them. --threads sets the threads of OpenCV,
-OpenMP, torch and the tracker's context; with --pin the process and its children are also held to that many cores, which
-is the only limit that ORB-SLAM3's own threads know. Vary nothing but the trackers: the machine's other load hits both
-alike because the runs alternate.
+ATE is the RMSE of the translation under --protocol (SE(3) alignment unless told otherwise), over the frames that both
+trackers of a pair of runs have; "own" is over each one's own tracked frames. Online and final trajectory are scored
+apart; a tracker without a final one shows a dash. A frame's time is that of `track()`, decoding excluded; medians and
+95th percentiles are taken over the frames of a run, then the median over the runs. CPU times include the programs that
+a tracker has started; that of the main threads is what a frame takes on a machine that does nothing else. --offsets
+starts the sequence later, as other samples of the same scene; a last table then pools them. --threads sets the threads
+of OpenCV, OpenMP, torch and the tracker's context; with --pin the process and its children are also held to that many
+cores, which is the only limit that ORB-SLAM3's own threads know. Vary nothing but the trackers: the machine's other
+load hits both alike because the runs alternate.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--set-a", nargs="*", default=[], metavar="NAME=VALUE")
     parser.add_argument("--set-b", nargs="*", default=[], metavar="NAME=VALUE")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--protocol", default="tum-rgbd/v1", help="monocular trackers need tum-rgbd/v1-sim3")
     parser.add_argument("--json", type=Path, default=None, help="write every run's numbers to this file")
     return parser.parse_args()
 
@@ -87,7 +88,7 @@ def compare(sequence, frames, offset: int, options: argparse.Namespace) -> dict:
     for repeat in range(options.repeats):
         order = ("a", "b") if repeat % 2 == 0 else ("b", "a")
         outcome = {side: run(side, sequence, frames, repeat, options) for side in order}
-        score_pair(outcome, sequence)
+        score_pair(outcome, sequence, options.protocol)
         for side in "ab":
             runs[side].append({key: value for key, value in outcome[side].items() if not key.startswith("_")})
             text = ", ".join(f"{key} {value:.4g}" for key, value in runs[side][-1].items() if value is not None)
@@ -148,7 +149,7 @@ def processor_seconds() -> tuple[float, float]:
     return main_thread, all_threads
 
 
-def score_pair(outcome: dict[str, dict], sequence) -> None:
+def score_pair(outcome: dict[str, dict], sequence, protocol: str) -> None:
     """Add the errors of one run of each, on common and on own frames."""
     from dynslam_bench.evaluation import common_frames
 
@@ -157,18 +158,18 @@ def score_pair(outcome: dict[str, dict], sequence) -> None:
         present = {side: one for side, one in both.items() if one is not None and len(one)}
         shared = dict(zip(present, common_frames(list(present.values())), strict=True)) if present else {}
         for side in "ab":
-            outcome[side][f"ate_{kind}_m"] = ate(shared.get(side), sequence)
-            outcome[side][f"own_ate_{kind}_m"] = ate(both[side], sequence)
+            outcome[side][f"ate_{kind}_m"] = ate(shared.get(side), sequence, protocol)
+            outcome[side][f"own_ate_{kind}_m"] = ate(both[side], sequence, protocol)
 
 
-def ate(trajectory, sequence) -> float | None:
+def ate(trajectory, sequence, protocol: str) -> float | None:
     from dynslam_bench.core.errors import EvaluationError
     from dynslam_bench.evaluation import evaluate
 
     if trajectory is None or sequence.ground_truth is None:
         return None
     try:
-        return evaluate(trajectory, sequence.ground_truth, "tum-rgbd/v1").metrics["ate_rmse_m"]
+        return evaluate(trajectory, sequence.ground_truth, protocol).metrics["ate_rmse_m"]
     except EvaluationError:
         return None
 

@@ -3,12 +3,12 @@
     python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
 
 Both run block by block in turn, so that whatever else the machine does slows them alike. Rendered scenes are instances
-that no choice has seen, three start offsets each, with the embedded network; the Bonn excerpt has masks of YOLO and
-eight start offsets; the fr1 excerpts, with nobody in view, have the embedded network and four each. Recordings are
-looked for in ``../shared``; what is not there is named. Ratios are preset : default, with 95 % intervals over scenes
-(over starts where there is one scene). "Not worse" is said where the one-sided 95 % bound of the error's ratio lies
-below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes
-hundreds of runs.
+that no choice has seen, two start offsets each, with the embedded network; the Bonn excerpt has masks of YOLO and 16
+start offsets, others than the choice saw; the fr1 excerpts, with nobody in view, have the embedded network and four
+each, likewise. Recordings are looked for in ``../shared``; what is not there is named. Ratios are preset : default,
+with 95 % intervals over scenes (over starts where there is one scene). "Not worse" is said where the one-sided 95 %
+bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to 0.27 in the
+logarithm: a closer margin takes hundreds of runs.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"
 MARGIN = 0.1
 PARTS = {
     "rendered": tuple(
-        f"synthetic/{instances}?frames=60&offsets=0-2"
+        f"synthetic/{instances}?frames=60&offsets=0-1"
         for instances in (
-            "walking_xyz@140-144", "walking_halfsphere@145-149", "walking_rpy@150-154", "walking_static@155-157",
-            "sitting_xyz@158-159",
+            "walking_xyz@160-164", "walking_halfsphere@165-169", "walking_rpy@170-174", "walking_static@175-177",
+            "sitting_xyz@178-179",
         )
     ),
-    "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=0-7",),
-    "fr1": tuple(f"{SHARED}/data/tum/rgbd_dataset_freiburg1_{name}?offsets=0-3" for name in ("xyz", "rpy")),
+    "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=8-23",),
+    "fr1": tuple(f"{SHARED}/data/tum/rgbd_dataset_freiburg1_{name}?offsets=4-7" for name in ("xyz", "rpy")),
 }  # fmt: skip
 
 

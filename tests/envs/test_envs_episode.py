@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from envs_toys import STEP_M, TARGET, ToySequence, truth
+from envs_toys import SPEC, STEP_M, TARGET, ToySequence, truth
 
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv, TrackerContractError
 from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.protocol import MONOCULAR
 from dynslam_bench.geometry import se3
 
 QUIET = {"noise.enabled": False}
@@ -100,6 +103,28 @@ def test_without_ground_truth_errors_are_left_out() -> None:
     assert rewards == [0.0] * 7
     assert not any(key.startswith(("pose_error", "frame_error")) for info in infos for key in info)
     assert infos[-1]["episode_metrics"] == {"coverage": 1.0, "frames": 8.0, "tracked_frames": 8.0}
+
+
+def test_a_monocular_tracker_has_errors_under_a_sim3_protocol_alone() -> None:
+    spec = replace(SPEC, sensors="rgb")
+    rewards, infos, _ = play(SlamEnv(ToySequence(8), spec))
+    assert rewards == [0.0] * 7
+    assert not any(key.startswith(("pose_error", "frame_error")) for info in infos for key in info)
+    assert infos[-1]["episode_metrics"] == {"coverage": 1.0, "frames": 8.0, "tracked_frames": 8.0}
+    _, infos, _ = play(SlamEnv(ToySequence(8), spec, protocol=MONOCULAR))
+    assert infos[-1]["episode_metrics"]["ate_rmse_m"] > 0
+
+
+@pytest.mark.parametrize("has_depth", [True, False])
+def test_a_tracker_that_needs_depth_is_refused_where_there_is_none(has_depth: bool) -> None:
+    sequence = ToySequence(8)
+    sequence.has_depth = has_depth
+    if has_depth:
+        assert len(play(SlamEnv(sequence, SPEC))[0]) == 7
+        return
+    with pytest.raises(TrackerError, match=r"'toy' needs depth, and sequence 'toy/walk' has colour images alone"):
+        SlamEnv(sequence, SPEC)
+    assert len(play(SlamEnv(sequence, replace(SPEC, sensors="rgb")))[0]) == 7
 
 
 def test_a_hole_in_the_ground_truth() -> None:

@@ -45,6 +45,7 @@ def evaluate_run(
     for which in ("online", "final"):
         try:
             protocol.check_sequence(record.sequence.id)
+            protocol.check_scale(record.tracker.id, record.tracker.sensors)
             truth = read_truth()
             if truth is None:
                 raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")

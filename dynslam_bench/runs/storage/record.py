@@ -31,6 +31,7 @@ class TrackerInfo(Record):
     license: str = ""
     citation: str = ""
     remarks: str = ""
+    sensors: Literal["rgbd", "rgb"] = "rgbd"
 
 
 class SequenceInfo(Record):

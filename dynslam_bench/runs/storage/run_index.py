@@ -73,9 +73,16 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "masks": record.segmentation,
         "seen_in_training": seen_in_training(record.segmentation, record.sequence.id),
-        "reason": record.reason,
+        "reason": record.reason or _not_scored(record, metrics),
         "started": record.started,
     }
+
+
+def _not_scored(record: RunRecord, metrics: MetricRecord | None) -> str:
+    """Why a run with ground truth has no errors; empty where it has some, or was not scored."""
+    if metrics is None or metrics.metrics or not record.sequence.ground_truth:
+        return ""
+    return metrics.reasons.get(metrics.trajectory, "")
 
 
 def part_words(record: RunRecord) -> str:

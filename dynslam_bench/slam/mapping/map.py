@@ -304,7 +304,11 @@ class Map:
         )  # fmt: skip
 
     def redundancy(self, slot: int, close_m: float, others: int = 3) -> tuple[int, int]:
-        """A keyframe's close points, and how many of them `others` keyframes see at the same scale or finer."""
-        keyframes, seen = (self.kf_point, self.kf_octave, self.kf_z), (self.obs_kf, self.obs_ft, self.n_obs)
+        """A keyframe's close points, and how many of them `others` keyframes see at the same scale or finer.
+
+        All points of a keyframe without any depth count as close.
+        """
+        depth = self.kf_z if self.kf_z[slot].any() else np.full(self.kf_z.shape, close_m, np.float32)
+        keyframes, seen = (self.kf_point, self.kf_octave, depth), (self.obs_kf, self.obs_ft, self.n_obs)
         total, redundant = kernels.redundancy(slot, int(self.kf_count[slot]), *keyframes, close_m, *seen, others)
         return int(total), int(redundant)

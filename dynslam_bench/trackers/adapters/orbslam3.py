@@ -16,7 +16,7 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.camera import Camera
 
 from .settings import OrbSlam3Settings
-from .subprocess_tracker import FinalizingProgramTracker
+from .subprocess_tracker import FinalizingProgramTracker, ProgramTracker
 from .vocabulary import find_vocabulary
 
 WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
@@ -28,11 +28,11 @@ _VIEWER = (
 )  # fmt: skip
 
 
-class OrbSlam3(FinalizingProgramTracker):
-    """ORB-SLAM3 in RGB-D mode, untouched: its own threads, loop closing and relocalisation included.
+class OrbSlam3Program(ProgramTracker):
+    """ORB-SLAM3, untouched: its own threads, loop closing and relocalisation included.
 
-    The online trajectory holds what it answers at each frame, the final one what it saves at the end. It runs in a
-    child process: ORB-SLAM3 ends its process on bad input, writes to standard output and cannot be stopped otherwise.
+    It runs in a child process: ORB-SLAM3 ends its process on bad input, writes to standard output and cannot be
+    stopped otherwise.
 
     Args:
         settings: What goes into its settings file, the vocabulary, and time limits.
@@ -41,6 +41,9 @@ class OrbSlam3(FinalizingProgramTracker):
     Raises:
         TrackerError: The vocabulary is missing or damaged.
     """
+
+    sensor: str
+    """How ORB-SLAM3 calls what it is given."""
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
         self.settings = settings
@@ -67,7 +70,19 @@ class OrbSlam3(FinalizingProgramTracker):
         """Paths of the vocabulary and of the settings file, which is written here."""
         path = folder / "settings.yaml"
         path.write_text(settings_yaml(camera, self.settings, self.context.fps))
-        return {"vocabulary": str(self._vocabulary), "settings_file": str(path)}
+        return {"vocabulary": str(self._vocabulary), "settings_file": str(path), "sensor": self.sensor}
+
+
+class OrbSlam3(OrbSlam3Program, FinalizingProgramTracker):
+    """In RGB-D mode: online what it answers at each frame, final what it saves at the end."""
+
+    sensor = "RGBD"
+
+
+class OrbSlam3Monocular(OrbSlam3Program):
+    """In monocular mode, which saves no poses of frames at the end; depth is not handed to it."""
+
+    sensor = "MONOCULAR"
 
 
 def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:

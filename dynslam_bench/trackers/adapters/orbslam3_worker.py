@@ -22,6 +22,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._slam: Any = None
+        self._monocular = False
         self._tracked: list[float] = []
 
     def reset(self, request: dict[str, Any]) -> None:
@@ -34,12 +35,18 @@ class Worker:
                 "apt-get install libgl1 libegl1 libopengl0 libsm6 libice6 libx11-6 libxext6"
             ) from error
         options = request["options"]
-        self._slam = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], pyorbslam3.Sensor.RGBD)
+        self._monocular = options["sensor"] == "MONOCULAR"
+        sensor = getattr(pyorbslam3.Sensor, options["sensor"])
+        self._slam = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], sensor)
 
     def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
-        """One frame."""
+        """One frame; without depth in monocular mode."""
         start = time.perf_counter()
-        result = self._slam.track_rgbd(np.ascontiguousarray(rgb), np.ascontiguousarray(depth), timestamp)
+        image = np.ascontiguousarray(rgb)
+        if self._monocular:
+            result = self._slam.track_monocular(image, timestamp)
+        else:
+            result = self._slam.track_rgbd(image, np.ascontiguousarray(depth), timestamp)
         seconds = time.perf_counter() - start
         state = STATES.get(result.state.name, "initialising")
         pose = None if result.pose_wc is None or state == "initialising" else result.pose_wc.astype(float).tolist()

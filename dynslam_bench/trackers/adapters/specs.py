@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from dynslam_bench.contracts.tracker import TrackerSpec
 
 from .settings import (
@@ -88,6 +90,19 @@ ORBSLAM3 = TrackerSpec(
     ),
 )
 
+ORBSLAM3_MONO = replace(
+    ORBSLAM3,
+    id="orbslam3-mono",
+    entry_point=f"{_HERE}.orbslam3:OrbSlam3Monocular",
+    label="ORB-SLAM3, monocular",
+    summary="The real ORB-SLAM3 in its monocular mode, untouched, in a process of its own.",
+    sensors="rgb",
+    remarks=(
+        "Assumes a static world. Its scale is free, and another after each loss that begins a new map; its poses are "
+        "taken as they come, and it saves none of single frames at the end. Threads and vocabulary: see orbslam3."
+    ),
+)
+
 OPENCV_ODOMETRY = TrackerSpec(
     id="opencv-odometry",
     entry_point=f"{_HERE}.opencv_odometry:OpenCvOdometry",
@@ -118,4 +133,13 @@ OPEN3D_ODOMETRY = TrackerSpec(
 
 def adapter_specs() -> list[TrackerSpec]:
     """The control trackers and the adapters."""
-    return [NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, ORBSLAM3, OPENCV_ODOMETRY, OPEN3D_ODOMETRY]
+    return [
+        NEVER_MOVE,
+        CONSTANT_VELOCITY,
+        REPLAY,
+        SUBPROCESS,
+        ORBSLAM3,
+        ORBSLAM3_MONO,
+        OPENCV_ODOMETRY,
+        OPEN3D_ODOMETRY,
+    ]

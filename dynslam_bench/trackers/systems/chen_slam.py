@@ -1,4 +1,7 @@
-"""Chen et al. (Micromachines 2022), the paper's direct parent: masks, Lucas-Kanade, epipolar culling."""
+"""Chen et al. (Micromachines 2022), the paper's direct parent: masks, Lucas-Kanade, epipolar culling.
+
+Theirs is monocular: `chen-slam-mono`. `chen-slam` is the same with depth, to stand beside the other systems.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
 
 from .composition import SemanticSystemSettings, compose
+from .monocular import BACKEND, MonocularSemanticSettings
 from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
 
 if TYPE_CHECKING:
@@ -21,7 +25,14 @@ class ChenSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: ChenSlamSettings, context: TrackerContext) -> SlamPipeline:
+class ChenSlamMonoSettings(MonocularSemanticSettings):
+    """The same without depth."""
+
+    box_epipolar: BoxEpipolarSettings = ChenSlamSettings().box_epipolar
+    flow: PublishedFlowSettings = PublishedFlowSettings()
+
+
+def build(settings: ChenSlamSettings | ChenSlamMonoSettings, context: TrackerContext) -> SlamPipeline:
     """B1, then B3 on the rest."""
     from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
     from dynslam_bench.culling.blocks.semantic import SemanticFilter
@@ -33,21 +44,41 @@ def build(settings: ChenSlamSettings, context: TrackerContext) -> SlamPipeline:
     return compose(settings, context, filters, settings.flow)
 
 
-SPEC = TrackerSpec(
-    id="chen-slam",
-    entry_point=f"{__name__}:build",
-    label="Chen et al. 2022 (our back end)",
-    settings=ChenSlamSettings,
-    summary="masks, then the epipolar test on Lucas-Kanade flow",
-    provenance="inspired",
-    ranked=False,
-    license="MIT (re-implemented from the description)",
-    citation="Chen et al., Micromachines 13(11) 2006, 2022",
-    assumptions=(
-        masks_in_words(ChenSlamSettings().segmentation),
-        matches_in_words(ChenSlamSettings().flow, ChenSlamSettings().box_epipolar.unmatched),
-        grown_in_words(ChenSlamSettings().segmentation),
-        "epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
-        "RGB-D back end (theirs is monocular)",
+def _spec(name: str, summary: str, settings: type[ChenSlamSettings | ChenSlamMonoSettings], sensor: str) -> TrackerSpec:
+    defaults = settings()
+    mono = settings is ChenSlamMonoSettings
+    return TrackerSpec(
+        id=name,
+        entry_point=f"{__name__}:build",
+        label=f"Chen et al. 2022{', monocular' * mono} (our back end)",
+        settings=settings,
+        summary=summary,
+        sensors="rgb" if mono else "rgbd",
+        provenance="inspired",
+        ranked=False,
+        license="MIT (re-implemented from the description)",
+        citation="Chen et al., Micromachines 13(11) 2006, 2022",
+        assumptions=(
+            masks_in_words(defaults.segmentation),
+            matches_in_words(defaults.flow, defaults.box_epipolar.unmatched),
+            grown_in_words(defaults.segmentation),
+            "epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
+            sensor,
+        ),
+    )
+
+
+SPECS = [
+    _spec(
+        "chen-slam",
+        "masks, then the epipolar test on Lucas-Kanade flow",
+        ChenSlamSettings,
+        "RGB-D back end (theirs is monocular: chen-slam-mono)",
     ),
-)
+    _spec(
+        "chen-slam-mono",
+        "masks, then the epipolar test on Lucas-Kanade flow, without depth as published",
+        ChenSlamMonoSettings,
+        BACKEND,
+    ),
+]

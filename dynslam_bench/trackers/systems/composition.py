@@ -95,7 +95,7 @@ def compose(
     from dynslam_bench.features.cached import cached_extractor
     from dynslam_bench.flow.build_flow import build_flow
     from dynslam_bench.segmentation.cached import cache_segmenter
-    from dynslam_bench.slam.backend import RgbdBackend
+    from dynslam_bench.slam.build_backend import build_backend
     from dynslam_bench.slam.pipeline import SlamPipeline
     from dynslam_bench.slam.stage_clock import CachedStage
 
@@ -109,9 +109,7 @@ def compose(
         segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
         if segmenter is not None:
             cached["segmentation"] = segmenter
-    backend = RgbdBackend(
-        settings.backend, scale_factor=settings.features.scale_factor, levels=settings.features.levels
-    )
+    backend = build_backend(settings.backend, settings.features.scale_factor, settings.features.levels)
     return SlamPipeline(
         extractor=extractor,
         masks=masks,

@@ -16,7 +16,7 @@ from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettin
 from dynslam_bench.flow.settings import FlowSettings
 
 from .composition import ObjectSettings, SemanticSystemSettings, SystemSettings, compose
-from .presets import FAST
+from .presets import FAST_FLOW
 from .published import CFPN, grown_in_words, masks_in_words
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def _spec(name: str, summary: str, settings: type[SystemSettings], factory: str 
         summary=summary,
         provenance="faithful-paper" if paper else "own",
         ranked=name in labels,
-        presets=FAST if name == "emfoa-oft" else {},
+        presets=FAST_FLOW if name == "emfoa-oft" else {},
         license="MIT",
         citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/method.md",
         published_as=("EMFOA-OFT-SLAM",) if paper else (),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 
 from .composition import SemanticSystemSettings, compose
-from .presets import FAST
+from .presets import FAST_MASKS
 from .published import CFPN, masks_in_words
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ SPEC = TrackerSpec(
     settings=SemanticSystemSettings,
     summary="drops the features on dilated masks of people; the masks' source is a setting",
     provenance="own",
-    presets=FAST,
+    presets=FAST_MASKS,
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
     assumptions=(

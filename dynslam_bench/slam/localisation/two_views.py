@@ -1,0 +1,250 @@
+"""The first map without depth: how the camera moved between two views, and the points that both show.
+
+As in ORB-SLAM (Mur-Artal, Montiel and Tardos 2015, Section IV) a homography and an essential matrix are fitted to the
+same matches, so that flat and deep scenes both give a motion, and a motion counts if nearly all matches lie before both
+cameras, no other explains them as well, and the rays meet at a wide enough angle. Which one explains them best is not
+read off the two models' scores as there, but off what is left after bundle adjustment of each motion: on a scene with
+one large wall the essential matrix of most matches is a wrong one, while a homography's motion is right, and the points
+beside the wall tell which of them. All functions are pure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.features.matching import rotation_consistent, search_in_radius
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+
+from ..bundle.schur import BundleProblem, adjust_bundle, reprojection_chi2
+from ..monocular_settings import TwoViewSettings
+from .observation import Observations
+from .pose import NEAR_M
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
+
+MAX_DISTANCE = 50
+RATIO = 0.9
+"""Largest Hamming distance of a match, and over that of the second nearest (ORB-SLAM's numbers)."""
+CHI2_LINE, CHI2_POINT = 3.841, 5.991
+"""95 % quantiles of chi-square: distance from a line, and from a point."""
+SURE_SHARE = 0.8
+"""Share of the matches that fit either model which must lie before both cameras and project back."""
+RIVAL_SHARE = 0.75
+"""A motion that explains a smaller share of what the best one does is no rival."""
+RIVAL_COST, RIVAL_FACTOR = 20.0, 1.2
+"""So much more chi-square, on top of so many times the best motion's, must be left to every rival."""
+SAME_SHAPE = 0.1
+"""Two pairs of views tell the same shape if depths differ by less, as a share and in the median, after scaling."""
+SAME_DEG = 1.0, 5.0
+"""Motions whose rotations and whose directions differ by less are one."""
+WIDE_POINTS = 50
+"""So many points must be seen under the smallest parallax or more."""
+RANSAC_ITERATIONS, CONFIDENCE = 2000, 0.999
+BUNDLE_ITERATIONS = 20
+"""Of the bundle adjustment of a motion (ORB-SLAM2's number)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Matches between two views.
+
+    Attributes:
+        first: int64 ``[M]``, features of the first view.
+        second: int64 ``[M]``, features of the second.
+    """
+
+    first: Slots
+    second: Slots
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+@dataclass(frozen=True, eq=False)
+class TwoViews:
+    """A motion and the points that it makes of matches, refined together; the unit of length is arbitrary.
+
+    Attributes:
+        T_second_first: Pose ``[4, 4]`` from the first camera's frame to the second's.
+        pair: The matches that became points.
+        points: ``[M, 3]`` in the first camera's frame.
+        cost: Chi-square that is left, of all matches that were to be explained.
+    """
+
+    T_second_first: Array
+    pair: Pair
+    points: Array
+    cost: float
+
+    @property
+    def parallax_deg(self) -> float:
+        """Angle under which `WIDE_POINTS` of the points are seen, or more."""
+        to_second = self.points - se3.inverse(self.T_second_first)[:3, 3]
+        lengths = np.linalg.norm(self.points, axis=1) * np.linalg.norm(to_second, axis=1)
+        cosine = np.sort((self.points * to_second).sum(axis=1) / np.maximum(lengths, 1e-12))
+        return float(np.degrees(np.arccos(np.clip(cosine[min(WIDE_POINTS, len(cosine)) - 1], -1.0, 1.0))))
+
+    def has_shape_of(self, other: TwoViews) -> bool:
+        """Whether features of the first view have the same depths as in another pair with it, up to scale."""
+        _, ours, theirs = np.intersect1d(self.pair.first, other.pair.first, return_indices=True)
+        if len(ours) < WIDE_POINTS:
+            return False
+        ratio = np.log(self.points[ours, 2] / other.points[theirs, 2])
+        return bool(np.median(np.abs(ratio - np.median(ratio))) < SAME_SHAPE)
+
+    def is_as(self, other: TwoViews) -> bool:
+        """Whether it is the same motion as another."""
+        turned = se3.rotation_angle(self.T_second_first @ se3.inverse(other.T_second_first))
+        one, two = (each.T_second_first[:3, 3] / np.linalg.norm(each.T_second_first[:3, 3]) for each in (self, other))
+        apart = np.arccos(np.clip(one @ two, -1.0, 1.0))
+        return bool(np.degrees(turned) < SAME_DEG[0] and np.degrees(apart) < SAME_DEG[1])
+
+
+def match_views(first: Observations, second: Observations, expected: Array, radius_px: float) -> Pair:
+    """Features of two views that look alike, each sought around where it was seen last.
+
+    Args:
+        first: The first view.
+        second: The second.
+        expected: Pixels ``[N, 2]`` of the first view's features in the image before the second.
+        radius_px: Half side of the window.
+    """
+    count = len(first)
+    windows = expected, np.full(count, np.nan), np.full(count, radius_px)
+    octaves = first.octave - 1, first.octave + 1
+    free = np.ones(len(second), bool)
+    found, _ = search_in_radius(
+        second.grid, second.arrays, free, windows, octaves, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
+    )
+    rows = np.flatnonzero(found >= 0)
+    steady = rotation_consistent(first.angle[rows], second.angle[found[rows]])
+    return Pair(rows[steady], found[rows[steady]])
+
+
+def reconstruct(
+    first: Observations, second: Observations, pair: Pair, camera: Camera, settings: TwoViewSettings
+) -> TwoViews | None:
+    """The camera's motion between two views; None where they do not tell it.
+
+    Args:
+        first: The first view.
+        second: The second.
+        pair: Their matches.
+        camera: Intrinsics, without distortion.
+        settings: Parallax and number of points that it needs.
+    """
+    one, other = first.xy[pair.first], second.xy[pair.second]
+    info = np.minimum(first.info[pair.first], second.info[pair.second])
+    flat, on_plane = _homography(one, other, info, camera)
+    deep, on_lines = _essential(one, other, info, camera)
+    rows = np.flatnonzero(on_plane | on_lines)
+    tried = [(motion, *_triangulated(motion, one[rows], other[rows], info[rows], camera)) for motion in [*flat, *deep]]
+    most = max((np.count_nonzero(good) for _, _, good in tried), default=0)
+    if most < max(settings.min_points, SURE_SHARE * len(rows)):
+        return None
+    rivals = [each for each in tried if np.count_nonzero(each[2]) >= RIVAL_SHARE * most]
+    fitting = Pair(pair.first[rows], pair.second[rows])
+    refined = [_refined(first, second, fitting, *each, camera) for each in rivals]
+    refined = sorted((each for each in refined if len(each.pair)), key=lambda each: each.cost)
+    if not refined or len(refined[0].pair) < settings.min_points:
+        return None
+    best = refined[0]
+    enough = RIVAL_FACTOR * best.cost + RIVAL_COST
+    if any(other.cost < enough and not other.is_as(best) for other in refined[1:]):
+        return None
+    return best if best.parallax_deg >= settings.min_parallax_deg else None
+
+
+def _homography(one: Array, other: Array, info: Array, camera: Camera) -> tuple[list[Array], NDArray[np.bool_]]:
+    """The motions of the homography of most matches, and which matches fit it in both images."""
+    nothing: tuple[list[Array], NDArray[np.bool_]] = [], np.zeros(len(one), bool)
+    if len(one) < 8:
+        return nothing
+    model, _ = cv2.findHomography(one, other, cv2.RANSAC, np.sqrt(CHI2_POINT), None, RANSAC_ITERATIONS, CONFIDENCE)
+    if model is None or abs(np.linalg.det(model)) < 1e-12:
+        return nothing
+    errors = [
+        info * np.square(cv2.perspectiveTransform(a[None], h)[0] - b).sum(axis=1)
+        for h, a, b in ((model, one, other), (np.linalg.inv(model), other, one))
+    ]
+    return _motions_of_homography(model, camera), np.asarray(np.maximum(*errors) <= CHI2_POINT)
+
+
+def _essential(one: Array, other: Array, info: Array, camera: Camera) -> tuple[list[Array], NDArray[np.bool_]]:
+    """The motions of the essential matrix of most matches, and which matches fit it in both images."""
+    nothing: tuple[list[Array], NDArray[np.bool_]] = [], np.zeros(len(one), bool)
+    if len(one) < 8:
+        return nothing
+    limit = np.sqrt(CHI2_LINE)
+    found, _ = cv2.findEssentialMat(one, other, camera.matrix, cv2.RANSAC, CONFIDENCE, limit, RANSAC_ITERATIONS)
+    if found is None or found.shape != (3, 3):
+        return nothing
+    inverse = np.linalg.inv(camera.matrix)
+    f = inverse.T @ found @ inverse
+    a, b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (one, other))
+    lines_in_other, lines_in_one = a @ f.T, b @ f
+    offset = np.square((b * lines_in_other).sum(axis=1))
+    errors = [info * offset / np.square(lines[:, :2]).sum(axis=1) for lines in (lines_in_other, lines_in_one)]
+    return _motions_of_essential(found), np.asarray(np.maximum(*errors) <= CHI2_LINE)
+
+
+def _motions_of_homography(model: Array, camera: Camera) -> list[Array]:
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(model, camera.matrix)
+    return [_pose(r, t) for r, t in zip(rotations, translations, strict=True) if np.linalg.norm(t) > 1e-9]
+
+
+def _motions_of_essential(model: Array) -> list[Array]:
+    one, other, t = cv2.decomposeEssentialMat(model)
+    return [_pose(r, sign * t) for r in (one, other) for sign in (1.0, -1.0)]
+
+
+def _pose(rotation: Array, translation: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = np.ravel(translation) / np.linalg.norm(translation)
+    return pose
+
+
+def _triangulated(
+    T_second_first: Array, one: Array, other: Array, info: Array, camera: Camera
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points ``[M, 3]`` in the first camera's frame, and which of them lie before both cameras and project back."""
+    projections = camera.matrix @ np.eye(3, 4), camera.matrix @ T_second_first[:3]
+    homogeneous = cv2.triangulatePoints(*projections, one.T, other.T).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = np.nan_to_num(homogeneous[:, :3] / homogeneous[:, 3:], nan=0.0, posinf=0.0, neginf=0.0)
+    moved = se3.transform(T_second_first, points)
+    good = (points[:, 2] > NEAR_M) & (moved[:, 2] > NEAR_M)
+    for local, seen in ((points, one), (moved, other)):
+        uv = camera.project(np.where(good[:, None], local, [0.0, 0.0, 1.0]))
+        good = good & (info * np.square(uv - seen).sum(axis=1) < CHI2_POINT)
+    return points, np.asarray(good)
+
+
+def _refined(
+    first: Observations, second: Observations, pair: Pair, motion: Array, points: Array, good: NDArray[np.bool_],
+    camera: Camera,
+) -> TwoViews:  # fmt: skip
+    """Motion and points adjusted together; a match without a good point costs the most that one can."""
+    count = int(np.count_nonzero(good))
+    pair, missing = Pair(pair.first[good], pair.second[good]), len(pair) - count
+
+    def by_turns(name: str) -> Array:
+        """Of the first view, then of the second, point by point."""
+        columns = getattr(first, name)[pair.first], getattr(second, name)[pair.second]
+        return np.stack(columns, axis=1).reshape(2 * count, *columns[0].shape[1:])
+
+    pose, point = np.tile([1, 0], count), np.repeat(np.arange(count), 2)
+    measured = by_turns("xy"), by_turns("right"), by_turns("info"), by_turns("info_right")
+    problem = BundleProblem(np.array([motion, np.eye(4)]), 1, points[good], pose, point, *measured, camera)
+    result = adjust_bundle(problem, BUNDLE_ITERATIONS)
+    _, chi2 = reprojection_chi2(problem, result.poses, result.points)
+    left = float(np.minimum(chi2, CHI2_POINT).sum()) + 2 * CHI2_POINT * missing
+    kept = result.inliers.reshape(-1, 2).all(axis=1) & np.isfinite(result.points).all(axis=1)
+    return TwoViews(result.poses[0], Pair(pair.first[kept], pair.second[kept]), result.points[kept], left)

@@ -1,0 +1,115 @@
+"""The first map of a camera without depth: two keyframes and what both show, the median depth being one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.geometry.camera import Camera
+
+from ..localisation.observation import Observations
+from ..localisation.two_views import Pair, TwoViews, match_views, reconstruct
+from ..monocular_settings import TwoViewSettings
+from .map import Map
+
+Array = NDArray[np.float64]
+
+
+STEADY_S = 0.09
+"""Seconds: so long a hand shakes one way."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame, and its features as the back end uses them."""
+
+    frame: FrameBundle
+    seen: Observations
+
+
+@dataclass(frozen=True, eq=False)
+class FirstMap:
+    """Two views and what they give together; lengths in units of the first view's median depth.
+
+    Attributes:
+        first: The first view; its camera is the world's frame of reference.
+        second: The second.
+        T_cam_world: World-to-camera pose ``[4, 4]`` of the second.
+        pair: Which features show a point.
+        points: World points ``[M, 3]``.
+    """
+
+    first: View
+    second: View
+    T_cam_world: Array
+    pair: Pair
+    points: Array
+
+
+class FirstViews:
+    """Keeps a first view until later ones tell, together with it, how the camera moved.
+
+    The shutter rolls, people walk, and a turn looks like a step: one frame may tell a wrong motion with a good fit. The
+    next ones then tell another shape of the scene, so that a motion is believed when all that was told for `STEADY_S`
+    is the same.
+    """
+
+    def __init__(self) -> None:
+        self._first: View | None = None
+        self._expected: Array = np.zeros((0, 2))
+        self._told: TwoViews | None = None
+        self._since = 0.0
+
+    def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
+        """Try the next frame with the first view; it takes that one's place where they have too little in common.
+
+        Args:
+            view: The next frame.
+            camera: Intrinsics, without distortion.
+            settings: What is asked of the two views.
+        """
+        first = self._first
+        if first is None:
+            self._begin(view, settings)
+            return None
+        pair = match_views(first.seen, view.seen, self._expected, settings.radius_px)
+        if len(pair) < settings.min_matches:
+            self._begin(view, settings)
+            return None
+        self._expected[pair.first] = view.seen.xy[pair.second]
+        found = reconstruct(first.seen, view.seen, pair, camera, settings)
+        if found is None:
+            return None
+        before, self._told = self._told, found
+        if before is None or not found.has_shape_of(before):
+            self._since = view.frame.timestamp
+            return None
+        return _scaled(first, view, found) if view.frame.timestamp - self._since >= STEADY_S else None
+
+    def _begin(self, view: View, settings: TwoViewSettings) -> None:
+        self._first = view if len(view.seen) >= settings.min_matches else None
+        self._expected = view.seen.xy.copy()
+        self._told = None
+
+
+def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
+    depth = float(np.median(found.points[:, 2]))
+    pose = found.T_second_first.copy()
+    pose[:3, 3] /= depth
+    return FirstMap(first, second, pose, found.pair, found.points / depth)
+
+
+def put(world: Map, start: FirstMap) -> tuple[int, int]:
+    """Put a first map into an empty one; the slots of its two keyframes."""
+    poses = np.eye(4), start.T_cam_world
+    slots = [
+        world.add_keyframe(view.seen, pose, view.frame.index, view.frame.timestamp)
+        for view, pose in zip((start.first, start.second), poses, strict=True)
+    ]
+    points = world.add_points(start.points, start.first.seen.rgb[start.pair.first], slots[0], start.pair.first)
+    world.observe(slots[1], start.pair.second, points)
+    world.refresh(points)
+    return slots[0], slots[1]

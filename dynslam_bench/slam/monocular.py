@@ -1,0 +1,68 @@
+"""The back end without depth: the same tracking and mapping, begun by two views instead of one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.geometry.camera import Camera
+
+from .backend import RgbdBackend
+from .localisation.localised import Localised
+from .localisation.observation import Observations
+from .localisation.tracking import Tracked
+from .mapping.first_map import FirstMap, FirstViews, View, put
+from .monocular_settings import MonocularBackendSettings
+
+
+class MonocularBackend(RgbdBackend):
+    """Tracks frames against a map whose points are triangulated; lengths are in units of its first median depth.
+
+    No feature it is given has a depth. The scale of bundle adjustment is free but for the keyframes that stay.
+
+    Args:
+        settings: Of tracking, mapping, bundle adjustment, keyframes, relocalisation and the first two views.
+        scale_factor: Ratio of consecutive pyramid levels of the features that will come.
+        levels: Number of pyramid levels of the features that will come.
+    """
+
+    uses_depth = False
+    settings: MonocularBackendSettings
+
+    def __init__(
+        self, settings: MonocularBackendSettings | None = None, *, scale_factor: float = 1.2, levels: int = 8
+    ) -> None:
+        super().__init__(settings or MonocularBackendSettings(), scale_factor=scale_factor, levels=levels)
+
+    def reset(self, camera: Camera, seed: int) -> None:
+        """Forget everything: a new sequence begins."""
+        super().reset(camera, seed)
+        self._views_so_far = FirstViews()
+
+    def _initialise(self, frame: FrameBundle, seen: Observations) -> Localised:
+        """Frames are ``initialising`` until one shows, together with an earlier one, how the camera moved."""
+        begin = perf_counter()
+        start = self._views_so_far.take(View(frame, seen), self.camera, self.settings.two_views)
+        if start is None:
+            return self._localised(None)
+        spent = {"mapping": perf_counter() - begin}
+        return self._begin_from_two(start, spent)
+
+    def _begin_from_two(self, start: FirstMap, spent: dict[str, float]) -> Localised:
+        """The two views become keyframes; the second, which is the frame at hand, is tracked."""
+        first, second = put(self.world, start)
+        frame, seen = start.second.frame, start.second.seen
+        self._tracked = True
+        point = self.world.kf_point[second, : len(seen)].astype(np.int64)
+        self._last = Tracked(seen, point, start.T_cam_world, frame.timestamp)
+        self._reference = second
+        self._keyframes.made(frame.index)
+        for slot, view in ((first, start.first), (second, start.second)):
+            self._views.renew(slot, view.frame.depth, [], self.settings.keyframes.depth_images)
+        self.state = self._state()
+        self.history.append(frame.timestamp, second, np.eye(4), 1e6 * np.eye(6))
+        count = len(start.points)
+        return replace(self._localised(start.T_cam_world, spent), matches=count, inliers=count)

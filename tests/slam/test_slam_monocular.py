@@ -1,0 +1,114 @@
+"""The back end without depth, on a simulated world: the first map from two views, tracking, honest waiting."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynslam_bench.core.settings import apply_overrides
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.geometry import se3
+from dynslam_bench.slam.localisation.observation import observe
+from dynslam_bench.slam.localisation.two_views import match_views, reconstruct
+from dynslam_bench.slam.monocular import MonocularBackend
+from dynslam_bench.slam.monocular_settings import MonocularBackendSettings, TwoViewSettings
+
+SIDEWAYS = se3.exp(np.array([0.25, 0.05, 0.02, 0.0, 0.03, 0.01]))
+
+
+def without_depth(frame):
+    return replace(frame, z=np.zeros_like(frame.z))
+
+
+def make(room, **overrides):
+    names = {name.replace("__", "."): value for name, value in overrides.items()}
+    backend = MonocularBackend(apply_overrides(MonocularBackendSettings(), names))
+    backend.reset(room.camera, 0)
+    return backend
+
+
+def views(room, *poses, wrong=0):
+    frames = [without_depth(room.see(pose, i, wrong=wrong)) for i, pose in enumerate(poses)]
+    settings = MonocularBackendSettings().tracking
+    scales = 1.2 ** np.arange(8)
+    return [
+        observe(f, np.ones(len(f), bool), np.ones(len(f), np.float32), room.camera, scales, settings) for f in frames
+    ]
+
+
+def flattened(room):
+    """All points on one slanted wall."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform([-3.0, -2.0], [3.0, 2.0], (len(room.points), 2)).T
+    room.points = np.stack([x, y, 2.5 + 0.4 * x], axis=1)
+    return room
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_two_views_tell_the_motion_up_to_scale(room, flat):
+    world = flattened(room) if flat else room
+    first, second = views(world, np.eye(4), SIDEWAYS, wrong=60)
+    pair = match_views(first, second, first.xy, 200.0)
+    found = reconstruct(first, second, pair, world.camera, TwoViewSettings())
+    assert found is not None
+    true = se3.inverse(SIDEWAYS)
+    assert np.degrees(se3.rotation_angle(found.T_second_first @ se3.inverse(true))) < 0.5
+    way, expected = (pose[:3, 3] / np.linalg.norm(pose[:3, 3]) for pose in (found.T_second_first, true))
+    assert np.degrees(np.arccos(way @ expected)) < 4.0
+    assert len(found.pair) > 120 and (found.points[:, 2] > 0).all() and found.parallax_deg > 1.0
+
+
+def test_turning_alone_makes_no_map_and_says_so(room, tracked):
+    turns = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.01 * i, 0.004 * i])) for i in range(25)]
+    backend = make(room)
+    results = tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate(turns)])
+    assert {r.state for r in results} == {"initialising"}
+    assert all(r.T_world_cam is None and r.keyframes == 0 for r in results)
+    assert not len(backend.finalize())
+
+
+def test_the_first_map_has_a_median_depth_of_one(room, tracked):
+    backend = make(room)
+    tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate((np.eye(4), SIDEWAYS))])
+    assert backend.state == "ok" and backend.world.keyframe_count == 2
+    assert np.median(backend.world.position[backend.world.points, 2]) == pytest.approx(1.0)
+
+
+def test_a_newer_frame_becomes_the_first_view_where_nothing_is_in_common(room, tracked):
+    away = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 2.6, 0.0]))
+    backend = make(room)
+    results = tracked(backend, [without_depth(room.see(p, i)) for i, p in enumerate((away, np.eye(4), SIDEWAYS))])
+    assert [r.state for r in results] == ["initialising", "initialising", "ok"]
+    assert backend.world.kf_frame[backend.world.keyframes].tolist() == [1, 2]
+
+
+def test_follows_a_smooth_path_to_millimetres_up_to_scale(room, tracked):
+    truth = room.path(90)
+    backend = make(room)
+    results = tracked(backend, [without_depth(room.see(pose, i, wrong=40)) for i, pose in enumerate(truth)])
+    begun = next(i for i, r in enumerate(results) if r.state == "ok")
+    assert 0 < begun < 25 and {r.state for r in results[begun:]} == {"ok"}
+    online = np.array([r.T_world_cam for r in results[begun:]])
+    final = backend.finalize()
+    assert len(final) == 90 - begun
+    for poses, limit in ((online, 0.03), (final.T_world_cam, 0.015)):
+        aligned = align(poses, truth[begun:], "sim3")
+        error = np.linalg.norm(aligned.apply(poses)[:, :3, 3] - truth[begun:, :3, 3], axis=1)
+        assert np.sqrt((error**2).mean()) < limit
+        assert aligned.scale > 1.5  # the room is some metres deep, the map one
+
+
+def test_is_found_again_after_blind_frames(room, tracked):
+    truth = room.path(60)
+    frames = [without_depth(room.see(pose, i)) for i, pose in enumerate(truth)]
+    frames[40:45] = [room.blind(i) for i in range(40, 45)]
+    states = [r.state for r in tracked(make(room), frames)]
+    assert states[39] == "ok" and set(states[40:45]) == {"lost"} and set(states[50:]) == {"ok"}
+
+
+def test_keyframes_without_depth_become_redundant_too(room, tracked):
+    frames = [without_depth(room.see(pose, i)) for i, pose in enumerate(room.path(60))]
+    kept, all_of_them = make(room), make(room, keyframes__redundant_share=1.0)
+    tracked(kept, frames)
+    tracked(all_of_them, frames)
+    assert kept.world.keyframe_count < all_of_them.world.keyframe_count

@@ -1,0 +1,79 @@
+"""Systems without depth: they never read it, they are refused what takes it, and what they score says so."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from steering_scene import SmallScene, construct, difference, play
+
+from dynslam_bench.contracts.checks import check_sensors
+from dynslam_bench.core.errors import EvaluationError, SettingsError, TrackerError
+from dynslam_bench.evaluation.protocol import MONOCULAR, PROTOCOLS
+from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.trackers.registry import resolve_settings
+from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.systems.composition import SystemSettings
+
+OURS = [spec.id for spec in all_specs() if spec.sensors == "rgb" and issubclass(spec.settings, SystemSettings)]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return SmallScene()
+
+
+def with_depth(scene, depth_of):
+    """The same scene with other depth images."""
+    other = SmallScene.__new__(SmallScene)
+    other.__dict__ |= scene.__dict__
+    other.frames = [replace(frame, depth=depth_of(frame)) for frame in scene.frames]
+    return other
+
+
+def test_there_are_monocular_systems():
+    assert {"orb-slam2-mono", "emfoa-oft-mono", "chen-slam-mono"} <= set(OURS)
+    assert TRACKERS.get("orbslam3-mono").sensors == "rgb" and TRACKERS.get("emfoa-oft").sensors == "rgbd"
+
+
+@pytest.mark.parametrize("tracker", OURS)
+def test_depth_is_never_read(scene, tracker):
+    rng = np.random.default_rng(0)
+    wild = with_depth(scene, lambda frame: rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32))
+    spec = TRACKERS.get(tracker)
+    few = {"backend.two_views.min_matches": 40, "backend.two_views.min_points": 25}  # the images are small
+    true = list(play(construct(spec, scene, **few), scene))
+    if tracker == "orb-slam2-mono":  # masks that err leave the others too little of so small a room for a map
+        assert sum(result.state == "ok" for result in true) >= len(true) // 2
+    else:
+        assert sum(result.stats["culled"] for result in true) > 100
+    assert difference(true, play(construct(spec, wild, **few), wild)) == ""
+
+
+@pytest.mark.parametrize("tracker", OURS)
+def test_loops_are_refused_in_one_line(tracker):
+    with pytest.raises(SettingsError, match=r"closes no loops, but backend\.loop_closing\.enabled") as refused:
+        resolve_settings(TRACKERS.get(tracker), {"backend.loop_closing.enabled": True})
+    assert "\n" not in str(refused.value)
+
+
+def test_sequences_without_depth_are_for_monocular_trackers_alone(scene):
+    scene.has_depth = False
+    try:
+        check_sensors(TRACKERS.get("emfoa-oft-mono"), scene)
+        with pytest.raises(TrackerError, match=r"'emfoa-oft' needs depth, and .*walking_xyz@103.* colour images alone"):
+            check_sensors(TRACKERS.get("emfoa-oft"), scene)
+    finally:
+        del scene.has_depth
+    check_sensors(TRACKERS.get("emfoa-oft"), scene)
+
+
+def test_no_protocol_without_scale_scores_a_monocular_tracker():
+    for protocol in PROTOCOLS.values():
+        protocol.check_scale("orb-slam2", "rgbd")
+        if protocol.alignment == "sim3":
+            protocol.check_scale("orb-slam2-mono", "rgb")
+        else:
+            with pytest.raises(EvaluationError, match=rf"'orb-slam2-mono' is monocular.*--protocol {MONOCULAR}"):
+                protocol.check_scale("orb-slam2-mono", "rgb")
+    tum, scaled = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS[MONOCULAR]
+    assert scaled == tum.model_copy(update={"id": MONOCULAR, "alignment": "sim3"})
