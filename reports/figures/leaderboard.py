@@ -217,7 +217,8 @@ def _spread(values: Sequence[float]) -> list[int]:
     if len(values) <= MOST_POINTS:
         return list(range(len(values)))
     order = np.argsort(values, kind="stable")
-    return np.sort(order[np.linspace(0, len(values) - 1, MOST_POINTS).round().astype(int)]).tolist()
+    shown = order[np.linspace(0, len(values) - 1, MOST_POINTS).round().astype(int)]
+    return sorted(int(at) for at in shown)
 
 
 def _pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

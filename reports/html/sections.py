@@ -162,14 +162,14 @@ def add_repeatability(draft: Draft, board: Board) -> None:
     if figure is not None:
         caption = (
             "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
-            + _thinned(board)
+            + thinned_note(board)
         )
         section.blocks.append(draft.figure("repeat", figure, caption))
     section.blocks.append(draft.table(table))
     draft.add(section)
 
 
-def _thinned(board: Board) -> str:
+def thinned_note(board: Board) -> str:
     """What a figure with a point for every run says where there are too many."""
     most = figures.MOST_POINTS
     if all(len(board.runs(key)) <= most for key in board.trackers):
@@ -182,7 +182,7 @@ def add_masks(draft: Draft, board: Board) -> None:
     section = Section("masks", "Mask quality and pose error", "Masks")
     figure = figures.mask_figure(board)
     if figure is not None:
-        section.blocks.append(draft.figure("masks", figure, "One point a run." + _thinned(board)))
+        section.blocks.append(draft.figure("masks", figure, "One point a run." + thinned_note(board)))
     table = metric_table(
         board,
         lambda row: row.mask_iou,
@@ -210,22 +210,22 @@ def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> No
     section = Section("provenance", "Machines, versions, commands", "Reproduce")
     section.blocks.append(draft.table(run_tables.machines(board)))
     commands = list(dict.fromkeys(row.command for row in board.rows if row.command))
-    commands = _few(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
+    commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
     if loaded.unreadable:
-        entries = _few(loaded.unreadable, _MOST_NOTES, "... and {} more, which `runs list` names")
+        entries = first_of(loaded.unreadable, _MOST_NOTES, "... and {} more, which `runs list` names")
         section.blocks.append(Block(kind="list", title="Left out: no valid record", entries=entries, folded=True))
     notes = [
         f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]
     if notes:
-        entries = _few(notes, _MOST_NOTES, "... and {} more on the pages of the runs")
+        entries = first_of(notes, _MOST_NOTES, "... and {} more on the pages of the runs")
         section.blocks.append(Block(kind="list", title="Diagnostics", entries=entries, folded=True))
     draft.add(section)
 
 
-def _few(entries: list[str], most: int, others: str) -> list[str]:
+def first_of(entries: list[str], most: int, others: str) -> list[str]:
     """The first entries; how many others there are stands behind them."""
     return entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]

@@ -62,7 +62,7 @@ def common_errors(
     Of more than `MOST_COMPARED` runs on a sequence these are the runs of each tracker around its median error.
     """
     runs = {
-        name: [Tracked.of(run) for run in _around_medians(successful(board, name, loaded))] for name in board.sequences
+        name: [Tracked.of(run) for run in around_medians(successful(board, name, loaded))] for name in board.sequences
     }
     if crew is None:
         answers = [common_of(found, protocol) for found in runs.values()]
@@ -114,7 +114,7 @@ def representatives(board: Board, sequence: str, loaded: Loaded) -> dict[str, Lo
     return {key: by_key[key][(len(by_key[key]) - 1) // 2] for key in board.trackers if key in by_key}
 
 
-def _around_medians(runs: Sequence[LoadedRun]) -> Sequence[LoadedRun]:
+def around_medians(runs: Sequence[LoadedRun]) -> Sequence[LoadedRun]:
     """All of few runs on a sequence; of many, as many of each tracker: those around its (lower) median error."""
     if len(runs) <= MOST_COMPARED:
         return runs

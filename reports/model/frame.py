@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +57,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     lines = [  # row by row: a hundred thousand of them lie far apart in memory
         (*_own(row, columns, labels), *map(row.metrics.get, metrics), *of_row(row)) for row in ordered
     ]
-    values = zip(*lines, strict=True) if lines else [()] * len(kinds)
+    values: Iterable[Sequence[Any]] = zip(*lines, strict=True) if lines else [()] * len(kinds)
     found = dict(zip([*_OWN, *metrics, *plain], values, strict=True))
     return pd.DataFrame({name: _array(found[name], kind) for name, kind in kinds.items()})
 

@@ -206,7 +206,7 @@ def _written(values: pd.Series) -> list[object]:
         return [None if number != number else number for number in numbers]
     found = values.astype(object)
     if is_numeric_dtype(values.dtype):
-        return found.where(values.notna(), None).tolist()
+        return list(found.where(values.notna(), None))
     if values.dtype == "string":
         known = {word: _harmless(word) for word in set(found)}
         return [known[word] for word in found]

@@ -77,12 +77,12 @@ def test_common_frames_of_many_runs_are_those_around_every_median(monkeypatch):
     board = make_board(rows)
     loaded = Loaded([LoadedRun(each, "0" * 16, RunStore("nowhere")) for each in rows])
     runs = common.successful(board, "s", loaded)
-    assert len(common._around_medians(runs)) == 10  # the choice that `common_errors` makes of what it would read
+    assert len(common.around_medians(runs)) == 10
     monkeypatch.setattr(common, "MOST_COMPARED", 9)
-    kept = {(run.row.tracker, run.row.metrics["ate_rmse_m"]) for run in common._around_medians(runs)}
+    kept = {(run.row.tracker, run.row.metrics["ate_rmse_m"]) for run in common.around_medians(runs)}
     assert kept == {("a", 0.2), ("a", 0.3), ("a", 0.4), ("b", 1.0), ("c", 1.0), ("c", 2.0), ("c", 3.0)}
     monkeypatch.setattr(common, "MOST_COMPARED", 1)
-    kept = {(run.row.tracker, run.row.metrics["ate_rmse_m"]) for run in common._around_medians(runs)}
+    kept = {(run.row.tracker, run.row.metrics["ate_rmse_m"]) for run in common.around_medians(runs)}
     assert kept == {("a", 0.3), ("b", 1.0), ("c", 2.0)}
 
 
@@ -97,10 +97,10 @@ def test_figures_thin_many_points_and_say_so(tmp_path, monkeypatch):
     store = fill(tmp_path / "results", sequences=["s/a", "s/b"], seeds=range(4))
     board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
     whole = figures.repeat_figure(board)
-    assert sections._thinned(board) == ""
+    assert sections.thinned_note(board) == ""
     monkeypatch.setattr(figures, "MOST_POINTS", 3)
     thin = figures.repeat_figure(board)
-    assert "more than 3 runs" in sections._thinned(board)
+    assert "more than 3 runs" in sections.thinned_note(board)
     ends = [[(min(trace["x"]), max(trace["x"])) for trace in figure["data"]] for figure in (whole, thin)]
     assert ends[0] == ends[1] and {len(trace["x"]) for trace in thin["data"]} == {3}
     assert all(len(trace["text"]) == len(trace["x"]) for trace in thin["data"])
@@ -108,8 +108,8 @@ def test_figures_thin_many_points_and_say_so(tmp_path, monkeypatch):
 
 
 def test_long_lists_end_in_how_many_more_there_are():
-    assert sections._few(["a", "b"], 2, "and {}") == ["a", "b"]
-    assert sections._few(["a", "b", "c", "d"], 2, "and {}") == ["a", "b", "and 2"]
+    assert sections.first_of(["a", "b"], 2, "and {}") == ["a", "b"]
+    assert sections.first_of(["a", "b", "c", "d"], 2, "and {}") == ["a", "b", "and 2"]
 
 
 def test_csv_of_every_kind_of_column():

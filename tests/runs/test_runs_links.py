@@ -65,6 +65,15 @@ def test_a_pipe_hangs_nothing(filled: tuple[RunStore, str]) -> None:
     assert found == [] and bad.reason.endswith("run.json is no plain file")
 
 
+def test_a_pipe_in_the_place_of_the_index_hangs_nothing(filled: tuple[RunStore, str]) -> None:
+    store, run = filled
+    index = index_file(store.root, get_protocol("tum-rgbd/v1"))
+    index.parent.mkdir()
+    os.mkfifo(index)
+    assert store.score(store.read_whole(run)).run_id == run  # which would add a line to it
+    assert [row["run"] for row in list_runs(store)[0]] == [run]
+
+
 @pytest.mark.parametrize("file", ["groundtruth.txt", "timestamps.txt"])
 def test_the_truth_of_a_part_is_no_link_to_elsewhere(filled: tuple[RunStore, str], outside: Path, file: str) -> None:
     store, run = filled

@@ -16,6 +16,8 @@ from dynslam_bench.core.reading import MEGABYTE, TABLE_BYTES
 
 T = TypeVar("T")
 
+_ADDING = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+"""No link is followed, and nobody is waited for who reads a pipe."""
 _PIECE = 16 * MEGABYTE
 """Bytes of lines that are read at once: a file of 100,000 long lines needs no memory of its own size beside theirs."""
 
@@ -39,7 +41,7 @@ def add_lines(path: Path, lines: Iterable[str]) -> None:
     """Add lines at once, so that those of other processes come before or after; what cannot be written is left out."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        handle = os.open(path, _ADDING, 0o666)
         try:
             os.write(handle, "".join(f"{line}\n" for line in lines).encode())
         finally:

@@ -68,9 +68,10 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
             on_progress(position, len(ids))
         try:
             line = known.get(run_id)
-            time_ns, size = stamp_of(f"{runs}/{run_id}/{RUN_FILE}")
-            scored = line[2:FIRST] if line is not None and as_verified else stamp_if_there(f"{errors}/{run_id}.json")
-            stamps = (time_ns, size, *scored)
+            scored = (
+                stamp_if_there(f"{errors}/{run_id}.json") if line is None or not as_verified else (line[2], line[3])
+            )
+            stamps = (*stamp_of(f"{runs}/{run_id}/{RUN_FILE}"), *scored)
             if line is None or (*line[:FIRST],) != stamps:
                 is_whole = False
                 line = _read(store, run_id, protocol, stamps)
