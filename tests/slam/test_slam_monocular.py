@@ -14,6 +14,8 @@ from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings, TwoViewSettings
 
 SIDEWAYS = se3.exp(np.array([0.25, 0.05, 0.02, 0.0, 0.03, 0.01]))
+BELIEVED = 4
+"""Frames at 30 Hz that must tell the same shape."""
 
 
 def without_depth(frame):
@@ -69,7 +71,9 @@ def test_turning_alone_makes_no_map_and_says_so(room, tracked):
 
 def test_the_first_map_has_a_median_depth_of_one(room, tracked):
     backend = make(room)
-    tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate((np.eye(4), SIDEWAYS))])
+    poses = [np.eye(4), *[SIDEWAYS] * BELIEVED]
+    states = [r.state for r in tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate(poses)])]
+    assert states == ["initialising"] * BELIEVED + ["ok"]
     assert backend.state == "ok" and backend.world.keyframe_count == 2
     assert np.median(backend.world.position[backend.world.points, 2]) == pytest.approx(1.0)
 
@@ -77,9 +81,10 @@ def test_the_first_map_has_a_median_depth_of_one(room, tracked):
 def test_a_newer_frame_becomes_the_first_view_where_nothing_is_in_common(room, tracked):
     away = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 2.6, 0.0]))
     backend = make(room)
-    results = tracked(backend, [without_depth(room.see(p, i)) for i, p in enumerate((away, np.eye(4), SIDEWAYS))])
-    assert [r.state for r in results] == ["initialising", "initialising", "ok"]
-    assert backend.world.kf_frame[backend.world.keyframes].tolist() == [1, 2]
+    poses = [away, np.eye(4), *[SIDEWAYS] * BELIEVED]
+    results = tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate(poses)])
+    assert [r.state for r in results] == ["initialising"] * (BELIEVED + 1) + ["ok"]
+    assert backend.world.kf_frame[backend.world.keyframes].tolist() == [1, 1 + BELIEVED]
 
 
 def test_follows_a_smooth_path_to_millimetres_up_to_scale(room, tracked):
