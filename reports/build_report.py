@@ -10,6 +10,7 @@ from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import dynslam_bench
 from dynslam_bench.core.records import write_atomic
@@ -95,7 +96,7 @@ def build_report(
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
     count = helpers_for(sum(len(store.ids()) for store in stores))
-    setup = {"protocol": protocol.model_dump_json(), "output": str(output)}
+    setup: dict[str, Any] = {"protocol": protocol.model_dump_json(), "output": str(output)}
     setup |= {"picture_seconds": picture_seconds, "most_frames": most_frames}
     hired: AbstractContextManager[Crew | None] = Crew(count, setup) if count else nullcontext()
     with hired as crew:

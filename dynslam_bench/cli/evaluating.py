@@ -37,8 +37,8 @@ def evaluate(
     from dynslam_bench.evaluation.evaluate import evaluate_loaded
     from dynslam_bench.runs import read_trajectory
 
-    loaded = [read_trajectory(path, timestamps) for path in (estimate, ground_truth)]
-    result = evaluate_loaded(*loaded, protocol)
+    read, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
+    result = evaluate_loaded(read, truth, protocol)
     if as_json:
         write_json(result)
         return

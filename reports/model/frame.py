@@ -72,4 +72,5 @@ def _array(values: Sequence[Any], kind: str) -> Any:
     """A column of a kind; numbers by way of numpy, which takes a tenth of the time."""
     import pandas as pd
 
-    return pd.array(np.array(values, dtype=np.float64) if kind == "Float64" else list(values), dtype=kind)
+    listed: Any = np.array(values, dtype=np.float64) if kind == "Float64" else list(values)
+    return pd.Series(listed, dtype=kind).array

@@ -110,9 +110,9 @@ class KnownRows:
             write_line_file(self._path, _lines(found.values()), self._older)
         elif not count:
             remove_older(self._path, self._older)
-        for run_id, known in found.items():
-            if known.row is not None:
-                known.row.log = log_of(self.store, run_id)
+        for run_id, each in found.items():
+            if each.row is not None:
+                each.row.log = log_of(self.store, run_id)
         return list(found.values()), [run_id for run_id in stored if run_id not in found]
 
     def take_all(self, run_ids: Iterable[str], told: Callable[[str], None]) -> tuple[list[KnownRow], list[str]]:

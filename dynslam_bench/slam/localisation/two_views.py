@@ -11,6 +11,7 @@ beside the wall tell which of them. All functions are pure.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -173,7 +174,7 @@ def _homography(one: Array, other: Array, info: Array, camera: Camera) -> tuple[
         info * np.square(cv2.perspectiveTransform(a[None], h)[0] - b).sum(axis=1)
         for h, a, b in ((model, one, other), (np.linalg.inv(model), other, one))
     ]
-    return _motions_of_homography(model, camera), np.asarray(np.maximum(*errors) <= CHI2_POINT)
+    return _motions_of_homography(np.asarray(model, np.float64), camera), np.asarray(np.maximum(*errors) <= CHI2_POINT)
 
 
 def _essential(one: Array, other: Array, info: Array, camera: Camera) -> tuple[list[Array], NDArray[np.bool_]]:
@@ -191,20 +192,24 @@ def _essential(one: Array, other: Array, info: Array, camera: Camera) -> tuple[l
     lines_in_other, lines_in_one = a @ f.T, b @ f
     offset = np.square((b * lines_in_other).sum(axis=1))
     errors = [info * offset / np.square(lines[:, :2]).sum(axis=1) for lines in (lines_in_other, lines_in_one)]
-    return _motions_of_essential(found), np.asarray(np.maximum(*errors) <= CHI2_LINE)
+    return _motions_of_essential(np.asarray(found, np.float64)), np.asarray(np.maximum(*errors) <= CHI2_LINE)
 
 
 def _motions_of_homography(model: Array, camera: Camera) -> list[Array]:
     _, rotations, translations, _ = cv2.decomposeHomographyMat(model, camera.matrix)
-    return [_pose(r, t) for r, t in zip(rotations, translations, strict=True) if np.linalg.norm(t) > 1e-9]
+    return [
+        _pose(np.asarray(r), np.asarray(t))
+        for r, t in zip(rotations, translations, strict=True)
+        if np.linalg.norm(t) > 1e-9
+    ]
 
 
 def _motions_of_essential(model: Array) -> list[Array]:
     one, other, t = cv2.decomposeEssentialMat(model)
-    return [_pose(r, sign * t) for r in (one, other) for sign in (1.0, -1.0)]
+    return [_pose(np.asarray(r), sign * np.asarray(t)) for r in (one, other) for sign in (1.0, -1.0)]
 
 
-def _pose(rotation: Array, translation: Array) -> Array:
+def _pose(rotation: NDArray[Any], translation: NDArray[Any]) -> Array:
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = np.ravel(translation) / np.linalg.norm(translation)
