@@ -26,7 +26,7 @@ from . import (
     studies,
     trackers,
 )
-from .ending import leave_interrupted
+from .ending import interrupted, leave_interrupted
 from .output import drawn_download, for_scripts
 from .panels import CARE, MEASURE, REPORT, START
 
@@ -82,12 +82,16 @@ def start(arguments: list[str] | None = None) -> None:
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
         app(args=arguments, prog_name="dynslam-bench")
-    except DynslamError as error:
-        _say(f"error: {error}")
-        sys.exit(1)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader went away, e.g. `| head`
         sys.exit(0)
+    except Exception as error:
+        if interrupted():  # libraries make errors of their own of an interrupt that meets them
+            leave_interrupted()
+        if not isinstance(error, DynslamError):
+            raise
+        _say(f"error: {error}")
+        sys.exit(1)
     except SystemExit as ended:  # typer turns an interrupt within a command into this
         if ended.code == INTERRUPT_CODE:
             leave_interrupted()

@@ -30,6 +30,11 @@ def code() -> int:
     return _TOLD + (_received[0] if _received else signal.SIGINT)
 
 
+def interrupted() -> bool:
+    """Whether a signal has asked for the end."""
+    return bool(_received)
+
+
 def leave_interrupted() -> None:
     """Say how to go on, and exit."""
     goes_on = "; what is finished is stored, the same command goes on from there"

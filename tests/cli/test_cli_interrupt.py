@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from dynslam_bench.cli import app
+from dynslam_bench.core.errors import RunError
+
 HERE = Path(__file__).resolve().parents[1]
 SUITE = (
     "trackers = [{tracker!r}]\nsequences = [{folder!r}]\nframes = [0, 4]\n"
@@ -88,3 +91,15 @@ def test_ctrl_c_while_everything_still_loads_is_one_line_and_stores_nothing(walk
 def _load():
     """Processes that wait for a processor; on a crowded machine two seconds are no measure."""
     return float(Path("/proc/loadavg").read_text().split()[0])
+
+
+@pytest.mark.parametrize("error", [ValueError("schema: KeyboardInterrupt"), RunError("cannot load")])
+def test_an_error_that_a_library_makes_of_an_interrupt_is_an_interrupt(monkeypatch, capsys, error):
+    def fails(**_):
+        raise error
+
+    monkeypatch.setattr(app, "app", fails)
+    monkeypatch.setattr(app, "interrupted", lambda: True)
+    with pytest.raises(SystemExit, match="130"):
+        app.start(["eval"])
+    assert capsys.readouterr().err.startswith("interrupted")

@@ -94,9 +94,9 @@ def test_info_tells_a_program_what_it_may_set(cli):
 
 
 def test_info_says_what_a_preset_sets(cli):
-    assert "fast (segmentation.schedule=every_nth, segmentation.n=3)" in cli("trackers", "info", "mask-rcnn")[1]
+    assert "fast (segmentation.schedule=every_nth, segmentation.n=2)" in cli("trackers", "info", "mask-rcnn")[1]
     facts = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])
-    assert facts["presets"] == {"fast": {"segmentation.schedule": "every_nth", "segmentation.n": 2}}
+    assert facts["presets"] == {"fast": {"segmentation.schedule": "every_nth", "segmentation.n": 2, "flow.budget": 24}}
 
 
 def test_progress_where_nobody_watches(capsys, monkeypatch):
