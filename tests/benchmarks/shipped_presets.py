@@ -3,7 +3,7 @@
     python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
 
 Both run block by block in turn, so that whatever else the machine does slows them alike. Rendered scenes are instances
-that no choice has seen, two start offsets each, with the embedded network; the Bonn excerpt has masks of YOLO and 16
+that no choice has seen, two start offsets each, with the embedded network; the Bonn excerpt has masks of YOLO and 23
 start offsets, others than the choice saw; the fr1 excerpts, with nobody in view, have the embedded network and four
 each, likewise. Recordings are looked for in ``../shared``; what is not there is named. Ratios are preset : default,
 with 95 % intervals over scenes (over starts where there is one scene). "Not worse" is said where the one-sided 95 %
@@ -34,7 +34,7 @@ PARTS = {
             "sitting_xyz@178-179",
         )
     ),
-    "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=8-23",),
+    "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=8-30",),
     "fr1": tuple(f"{SHARED}/data/tum/rgbd_dataset_freiburg1_{name}?offsets=4-7" for name in ("xyz", "rpy")),
 }  # fmt: skip
 
