@@ -137,7 +137,8 @@ def main() -> None:
         store = RunStore(root / "results")
         if not store.runs.is_dir():
             fill(root, options.trackers, options.sequences, options.repeats, options.frames)
-        shutil.rmtree(store.root / "metrics", ignore_errors=True)
+        for known in ("metrics", "index"):
+            shutil.rmtree(store.root / known, ignore_errors=True)
         print(f"{len(store.ids())} runs", flush=True)
         output = Path(folder) / "report"
         for name in ("first", "again"):
