@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from statistics import mean
 from typing import TYPE_CHECKING
@@ -37,7 +38,7 @@ def estimate(frames: int, study_frames: int, trials: int, jobs: int) -> str:
     studied = SINGLE_RUNS + 3 * (trials - 2)
     seconds = rendered * RENDER_S + (runs + studied) * START_S + REPORT_S
     seconds += SEQUENCES * frames * sum(TRACK_S.values()) + studied * study_frames * STUDIED_S
-    minutes, first = (max(1, round(each / max(jobs, 1) / 60)) for each in (seconds, seconds + COMPILE_S))
+    minutes, first = (max(1, math.ceil(each / max(jobs, 1) / 60)) for each in (seconds, seconds + COMPILE_S))
     machine = f"{jobs} quiet core{'s' * (jobs != 1)}"
     return (
         f"about {minutes} minute{'s' * (minutes > 1)} on {machine}, {first} when it first compiles; "

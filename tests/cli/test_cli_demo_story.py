@@ -58,5 +58,5 @@ def test_what_culling_costs_is_the_median_frame_of_the_runs_that_ended_well() ->
 
 
 def test_the_estimate_grows_with_what_is_asked_for() -> None:
-    assert estimate(100, 25, 6, 2).startswith("about 2 minutes on 2 quiet cores, 3 when it first compiles; 350 frames")
-    assert estimate(600, 150, 30, 1).startswith("about 37 minutes on 1 quiet core,")
+    assert estimate(80, 20, 6, 2).startswith("about 2 minutes on 2 quiet cores, 3 when it first compiles; 280 frames")
+    assert estimate(600, 150, 30, 1).startswith("about 38 minutes on 1 quiet core,")
