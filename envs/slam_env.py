@@ -187,6 +187,22 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         outputs = getattr(self._tracker, "map_outputs", None)
         return outputs() if outputs is not None else None
 
+    def save_map(self, path: Path, made_by: str = "") -> None:
+        """Write the tracker's map to a file from which a later run may start.
+
+        Args:
+            path: The file.
+            made_by: Which run made it, in words.
+
+        Raises:
+            TrackerError: The tracker cannot save its map, or has none.
+            DynslamError: The file cannot be written.
+        """
+        save = getattr(self._tracker, "save_map", None)
+        if save is None:
+            raise TrackerError(f"tracker '{self.tracker_spec.id}' cannot save its map")
+        save(path, made_by)
+
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -22,6 +22,7 @@ from .options import (
     Frames,
     Jobs,
     Label,
+    LocalisationOnly,
     MemoryLimit,
     Offsets,
     Preset,
@@ -30,16 +31,19 @@ from .options import (
     Recording,
     Results,
     Retry,
+    SaveMap,
     Scheduler,
     Seeds,
     SettingsFile,
     Sheet,
+    StartMap,
     Stride,
     Threads,
     TimeLimit,
     Trackers,
     Video,
     gather_settings,
+    map_settings,
 )
 from .output import SOME_RUNS_FAILED, note, progress
 from .panels import MEASURE
@@ -89,6 +93,9 @@ def run(
     video: Video = False,
     sheet: Sheet = False,
     rrd: Recording = False,
+    save_map: SaveMap = False,
+    start_map: StartMap = None,
+    localisation_only: LocalisationOnly = False,
     retry: Retry = None,
     label: Label = "",
     time_limit: TimeLimit = None,
@@ -100,12 +107,12 @@ def run(
     from dynslam_bench.runs import Limits, RunSpec
     from dynslam_bench.sequences.catalogue import parse_frames
 
-    chosen = {} if preset is None else preset_of(tracker, preset)
+    chosen = ({} if preset is None else preset_of(tracker, preset)) | map_settings(start_map, localisation_only)
     asked: dict[str, Any] = {"tracker": tracker, "settings": gather_settings(assignments, settings, chosen)}
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
     asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
-    asked |= {"video": video, "sheet": sheet, "rrd": rrd, "label": label}
+    asked |= {"video": video, "sheet": sheet, "rrd": rrd, "save_map": save_map, "label": label}
     asked |= {"limits": checked(Limits, time_s=time_limit, memory_mb=memory_limit)}
     specs = [
         checked(RunSpec, sequence=sequence, seed=number, offset=skipped, **asked)

@@ -45,6 +45,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         block=column_of(record),
         content=sequence.content,
         camera=camera_words(record),
+        map_file="" if record.start_map is None else record.start_map.file,
         place=record.place,
         duration_s=sequence.duration_s,
         tags=sequence.tags,
