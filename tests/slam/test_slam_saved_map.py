@@ -10,6 +10,7 @@ from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.mapping.islands import Islands
 from dynslam_bench.slam.mapping.map_store import packed
 from dynslam_bench.slam.mapping.saved_map import HEADER, MAP_SCHEMA, read_map
 from dynslam_bench.slam.monocular import MonocularBackend
@@ -48,7 +49,7 @@ def made(tmp_path_factory):
 
 def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
     room, _, file, backend = made
-    saved, loaded = packed(backend.world, backend._islands), read_map(file)  # what was in memory, as it was stored
+    saved, loaded = packed(backend.world, Islands()), read_map(file)  # what is in memory, and as it was stored
     assert loaded.header.made_by == "a walk" and saved.keys() == loaded.arrays.keys() and len(saved["id"]) > 300
     for name, array in saved.items():
         assert array.dtype == loaded.arrays[name].dtype and array.tobytes() == loaded.arrays[name].tobytes(), name
