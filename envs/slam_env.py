@@ -189,11 +189,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return outputs() if outputs is not None else None
 
     def save_map(self, path: Path, made_by: str = "") -> None:
-        """Write the tracker's map to a file from which a later run may start.
-
-        Args:
-            path: The file.
-            made_by: Which run made it, in words.
+        """Write the tracker's map to a file from which a later run may start; `made_by` says in words by which run.
 
         Raises:
             TrackerError: The tracker cannot save its map, or has none.
