@@ -95,7 +95,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     source = segmentation_source(settings, sequence)
     known = versions()
     part = part_of(sequence, spec.offset)
-    identity = {
+    identity: dict[str, Any] = {
         "tracker": tracker.id,
         "tracker_version": tracker.version,
         "distribution": distribution_of(tracker),

@@ -24,7 +24,6 @@ from dynslam_bench.geometry.camera import Camera
 MAP_FILE = "map.npz"
 MAP_SCHEMA = 1
 HEADER = "header"
-KIND = "dynslam-bench map"
 MAKE_ONE = "a map is made by: run --save-map"
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -92,7 +91,7 @@ class MapHeader(Record):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: Literal["dynslam-bench map"] = KIND
+    kind: Literal["dynslam-bench map"] = "dynslam-bench map"
     schema_version: int = schema(MAP_SCHEMA)
     sensors: Sensors
     camera: dict[str, float]
