@@ -37,6 +37,7 @@ from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
 from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.geometry.camera import Camera  # noqa: E402
+from dynslam_bench.segmentation.settings import SegmentationSettings  # noqa: E402
 from dynslam_bench.sequences import open_sequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
@@ -58,11 +59,20 @@ DILATION = 15
 
 
 @dataclass(frozen=True, eq=False)
+class Seen:
+    """A frame: features of the room alone, their depth, and where people are (packed bits)."""
+
+    keypoints: Keypoints
+    z: np.ndarray
+    mask: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Room:
-    """What the camera saw: the camera, features of each frame (those of the room alone), true poses ``[N, 4, 4]``."""
+    """What the camera saw: the camera, the frames, true poses ``[N, 4, 4]``, frames a second."""
 
     camera: Camera
-    seen: list[tuple[Keypoints, np.ndarray]]
+    seen: list[Seen]
     poses: np.ndarray
     fps: float
 
@@ -91,12 +101,13 @@ def rendered(source: str, count: int) -> Room:
     for index in range(len(sequence)):
         frame, masks = sequence[index], sequence.masks[index]
         people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
-        room = cv2.dilate(people.astype(np.uint8), kernel) == 0
-        keypoints = extractor.extract(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY))
+        mask = cv2.dilate(people.astype(np.uint8), kernel) > 0
+        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        keypoints = extractor.extract_beside(gray, mask, SegmentationSettings().outside_share)
         column, row = np.rint(keypoints.xy).astype(int).T
-        at = row.clip(0, room.shape[0] - 1), column.clip(0, room.shape[1] - 1)
-        mine = np.flatnonzero(room[at])
-        seen.append((keypoints.select(mine), frame.depth[at][mine].clip(min=0)))
+        at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
+        mine = np.flatnonzero(~mask[at])
+        seen.append(Seen(keypoints.select(mine), frame.depth[at][mine].clip(min=0), np.packbits(mask)))
     stamps, truth = sequence.timestamps, sequence.ground_truth
     nearest = np.abs(truth.timestamps[:, None] - stamps[None]).argmin(axis=0)
     return Room(sequence.camera, seen, truth.T_world_cam[nearest], sequence.fps / stride)
@@ -104,12 +115,15 @@ def rendered(source: str, count: int) -> Room:
 
 def frame_of(room: Room, index: int | None, number: int) -> FrameBundle:
     """A frame of the case; None is a black one."""
-    keypoints, z = room.seen[0 if index is None else index]
+    seen, size = room.seen[0 if index is None else index], (room.camera.height, room.camera.width)
+    mask = np.unpackbits(seen.mask).reshape(size).astype(bool)
+    keypoints, z = seen.keypoints, seen.z
     if index is None:
-        keypoints, z = keypoints.select(np.zeros(0, np.int64)), z[:0]
-    blank = np.zeros((room.camera.height, room.camera.width, 3), np.uint8)
-    pictures = blank, blank[..., 0], np.zeros(blank.shape[:2], np.float32)
-    return FrameBundle(number, number / room.fps, *pictures, keypoints, keypoints.xy.astype(np.float64), z)
+        keypoints, z, mask = keypoints.select(np.zeros(0, np.int64)), z[:0], np.zeros(size, bool)
+    blank = np.zeros((*size, 3), np.uint8)
+    pictures = blank, blank[..., 0], np.zeros(size, np.float32)
+    xy = keypoints.xy.astype(np.float64)
+    return FrameBundle(number, number / room.fps, *pictures, keypoints, xy, z, mask=mask)
 
 
 def way_of(kind: str, start: int, black: int) -> list[int | None]:
