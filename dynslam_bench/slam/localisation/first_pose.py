@@ -30,6 +30,9 @@ Slots = NDArray[np.int64]
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
+MANY = 100
+MANY_SHARE = 0.75
+"""So many points that fit a place let this much of the share of what should be in view suffice (`docs/backend.md`)."""
 WIDE = 2.5
 """Factor on the search window where the narrow one gave no trusted pose."""
 
@@ -84,8 +87,8 @@ def first_pose(
     """A first pose, or None.
 
     The last frame's map points come first. Where they are few, what only its depth gives helps as well. A pose that few
-    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'; after a loss it
-    does not count at all.
+    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'. After a loss it
+    counts only if all around agrees.
 
     Args:
         world: The map.
@@ -101,13 +104,13 @@ def first_pose(
             best = matches, estimate
         if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
             return _agreed(*best, before.reference)
-    found = _from_keyframes(
-        world, islands, seen, before, settings, ENOUGH_FIRST // 2 if best is None else best[1].count + 1
-    )
-    if found is not None:
+    lost = before.lost_on is not None
+    least = ENOUGH_FIRST // 2 if best is None or lost else best[1].count + 1
+    found = _from_keyframes(world, islands, seen, before, settings, least)
+    if found is not None or best is None:
         return found
-    if best is None or before.lost_on is not None:
-        return None
+    if lost:
+        return _there(world, islands, seen, Relocalised(before.reference, *best), before, settings)
     return _agreed(*best, before.reference)
 
 
@@ -124,7 +127,8 @@ def _there(
         return None
     matches = found.matches.select(found.estimate.inliers)
     place = recognise(world, found.keyframe, seen, matches, found.estimate.T_cam_world, settings.tracking)
-    if place.share < settings.relocalisation.min_share:
+    many = len(place.matches) >= MANY
+    if place.share < (MANY_SHARE if many else 1.0) * settings.relocalisation.min_share:
         return None
     return FirstPose(place.T_cam_world, place.matches, found.keyframe, relocalised=True)
 
