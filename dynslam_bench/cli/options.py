@@ -188,12 +188,6 @@ MemoryLimit = Annotated[
 ]
 
 
-def map_settings(start_map: Path | None, localisation_only: bool) -> dict[str, Any]:
-    """The settings that ``--map`` and ``--localisation-only`` stand for."""
-    settings = {} if start_map is None else {"backend.map.file": str(start_map.expanduser().absolute())}
-    return settings | ({"backend.map.localisation_only": True} if localisation_only else {})
-
-
 def gather_settings(assignments: list[str] | None, file: Path | None, preset: dict[str, Any]) -> dict[str, Any]:
     """Overrides by dotted name: the preset's, then the file's, then the assignments'.
 

@@ -43,7 +43,6 @@ from .options import (
     Trackers,
     Video,
     gather_settings,
-    map_settings,
 )
 from .output import SOME_RUNS_FAILED, note, progress
 from .panels import MEASURE
@@ -107,7 +106,9 @@ def run(
     from dynslam_bench.runs import Limits, RunSpec
     from dynslam_bench.sequences.catalogue import parse_frames
 
-    chosen = ({} if preset is None else preset_of(tracker, preset)) | map_settings(start_map, localisation_only)
+    chosen = ({} if preset is None else preset_of(tracker, preset)) | map_settings(
+        tracker, start_map, localisation_only
+    )
     asked: dict[str, Any] = {"tracker": tracker, "settings": gather_settings(assignments, settings, chosen)}
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
@@ -139,6 +140,24 @@ def checked(kind: type[R], **values: Any) -> R:
         first = error.errors()[0]
         name = ".".join(map(str, first["loc"]))
         raise RunError(f"{name} is {first['input']!r}", first["msg"].lower()) from None
+
+
+def map_settings(tracker: str, start_map: Path | None, localisation_only: bool) -> dict[str, Any]:
+    """The settings that ``--map`` and ``--localisation-only`` stand for.
+
+    Raises:
+        RunError: The tracker begins in no map of ours.
+        PluginError: There is no such tracker.
+    """
+    from dynslam_bench.core.errors import RunError
+    from dynslam_bench.core.settings import field_names
+    from dynslam_bench.trackers import TRACKERS
+
+    settings: dict[str, Any] = {} if start_map is None else {"backend.map.file": str(start_map.expanduser().absolute())}
+    settings |= {"backend.map.localisation_only": True} if localisation_only else {}
+    if settings and "backend.map.file" not in field_names(TRACKERS.get(tracker).settings):
+        raise RunError(f"tracker '{tracker}' cannot begin in a map", "the systems on our back end can, e.g. orb-slam2")
+    return settings
 
 
 def preset_of(tracker: str, preset: str) -> dict[str, Any]:
