@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 from .composition import SemanticSystemSettings, SystemSettings, compose
-from .presets import FAST_MASKS
 from .published import CFPN, masks_in_words
 
 if TYPE_CHECKING:
@@ -97,7 +95,6 @@ def _spec(
     provenance: Literal["faithful-code", "faithful-paper", "inspired"],
     published_as: tuple[str, ...],
     falls_short: str = "",
-    presets: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> TrackerSpec:
     return TrackerSpec(
         id=f"dynaslam{suffix}",
@@ -112,7 +109,6 @@ def _spec(
         citation="Bescos et al., DynaSLAM, IEEE RA-L 2018",
         assumptions=_assumptions(settings(), as_in_code=provenance == "faithful-code"),
         remarks="background inpainting is left out: it rejects nothing" + falls_short,
-        presets=presets or {},
     )
 
 
@@ -122,7 +118,7 @@ G_FALLS_SHORT = (
 )
 BOTH = ("DynaSLAM N+G", "DynaSLAM")
 SPECS = [
-    _spec("", "N+G", DynaSlamSettings, "build", "faithful-paper", BOTH, presets=FAST_MASKS),
+    _spec("", "N+G", DynaSlamSettings, "build", "faithful-paper", BOTH),
     _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", "faithful-code", BOTH),
     _spec("-n", "N", DynaSlamMasksSettings, "build_masks_only", "faithful-code", ("DynaSLAM N",)),
     _spec("-g", "G", DynaSlamGeometrySettings, "build", "inspired", ("DynaSLAM G",), G_FALLS_SHORT),
