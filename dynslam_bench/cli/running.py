@@ -106,9 +106,8 @@ def run(
     from dynslam_bench.runs import Limits, RunSpec
     from dynslam_bench.sequences.catalogue import parse_frames
 
-    chosen = ({} if preset is None else preset_of(tracker, preset)) | map_settings(
-        tracker, start_map, localisation_only
-    )
+    chosen = {} if preset is None else preset_of(tracker, preset)
+    chosen |= map_settings(tracker, start_map, localisation_only)
     asked: dict[str, Any] = {"tracker": tracker, "settings": gather_settings(assignments, settings, chosen)}
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
