@@ -243,7 +243,8 @@ def write_pages(
 def _shares(pieces: Sequence[Sequence[LoadedRun]]) -> list[dict[int, float]]:
     """For each piece the exact share of dynamic pixels of its column's frames, as far as a run has recorded it."""
     by_column: dict[str, list[LoadedRun]] = {}
-    for run in sorted((run for piece in pieces for run in piece), key=lambda run: run.row.offset):
+    newest = sorted((run for piece in pieces for run in piece), key=lambda run: run.row.started, reverse=True)
+    for run in sorted(newest, key=lambda run: run.row.offset):  # older versions recorded no share
         by_column.setdefault(run.row.column_id, []).append(run)
     known = {column: exact_shares(some) for column, some in by_column.items()}
     return [known[piece[0].row.column_id] for piece in pieces]

@@ -77,7 +77,10 @@ class FrameSums:
             self._errors.setdefault(row.variant_key, []).extend(frames.errors_m)
 
     def by_share(self, key: str) -> list[list[float | None]]:
-        """Median error in mm and number of frames of each bin between `SHARE_EDGES`, of one tracker; empty for none."""
+        """RMSE in mm and number of frames of each bin between `SHARE_EDGES`, of one tracker; empty for none.
+
+        Not the median: a tracker that follows people errs grossly on few frames, and best of all on most.
+        """
         if key not in self._shares:
             return []
         share, error = np.array(self._shares[key]), np.array(self._errors[key])
@@ -85,8 +88,8 @@ class FrameSums:
         found: list[list[float | None]] = []
         for number in range(len(SHARE_EDGES) - 1):
             inside = error[at == number]
-            middle_mm = 1000 * float(np.median(inside)) if len(inside) >= FEWEST_FRAMES else None
-            found.append([significant(middle_mm, 4), len(inside)])
+            rmse_mm = 1000 * float(np.sqrt(np.mean(inside**2))) if len(inside) >= FEWEST_FRAMES else None
+            found.append([significant(rmse_mm, 4), len(inside)])
         return found
 
 

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pandas as pd
 import pytest
 from reports_fake_store import add_run
@@ -9,6 +10,7 @@ from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
 from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
+from dynslam_bench.reports.html.explore_data import FrameSums, summarise
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
@@ -355,3 +357,13 @@ def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
     assert frame["epipolar_skipped"][1] is pd.NA
     paths = build_report(store, tmp_path / "report")
     assert list(rows_of(paths.csv["runs"])[0]) == list(frame.columns)
+
+
+def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
+    """The exploring page's error by the share of dynamic pixels; the follower is best on most frames."""
+    sums, share = FrameSums(), np.full(100, 0.35)
+    for tracker, errors_mm in (("steady", np.full(100, 1.2)), ("follower", np.r_[np.full(90, 0.9), np.full(10, 40.0)])):
+        sums.add(row(tracker), summarise(row(tracker), 1e-3 * errors_mm, share, exact=True))
+    steady, follower = ([mm for mm, _ in sums.by_share(row(name).variant_key) if mm] for name in ("steady", "follower"))
+    assert steady == [1.2]
+    assert follower == [pytest.approx(np.sqrt(0.9 * 0.9**2 + 0.1 * 40.0**2), rel=1e-3)]

@@ -21,7 +21,7 @@ function boxFigure(explore, trackers, sequences) {
   };
 }
 
-/** Median frame error by the share of dynamic pixels, a line for every tracker. */
+/** RMSE of the frame errors by the share of dynamic pixels, a line for every tracker. */
 function shareFigure(explore, trackers) {
   const { shareEdges: edges, byShare } = explore.data;
   const percent = (value) => `${Math.round(100 * value)}`;
@@ -29,14 +29,14 @@ function shareFigure(explore, trackers) {
   const with_ = trackers.filter((tracker) => byShare[tracker.at]);
   const data = with_.map((tracker, at) => ({
     mode: "lines+markers", name: verbatim(tracker.label), visible: at < 10 ? true : "legendonly", x: names,
-    y: byShare[tracker.at].map(([middle]) => middle), text: byShare[tracker.at].map(([, count]) => `${count} frames`),
+    y: byShare[tracker.at].map(([rmse]) => rmse), text: byShare[tracker.at].map(([, count]) => `${count} frames`),
     line: { color: tracker.colour, width: 2 }, marker: { color: tracker.colour, size: 8 },
     hovertemplate: "%{x} of the image: %{y} mm<br>%{text}<extra>%{fullData.name}</extra>",
   }));
   const used = names.filter((_, at) => with_.some((tracker) => byShare[tracker.at][at][0] !== null));
   return {
     data: data.map((trace) => ({ ...trace, ...only(trace, used) })),
-    layout: { height: 420, xaxis: { type: "category", categories: used, title: { text: "share of the image that shows people" } }, yaxis: { type: "log", title: { text: "median frame-to-frame error (mm)" } } },
+    layout: { height: 420, xaxis: { type: "category", categories: used, title: { text: "share of the image that shows people" } }, yaxis: { type: "log", title: { text: "frame-to-frame error, RMSE (mm)" } } },
   };
 }
 
