@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from conftest import PointWorld, track_all
+from point_world import PointWorld, track_all
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend

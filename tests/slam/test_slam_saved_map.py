@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import PointWorld, track_all
+from point_world import PointWorld, track_all
 
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.settings import apply_overrides
