@@ -250,8 +250,9 @@ def settings_table(cls: type[Settings]) -> str:
     for name, field, default in _leaves(cls):
         p = described.get(name)
         span = "" if p is None else _span(p)
+        given = json.dumps(default, default=str)
         rows.append(
-            f"| `{name}` | `{json.dumps(default, default=str)}` | {span} | {p.unit if p else ''} | {'yes' if p and p.online else ''} "
+            f"| `{name}` | `{given}` | {span} | {p.unit if p else ''} | {'yes' if p and p.online else ''} "
             f"| {field.description or ''} |"
         )
     return "\n".join(rows) + "\n"
