@@ -8,18 +8,21 @@ from typing import Annotated, Any, Optional
 import typer
 
 from . import completion
-from .options import (
-    AsJson,
-    Assignments,
-    Camera,
-    DataRoot,
-    Device,
-    Frames,
-    SettingsFile,
-    Threads,
-    gather_settings,
-)
+from .options import AsJson, Camera, DataRoot, Device, Frames, Threads, gather_settings
 from .output import progress, write, write_fields, write_json, write_table
+
+TrainingAssignments = Annotated[
+    Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
+    typer.Option("--set", metavar="NAME=VALUE", help="Set one of the training's, e.g. iterations=1200; repeatable."),
+]
+TrainingFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--settings", help="TOML file of the training's settings."),
+]
+MaskAssignments = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--set", metavar="NAME=VALUE", help="Set one of the masks', e.g. classes=person; repeatable."),
+]
 
 app = typer.Typer(help="Train, measure and export segmentation networks, record their masks.", no_args_is_help=True)
 
@@ -27,8 +30,8 @@ app = typer.Typer(help="Train, measure and export segmentation networks, record 
 @app.command()
 def train(
     output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
-    assignments: Assignments = None,
-    settings: SettingsFile = None,
+    assignments: TrainingAssignments = None,
+    settings: TrainingFile = None,
     data_cache: Annotated[Optional[Path], typer.Option(help="Where prepared images are kept.")] = None,  # noqa: UP045
     device: Device = "auto",
     threads: Threads = 1,
@@ -68,7 +71,7 @@ def train(
 def evaluate(
     data: Annotated[str, typer.Argument(help="synthetic:..., sequence:ID, coco:FILE[:IMAGES] or yolo:DIR.")],
     source: Annotated[str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")] = "embedded",
-    assignments: Assignments = None,
+    assignments: MaskAssignments = None,
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="JSON file of the scores.")] = None,  # noqa: UP045
     limit: Annotated[Optional[int], typer.Option(min=1, help="Only so many images.")] = None,  # noqa: UP045
     min_area: Annotated[int, typer.Option(min=0, help="Leave out objects with fewer pixels.")] = 0,
@@ -115,7 +118,7 @@ def record(
     sequence: Annotated[str, typer.Argument(help="Id or path.", autocompletion=completion.sequences)],
     output: Annotated[Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")],
     source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
-    assignments: Assignments = None,
+    assignments: MaskAssignments = None,
     frames: Frames = None,
     data_root: DataRoot = None,
     camera: Camera = None,

@@ -10,7 +10,7 @@ from typing import Any
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.core.errors import RunError, SequenceError
+from dynslam_bench.core.errors import RunError, SequenceError, did_you_mean
 from dynslam_bench.core.fingerprint import code_digest, named_digests, path_digest, plugin_digest
 from dynslam_bench.core.machine import versions
 from dynslam_bench.core.plugins import Registry, load_object
@@ -187,7 +187,7 @@ def _check_degradation(strengths: dict[str, float]) -> None:
     known = set(Degradation.__dataclass_fields__) - {"seed"}
     unknown = sorted(set(strengths) - known)
     if unknown:
-        raise RunError(f"unknown degradation '{unknown[0]}'", "known: " + ", ".join(sorted(known)))
+        raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], known))
     Degradation(seed=0, **strengths)
 
 

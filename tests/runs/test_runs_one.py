@@ -205,6 +205,7 @@ def test_no_ground_truth(store: RunStore, tmp_path: Path) -> None:
         ({"frames": (3, 4)}, "1 frames here, a run needs 2 or more"),
         ({"device": "cuda:77"}, "cuda:77"),
         ({"degrade": {"fog": 1.0}}, "unknown degradation 'fog'.*blur"),
+        ({"degrade": {"blurr": 1.0}}, "unknown degradation 'blurr'.*did you mean 'blur'"),
         ({"degrade": {"blur": 2.0}}, r"expected a strength in \[0, 1\]"),
     ],
 )
