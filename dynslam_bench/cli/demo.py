@@ -55,7 +55,7 @@ class DemoOutcome:
     failed: int
 
 
-def run_demo(results: Path | str = "results", *, frames: int = 80, jobs: int = 2, trials: int = 6) -> DemoOutcome:
+def run_demo(results: Path | str = "results", *, frames: int = 60, jobs: int = 2, trials: int = 6) -> DemoOutcome:
     """Render walking and sitting people, run the suite ``demo`` on them, report it, and tune `STUDIED`.
 
     Args:

@@ -184,7 +184,7 @@ def audit_paper(
 
 def demo(
     results: Results = Path("results"),
-    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 80,
+    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 60,
     jobs: Jobs = 2,
     trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:

@@ -3,12 +3,12 @@
     python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
 
 Both run block by block in turn, so that whatever else the machine does slows them alike. Rendered scenes are instances
-that no choice has seen, two start offsets each, with the embedded network; the Bonn excerpt has masks of YOLO and 23
-start offsets, others than the choice saw; the fr1 excerpts, with nobody in view, have the embedded network and four
-each, likewise. Recordings are looked for in ``../shared``; what is not there is named. Ratios are preset : default,
-with 95 % intervals over scenes (over starts where there is one scene). "Not worse" is said where the one-sided 95 %
-bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to 0.27 in the
-logarithm: a closer margin takes hundreds of runs.
+that no choice has seen, two start offsets each; the Bonn excerpt has 23 start offsets, others than the choice saw; the
+fr1 excerpts, with nobody in view, have four each, likewise. Masks, where a tracker asks for them, are YOLO's on Bonn
+and the embedded network's elsewhere. Recordings are looked for in ``../shared``; what is not there is named. Ratios
+are preset : default, with 95 % intervals over scenes (over starts where there is one scene). "Not worse" is said where
+the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to
+0.27 in the logarithm: a closer margin takes hundreds of runs.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.blocks import Block, parse_blocks
@@ -41,9 +42,11 @@ PARTS = {
 
 def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> str:
     """One line: what the preset is worth on that part."""
-    source = {"segmentation.source": f"onnx:{NETWORK}" if part == "bonn" else "embedded"}
+    spec = TRACKERS.get(tracker)
+    network = f"onnx:{NETWORK}" if part == "bonn" else "embedded"
+    source = {name: network for name in field_names(spec.settings) if name == "segmentation.source"}
     blocks = [block for text in PARTS[part] for block in parse_blocks(text)]
-    settings = [source, {**source, **TRACKERS.get(tracker).presets[preset]}]
+    settings = [source, {**source, **spec.presets[preset]}]
     outcomes: list[dict[Block, Outcome]] = [{}, {}]
     for block in blocks:
         for found, values in zip(outcomes, settings, strict=True):
