@@ -26,6 +26,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.availability import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
+from .arguments import RENDER_MODES, check_arguments
 from .control import ActionMap
 from .device import resolve_device
 from .episode import Episode, FrameOutcome
@@ -99,7 +100,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 30}  # noqa: RUF012
 
     def __init__(
         self,
@@ -123,7 +124,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
-        _check_arguments(render_mode, observation, lost_after, threads)
+        check_arguments(render_mode, observation, lost_after, threads)
         self.render_mode = render_mode
         self.protocol = get_protocol(protocol)
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
@@ -186,6 +187,17 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """The tracker's keyframes and map points (``slam.outputs.MapOutputs``); None if it offers none."""
         outputs = getattr(self._tracker, "map_outputs", None)
         return outputs() if outputs is not None else None
+
+    def save_map(self, path: Path, made_by: str = "") -> None:
+        """Write the tracker's map to a file from which a later run may start; `made_by` says in words by which run.
+
+        Raises:
+            TrackerError: The tracker cannot save its map, or has none.
+            DynslamError: The file cannot be written.
+        """
+        if not hasattr(self._tracker, "save_map"):
+            raise TrackerError(f"tracker '{self.tracker_spec.id}' cannot save its map")
+        self._tracker.save_map(path, made_by)
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
@@ -385,14 +397,3 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         context = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
         make = stats_observation if self._observation == "stats" else rgbd_observation
         return make(self.frame, self.result, context)
-
-
-def _check_arguments(render_mode: str | None, observation: str, lost_after: int | None, threads: int) -> None:
-    if render_mode not in (None, *SlamEnv.metadata["render_modes"]):
-        raise SettingsError(f"unknown render mode '{render_mode}'", "known: rgb_array")
-    if observation not in ("stats", "rgbd"):
-        raise SettingsError(f"unknown observation '{observation}'", "known: stats, rgbd")
-    if lost_after is not None and lost_after < 1:
-        raise SettingsError(f"lost_after is {lost_after}", "give a number of frames >= 1, or None")
-    if threads < 1:
-        raise SettingsError(f"threads is {threads}", "give a number >= 1")

@@ -137,6 +137,20 @@ Sheet = Annotated[
 Recording = Annotated[
     bool, typer.Option("--rrd", help="Write recording.rrd beside the run, for rerun's viewer.", rich_help_panel=OUTPUT)
 ]
+SaveMap = Annotated[
+    bool,
+    typer.Option("--save-map", help="Write map.npz beside the run, for --map of a later one.", rich_help_panel=OUTPUT),
+]
+StartMap = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--map", metavar="FILE", help="Begin in the map of an earlier run (--save-map).", rich_help_panel=SETTINGS
+    ),
+]
+LocalisationOnly = Annotated[
+    bool,
+    typer.Option("--localisation-only", help="Leave that map as it is: poses alone.", rich_help_panel=SETTINGS),
+]
 Label = Annotated[
     str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=SETTINGS)
 ]

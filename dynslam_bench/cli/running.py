@@ -22,6 +22,7 @@ from .options import (
     Frames,
     Jobs,
     Label,
+    LocalisationOnly,
     MemoryLimit,
     Offsets,
     Preset,
@@ -30,10 +31,12 @@ from .options import (
     Recording,
     Results,
     Retry,
+    SaveMap,
     Scheduler,
     Seeds,
     SettingsFile,
     Sheet,
+    StartMap,
     Stride,
     Threads,
     TimeLimit,
@@ -89,6 +92,9 @@ def run(
     video: Video = False,
     sheet: Sheet = False,
     rrd: Recording = False,
+    save_map: SaveMap = False,
+    start_map: StartMap = None,
+    localisation_only: LocalisationOnly = False,
     retry: Retry = None,
     label: Label = "",
     time_limit: TimeLimit = None,
@@ -101,11 +107,12 @@ def run(
     from dynslam_bench.sequences.catalogue import parse_frames
 
     chosen = {} if preset is None else preset_of(tracker, preset)
+    chosen |= map_settings(tracker, start_map, localisation_only)
     asked: dict[str, Any] = {"tracker": tracker, "settings": gather_settings(assignments, settings, chosen)}
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
     asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
-    asked |= {"video": video, "sheet": sheet, "rrd": rrd, "label": label}
+    asked |= {"video": video, "sheet": sheet, "rrd": rrd, "save_map": save_map, "label": label}
     asked |= {"limits": checked(Limits, time_s=time_limit, memory_mb=memory_limit)}
     specs = [
         checked(RunSpec, sequence=sequence, seed=number, offset=skipped, **asked)
@@ -132,6 +139,24 @@ def checked(kind: type[R], **values: Any) -> R:
         first = error.errors()[0]
         name = ".".join(map(str, first["loc"]))
         raise RunError(f"{name} is {first['input']!r}", first["msg"].lower()) from None
+
+
+def map_settings(tracker: str, start_map: Path | None, localisation_only: bool) -> dict[str, Any]:
+    """The settings that ``--map`` and ``--localisation-only`` stand for.
+
+    Raises:
+        RunError: The tracker begins in no map of ours.
+        PluginError: There is no such tracker.
+    """
+    from dynslam_bench.core.errors import RunError
+    from dynslam_bench.core.settings import field_names
+    from dynslam_bench.trackers import TRACKERS
+
+    settings: dict[str, Any] = {} if start_map is None else {"backend.map.file": str(start_map.expanduser().absolute())}
+    settings |= {"backend.map.localisation_only": True} if localisation_only else {}
+    if settings and "backend.map.file" not in field_names(TRACKERS.get(tracker).settings):
+        raise RunError(f"tracker '{tracker}' cannot begin in a map", "the systems on our back end can, e.g. orb-slam2")
+    return settings
 
 
 def preset_of(tracker: str, preset: str) -> dict[str, Any]:

@@ -85,6 +85,7 @@ def show(
         "peak_memory_mb": record.peak_memory_mb,
         "keyframes": record.keyframes,
         "map_points": record.map_points,
+        "maps": record.maps,
         "overrides": [f"{name}={value}" for name, value in record.overrides.items()],
         "notes": record.notes,
         "command": " ".join(record.command),

@@ -14,11 +14,12 @@ class KeyframeRecord:
 
     Attributes:
         id: Number in order of creation.
-        frame: Index of its frame.
-        timestamp: Seconds.
+        frame: Index of its frame; -1 for one of an earlier run, in whose map this one began.
+        timestamp: Seconds; NaN for one of an earlier run.
         T_world_cam: Camera-to-world pose ``[4, 4]``.
         features: Features it holds.
         observations: Map points it observes.
+        map: 0 for the map that the trajectory is in; another number for one that began after a loss and never met it.
     """
 
     id: int
@@ -27,6 +28,7 @@ class KeyframeRecord:
     T_world_cam: NDArray[np.float64]
     features: int
     observations: int
+    map: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ class Tracker(Protocol):
     """A SLAM or odometry system that is fed one frame at a time.
 
     Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last optimisation of the map),
-    ``map_outputs() -> MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``)
-    and ``close()``.
+    ``map_outputs() -> MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``),
+    ``save_map(path, made_by)`` (the map as a file from which a later run may start) and ``close()``.
     """
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:

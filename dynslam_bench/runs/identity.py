@@ -30,6 +30,8 @@ from dynslam_bench.sequences.part import part_of
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
 from .spec import RunSpec
+from .start_map import start_map_of
+from .storage.record import StartMap
 
 _ROOMS = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
@@ -50,6 +52,7 @@ class ResolvedRun:
         device: ``cpu`` or ``cuda:N``.
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
         identity: What the run's id is a digest of.
+        start_map: The map that it begins in; None for a run that begins without one.
     """
 
     spec: RunSpec
@@ -59,6 +62,7 @@ class ResolvedRun:
     device: str
     segmentation: str
     identity: dict[str, Any]
+    start_map: StartMap | None = None
 
     @property
     def run_id(self) -> str:
@@ -72,7 +76,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     Raises:
         DynslamError: Unknown tracker, setting, sequence, device or degradation; a sequence that is missing or has fewer
             than two frames; a semantic source that is not available; a tracker that needs a missing package, or
-            depth that the sequence has not.
+            depth that the sequence has not; a map to begin in that does not fit.
     """
     spec = spec.absolute()
     tracker = TRACKERS.get(spec.tracker)
@@ -91,7 +95,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     source = segmentation_source(settings, sequence)
     known = versions()
     part = part_of(sequence, spec.offset)
-    identity = {
+    identity: dict[str, Any] = {
         "tracker": tracker.id,
         "tracker_version": tracker.version,
         "distribution": distribution_of(tracker),
@@ -117,7 +121,8 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "opencv": known.get("opencv", ""),
         "torch": known.get("torch", ""),
     }
-    return ResolvedRun(spec, tracker, settings, sequence, device, source, identity)
+    start_map = start_map_of(settings, sequence.camera, tracker.sensors, identity["weights"])
+    return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
 
 
 def distribution_of(tracker: TrackerSpec) -> str:

@@ -20,6 +20,7 @@ from dynslam_bench.geometry.tum_file import write_tum
 
 from .exchange.recording import RECORDING_FILE, RecordingWriter
 from .frame_row import FRAMES_FILE, FrameRow
+from .kept_map import keep_map
 from .process.failures import at
 from .sheet_collector import SHEET_FILE, SheetWriter
 from .snapshots import SnapshotWriter, taken
@@ -108,6 +109,7 @@ class _Recorder:
     """Everything that is kept of a run frame by frame: the log, and the pictures that were asked for."""
 
     def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
+        self.spec = spec
         self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
         self._snapshots = SnapshotWriter(folder, len(env.sequence))
         self._env = env
@@ -178,22 +180,17 @@ def _finish(env: SlamEnv, folder: Path, recorder: _Recorder) -> dict[str, Any]:
     sheet = recorder.sheet
     began = time.perf_counter()
     final = env.final_trajectory()
-    outcome: dict[str, Any] = {"finalize_s": None, "keyframes": None, "map_points": None, "gpu_memory_mb": None}
-    notes: list[str] = []
+    outcome: dict[str, Any] = {"finalize_s": None, "gpu_memory_mb": None}
     if final is not None:
         outcome["finalize_s"] = time.perf_counter() - began
         write_tum(folder / "trajectory_final.txt", final)
-    outputs = env.map_outputs()
-    if outputs is not None:
-        from dynslam_bench.slam.outputs.map_files import write_keyframes_csv, write_ply
-
-        write_keyframes_csv(folder / "keyframes.csv", outputs)
-        write_ply(folder / "map.ply", outputs)
-        if sheet is not None:
+    kept = keep_map(env, folder, recorder.spec)
+    outputs, notes = kept.outputs, [*kept.notes]
+    if sheet is not None:
+        if outputs is not None:
             sheet.write(outputs, env.online_trajectory() if final is None else final)
-        outcome |= {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions)}
-    elif sheet is not None:
-        notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
+        else:
+            notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
     if recorder.recording is not None:
         track = env.online_trajectory() if final is None else final
         truth = aligned_truth(env.sequence.ground_truth, track)[0] if len(track) else None
@@ -204,7 +201,7 @@ def _finish(env: SlamEnv, folder: Path, recorder: _Recorder) -> dict[str, Any]:
 
         outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
         outcome["gpu"] = torch.cuda.get_device_name(env.device)
-    return outcome | {"notes": notes}
+    return outcome | kept.counts | {"notes": notes}
 
 
 class _FrameWriter:

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.slam.mapping.saved_map import MAP_FILE
 
 from .exchange.recording import RECORDING_FILE
 from .identity import ResolvedRun, resolve
@@ -65,10 +66,11 @@ def run_many(
 ) -> list[RunRecord]:
     """Make the runs that are not stored yet, and score all of them.
 
-    Everything is looked up before the first run begins. A stored run is made again if a video or a sheet is asked for
-    that it lacks; one that is given another label gets that. Each run is a child process; a failure is a record like
-    any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from there.
-    Several processes may do so at a time on one results folder: each run is made by one of them (not with `executor`).
+    Everything is looked up before the first run begins. A stored run is made again if a video, a sheet or its map is
+    asked for that it lacks; one that is given another label gets that. Each run is a child process; a failure is a
+    record like any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from
+    there. Several processes may do so at a time on one results folder: each run is made by one of them (not with
+    `executor`).
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -255,17 +257,17 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
 
 def pictures_asked(spec: RunSpec) -> list[str]:
     """The files beside a run that it was asked for."""
-    asked = ((VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet), (RECORDING_FILE, spec.rrd))
+    asked = ((VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet), (RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map))
     return [name for name, wanted in asked if wanted]
 
 
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
-    """Whether a stored run has to be made again for a video, a sheet or a recording that is asked for now."""
+    """Whether a stored run has to be made again for a video, a sheet, a recording or a map that is asked for now."""
     folder = store.folder(stored.run_id)
     wanted = pictures_asked(run.spec)
     excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
     if stored.failed:  # what ends early has no map to draw, and what saw no frame nothing at all
-        excused |= {SHEET_FILE} if stored.n_processed else set(wanted)
+        excused |= {SHEET_FILE, MAP_FILE} if stored.n_processed else set(wanted)
     return any(not (folder / name).is_file() for name in set(wanted) - excused)
 
 

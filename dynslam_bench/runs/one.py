@@ -179,6 +179,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         **_counts(frames, total),
         keyframes=final.get("keyframes"),
         map_points=final.get("map_points"),
+        maps=final.get("maps"),
+        start_map=resolved.start_map,
         epipolar_skipped=frames.epipolar_skipped(),
         mask_iou=frames.mask_iou(),
         timings=frames.timings(),
@@ -192,9 +194,15 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         git=git_revision(),
         command=list(sys.argv),
         identity=identity,
-        notes=[*([CACHED_TIMES] if spec.cache else []), *final.get("notes", [])],
+        notes=[*_notes(resolved), *final.get("notes", [])],
         place=place_of(spec.sequence),
     )
+
+
+def _notes(resolved: ResolvedRun) -> list[str]:
+    """What a reader should know before the run."""
+    begun = [] if resolved.start_map is None else [resolved.start_map.describe()]
+    return ([CACHED_TIMES] if resolved.spec.cache else []) + begun
 
 
 _AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share")

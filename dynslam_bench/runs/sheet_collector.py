@@ -47,7 +47,8 @@ class SheetWriter:
             track: The run's final trajectory, or the online one.
         """
         sequence = self._env.sequence
-        shown = [outputs.keyframes[row].frame for row in _spread(len(outputs.keyframes))]
+        own = [record.frame for record in outputs.keyframes if record.frame >= 0]  # others are of an earlier run
+        shown = [own[row] for row in _spread(len(own))]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth, ate_m = aligned_truth(sequence.ground_truth, track)

@@ -55,6 +55,7 @@ class RunSpec(Record):
         video: Whether to write ``video.webm``.
         sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
         rrd: Whether to write ``recording.rrd`` for rerun's viewer.
+        save_map: Whether to write ``map.npz``, from which a later run may start (setting ``backend.map.file``).
         label: Name in tables, in place of the tracker's; no part of the run's identity.
         limits: What it may take.
     """
@@ -79,6 +80,7 @@ class RunSpec(Record):
     video: bool = False
     sheet: bool = False
     rrd: bool = False
+    save_map: bool = False
     label: str = ""
     limits: Limits = Field(default_factory=Limits)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FrameBundle, KeyframeView
 from dynslam_bench.contracts.map_outputs import MapOutputs
 from dynslam_bench.contracts.result import TrackingState
+from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -25,10 +27,10 @@ from .localisation.surroundings import Surroundings
 from .localisation.tracking import MapFit, Tracked, fit_to_map
 from .loop_closing import LoopCloser
 from .mapping.history import History
-from .mapping.islands import Islands
 from .mapping.keyframes import KeyframeRule
 from .mapping.local_mapping import LocalMapper
-from .mapping.map import Map
+from .mapping.map_store import begin, save
+from .mapping.saved_map import MapFeatures
 from .settings import BackendSettings
 from .views import MapViews
 
@@ -45,14 +47,23 @@ class RgbdBackend:
         settings: Of tracking, mapping, bundle adjustment, keyframes and relocalisation.
         scale_factor: Ratio of consecutive pyramid levels of the features that will come.
         levels: Number of pyramid levels of the features that will come.
+        extractor: Who finds them; a saved map serves the same features alone.
     """
 
     uses_depth = True
     """Whether depth is read; where it is not, the pipeline shows it to nobody."""
 
-    def __init__(self, settings: BackendSettings | None = None, *, scale_factor: float = 1.2, levels: int = 8) -> None:
+    def __init__(
+        self,
+        settings: BackendSettings | None = None,
+        *,
+        scale_factor: float = 1.2,
+        levels: int = 8,
+        extractor: str = "orb",
+    ) -> None:
         self.settings = settings or BackendSettings()
-        self._scales = scale_factor ** np.arange(max(levels, 1), dtype=np.float64)
+        self._made_of = MapFeatures(extractor=extractor, levels=max(levels, 1), scale_factor=scale_factor)
+        self._scales = self._made_of.scales
         self._ready = False
 
     def configure(self, settings: BackendSettings) -> None:
@@ -65,23 +76,27 @@ class RgbdBackend:
             self._keyframes.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
-        """Forget everything: a new sequence begins.
+        """Forget everything: a new sequence begins, in the map that the settings name, if they do.
 
         Args:
             camera: Intrinsics; keypoints' `xy` come undistorted, so its distortion plays no role here.
             seed: Founds all random draws.
+
+        Raises:
+            SettingsError: That map cannot be read, or is of another camera, other features or another sensor.
         """
         self.camera = camera.undistorted()
         self.seed = int(seed)
-        self.world = Map(self.camera, self._scales)
+        start = self.settings.map
+        self.world, self._islands = begin(start.file, self.camera, self._made_of, depth=self.uses_depth)
+        self._grows = not start.localisation_only
         self.mapper = LocalMapper(self.world, self.settings)
         self.history = History()
         self.state: TrackingState = "initialising"
         self._tracked = False
         self._island = 0
         self._unrecognised = 0
-        self._reach = Reach()
-        self._islands = Islands()
+        self._reach = Reach(anywhere=bool(start.file))
         self._last: Tracked | None = None
         self._motion = CameraMotion()
         self._reference = -1
@@ -107,7 +122,7 @@ class RgbdBackend:
         assert self._ready, "reset() comes before track()"
         begin = perf_counter()
         seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
-        found = self._localise(frame, seen, self._last) if self._last is not None else self._initialise(frame, seen)
+        found = self._localise(frame, seen) if self.world.next_keyframe else self._initialise(frame, seen)
         tracking = perf_counter() - begin - sum(found.timings.values())
         stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
         return replace(found, timings={**stages, **found.timings})
@@ -133,8 +148,9 @@ class RgbdBackend:
         self._island = int(self.world.kf_island[self._reference])
         return "ok" if self._tracked and self._island == 0 else "lost"
 
-    def _localise(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised:
+    def _localise(self, frame: FrameBundle, seen: Observations) -> Localised:
         """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
+        last = self._nowhere(frame, seen) if self._last is None else self._last
         prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
         reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
@@ -142,12 +158,13 @@ class RgbdBackend:
         before = Before(last, prediction, self._reference, around, island, reach, close, self.seed, frame.index)
         first = first_pose(self.world, self._islands, seen, before, self.settings)
         if first is None:
-            return self._lost(frame, seen, prediction)
+            return self._lost(frame, seen, last, prediction)
         points = self._surroundings.points(first.keyframe, first.matches.point)
         fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, points, self.settings.tracking)
-        self.world.visible[fit.in_view] += 1
+        if self._grows:
+            self.world.visible[fit.in_view] += 1
         if fit.count < self._needed_inliers() or not np.isfinite(fit.estimate.T_cam_world).all():
-            found = self._lost(frame, seen, prediction)
+            found = self._lost(frame, seen, last, prediction)
         else:
             taken = self._accept(frame, seen, fit, last)
             spent = self._keyframe_if_wanted(frame, taken, fit)
@@ -157,28 +174,45 @@ class RgbdBackend:
     def _needed_inliers(self) -> int:
         return self.settings.tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
 
-    def _lost(self, frame: FrameBundle, seen: Observations, prediction: Array) -> Localised:
+    def _nowhere(self, frame: FrameBundle, seen: Observations) -> Tracked:
+        """What stands for the last tracked frame before the camera is found in a loaded map: it shows nothing.
+
+        Raises:
+            TrackerError: The features' descriptors are not those of the map.
+        """
+        if len(seen) and 8 * seen.words.shape[1] != self.world.descriptor_bytes:
+            raise TrackerError(
+                f"the map's descriptors have {self.world.descriptor_bytes} bytes, frame {frame.index}'s "
+                f"{8 * seen.words.shape[1]}",
+                "make the map with the same features",
+            )
+        none, unsure = np.zeros(len(frame), bool), np.zeros(len(frame), np.float32)
+        nothing = observe(frame, none, unsure, self.camera, self._scales, self.settings.tracking)
+        return Tracked(nothing, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
+
+    def _lost(self, frame: FrameBundle, seen: Observations, last: Tracked, prediction: Array) -> Localised:
         """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
         self.state = "lost"
-        assert self._last is not None
         deep = int(np.count_nonzero(seen.z > 0))
         if self._tracked:
-            self._reach.lost(self._last, deep, MIN_INITIAL)
+            self._reach.lost(last, deep, MIN_INITIAL)
         self._tracked = False
         self._motion.forget()
         self._unrecognised = self._unrecognised + 1 if deep >= MIN_INITIAL else 0
-        if not self.settings.loop_closing.enabled or self._unrecognised < self.settings.relocalisation.new_map_after:
-            return self._localised(prediction)
+        begins = self._grows and self.settings.loop_closing.enabled
+        if not begins or self._unrecognised < self.settings.relocalisation.new_map_after:
+            return self._localised(None if self._last is None else prediction)
         self._unrecognised = 0
-        reach = self._reach.metres(self._last, frame.timestamp, self.settings.relocalisation)
-        start = self._last.T_cam_world
+        reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
+        start = last.T_cam_world
         self._island = self._islands.begin(self._island, se3.inverse(start)[:3, 3], reach)
         return self._begin_map(frame, seen, start)
 
     def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: Tracked) -> Tracked:
         """The frame is tracked: what it sees counts as found, and its pose is weighed against the motion model."""
         points = fit.matches.point[fit.inliers]
-        self.world.found[points] += 1
+        if self._grows:
+            self.world.found[points] += 1
         point = np.full(len(seen), -1, np.int64)
         point[fit.matches.feature[fit.inliers]] = points
         measured = fit.estimate.T_cam_world, fit.estimate.information
@@ -197,7 +231,7 @@ class RgbdBackend:
         """Make the tracked frame a keyframe if the rule says so, and note its pose; what that took, by stage."""
         spent: dict[str, float] = {}
         pose = fit.estimate.T_cam_world
-        if self._keyframes.wants(self.world, tracked, frame.index, self._reference):
+        if self._grows and self._keyframes.wants(self.world, tracked, frame.index, self._reference):
             spent = self._make_keyframe(frame, tracked)
             if self.settings.bundle_adjustment.enabled or self.settings.loop_closing.enabled:
                 pose = tracked.T_cam_world
@@ -237,6 +271,7 @@ class RgbdBackend:
             keyframe=bool(spent),
             map_points=len(self.map_points()[0]),
             keyframes=self.world.keyframe_count,
+            maps=self.world.map_count,
             timings=spent or {},
         )
 
@@ -282,12 +317,27 @@ class RgbdBackend:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
         return self._views.outputs()
 
+    def save_map(self, path: Path, made_by: str = "") -> None:
+        """Write the map to a file from which a later run may start (`backend.map.file`).
+
+        Args:
+            path: The file; ``map.npz`` in runs.
+            made_by: Which run made it, in words.
+
+        Raises:
+            TrackerError: There is no map yet, or it is too large for a file.
+            DynslamError: The file cannot be written.
+        """
+        if not self.world.next_keyframe:
+            raise TrackerError("there is no map to save: no frame has begun one")
+        save(path, self.world, self._islands, self._made_of, depth=self.uses_depth, made_by=made_by)
+
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
 
-        With `bundle_adjustment.full` all of the map is refined first.
+        With `bundle_adjustment.full` all of the map is refined first, unless the run only localises in it.
         """
-        if self.settings.bundle_adjustment.full:
+        if self._grows and self.settings.bundle_adjustment.full:
             self.mapper.adjust_all()
         stamps, poses, information = self.history.poses(self.world)
         order = np.argsort(stamps, kind="stable")

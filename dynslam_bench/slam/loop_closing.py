@@ -192,7 +192,7 @@ class LoopCloser:
             if not here:
                 return self.islands.may_lie(there, se3.inverse(correction))
             return self.islands.may_lie(here, correction)
-        way = self._walked - self._way[int(self.world.kf_id[loop.keyframe])]
+        way = self._walked - self._way.get(int(self.world.kf_id[loop.keyframe]), 0.0)  # 0: of a loaded map
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 
     # ------------------------------------------------------------------ correct and fuse

@@ -27,15 +27,22 @@ class MonocularBackend(RgbdBackend):
         settings: Of tracking, mapping, bundle adjustment, keyframes, relocalisation and the first two views.
         scale_factor: Ratio of consecutive pyramid levels of the features that will come.
         levels: Number of pyramid levels of the features that will come.
+        extractor: Who finds them.
     """
 
     uses_depth = False
     settings: MonocularBackendSettings
 
     def __init__(
-        self, settings: MonocularBackendSettings | None = None, *, scale_factor: float = 1.2, levels: int = 8
+        self,
+        settings: MonocularBackendSettings | None = None,
+        *,
+        scale_factor: float = 1.2,
+        levels: int = 8,
+        extractor: str = "orb",
     ) -> None:
-        super().__init__(settings or MonocularBackendSettings(), scale_factor=scale_factor, levels=levels)
+        own = settings or MonocularBackendSettings()
+        super().__init__(own, scale_factor=scale_factor, levels=levels, extractor=extractor)
 
     def reset(self, camera: Camera, seed: int) -> None:
         """Forget everything: a new sequence begins."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
@@ -233,6 +234,7 @@ class SlamPipeline:
             "map_points": float(located.map_points),
             "keyframes": float(located.keyframes),
             "keyframe": float(located.keyframe),
+            "maps": float(located.maps),
             "residual_px": located.residual_px,
             "mask_fraction": 0.0 if culled.mask is None else float(culled.mask.mean()),
             "relocalised": float(located.relocalised),
@@ -267,6 +269,20 @@ class SlamPipeline:
         """
         self._begun("map_outputs")
         return self._backend.outputs()
+
+    def save_map(self, path: Path, made_by: str = "") -> None:
+        """Write the map to a file from which a later run may start (setting ``backend.map.file``).
+
+        Args:
+            path: The file.
+            made_by: Which run made it, in words.
+
+        Raises:
+            TrackerError: `reset` was never called, there is no map yet, or it is too large for a file.
+            DynslamError: The file cannot be written.
+        """
+        self._begun("save_map")
+        self._backend.save_map(path, made_by)
 
     def configure(self, settings: Settings) -> None:
         """Put other values of online settings into force from the next frame on; `reset` undoes it.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
-from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.settings import Settings, names, tunable
 
 ADJUSTED, FILTERED = {"enabled": [True]}, {"filter": [True]}
 
@@ -351,6 +353,24 @@ class MotionModelSettings(Settings):
     )
 
 
+class StartMapSettings(Settings):
+    """A map from which the run starts, made by an earlier one; where in it the camera is has to be recognised first."""
+
+    file: str = names("", "file", meaning="map.npz of an earlier run (run --save-map); empty to begin without a map")
+    localisation_only: bool = Field(
+        False, description="whether that map stays as it is: no keyframes, no bundle adjustment, poses alone"
+    )
+
+    def verify(self) -> None:
+        """Without a map there is nothing to localise in."""
+        if self.localisation_only and not self.file:
+            raise SettingsError(
+                "localisation only needs a map, but backend.map.file is empty", "make one with: run --save-map"
+            )
+        if self.file and not Path(self.file).expanduser().is_file():
+            raise SettingsError(f"backend.map.file names {self.file}, which is no file", "make one: run --save-map")
+
+
 class BackendSettings(Settings):
     """All settings of the back end."""
 
@@ -361,3 +381,4 @@ class BackendSettings(Settings):
     bundle_adjustment: BundleAdjustmentSettings = BundleAdjustmentSettings()
     relocalisation: RelocalisationSettings = RelocalisationSettings()
     loop_closing: LoopClosingSettings = LoopClosingSettings()
+    map: StartMapSettings = StartMapSettings()

@@ -93,4 +93,5 @@ def _record(world: Map, slot: int) -> KeyframeRecord:
         world.T_world_cam(slot),
         count,
         int(np.count_nonzero(world.kf_point[slot, :count] >= 0)),
+        int(world.kf_island[slot]),
     )

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 from .row import SEEN, RunRow
 
+ALWAYS = ("map", "backend.map.localisation_only")
+"""Named in any table: a run that begins in a map knows more than one that begins without."""
+
 
 def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants.
@@ -25,8 +28,8 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     kinds = {tracker: {other.kind for other in others} for tracker, others in by_tracker.items()}
     labels = {}
     for key, row in variants.items():
-        differing = differing_of[row.tracker]
-        parts = [f"{name}={row.variant[name]}" for name in differing if name in row.variant]
+        shown = {*differing_of[row.tracker], *ALWAYS}
+        parts = [f"{name}={value}" for name, value in sorted(row.variant.items()) if name in shown]
         if row.imported and len(kinds[row.tracker]) > 1:
             parts.append("imported")
         base = f"{row.label} <{row.tracker}>" if len(by_label[row.label]) > 1 else row.label

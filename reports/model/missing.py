@@ -79,6 +79,8 @@ def _settings(row: RunRow) -> list[str]:
             words += ["--threads", str(value)] if value != 1 else []
         elif name == "device":
             words += ["--device", str(value)] if value not in ("cpu", "") else []
+        elif name == "map":
+            words += ["--map", row.map_file]
         elif name == "realtime":
             words.append("--realtime")
         elif name == "drop_share":

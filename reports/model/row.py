@@ -36,6 +36,7 @@ class RunRow(Record):
         block: What one column of a table is: content, camera, frames and stride.
         content: Digest of the content.
         camera: Camera in words.
+        map_file: File of the map that it began in, which `variant` names by its digest; empty for none.
         place: Folder of the sequence where it was named by its path.
         duration_s: Time between its first and last frame.
         tags: Tags of the sequence.
@@ -91,6 +92,7 @@ class RunRow(Record):
     block: str = ""
     content: str = ""
     camera: str = ""
+    map_file: str = ""
     place: str = ""
     duration_s: float = 0.0
     tags: list[str] = Field(default_factory=list)

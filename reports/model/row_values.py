@@ -84,7 +84,7 @@ def held_error(
 
 def variant_of(record: RunRecord) -> dict[str, Any]:
     """What sets runs of one tracker apart besides sequence and repeat."""
-    variant: dict[str, Any] = dict(sorted(record.overrides.items()))
+    variant: dict[str, Any] = dict(sorted(record.asked.items()))
     if record.kind == "run":
         variant |= {"device": record.device, "threads": record.threads}
     if record.realtime:

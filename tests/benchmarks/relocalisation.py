@@ -24,7 +24,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests/benchmarks"), str(ROOT / "tests/sla
 import backend_accuracy  # noqa: E402
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from conftest import PointWorld  # noqa: E402
+from point_world import PointWorld  # noqa: E402
 
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
 from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402

@@ -40,6 +40,9 @@ def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk):
         ("run", "mask-rcnn", walk, "--set", "segmentation.source=onnx:none.onnx"),
         ("run", "mask-rcnn", walk, "--set", "segmentation.source=oracle"),
         ("run", "replay:none.txt", walk),
+        ("run", "orb-slam2", walk, "--map", "none.npz"),
+        ("run", "orb-slam2", walk, "--localisation-only"),
+        ("run", "never-move", walk, "--map", "none.npz"),
     ):
         code, _, err = cli(*arguments)
         assert code == 1 and one_line(err)

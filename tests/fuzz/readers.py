@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from . import binaries, exchange, layouts, records, texts
+from . import binaries, exchange, layouts, maps, records, texts
 
-TARGETS = [*records.TARGETS, *texts.TARGETS, *binaries.TARGETS, *layouts.TARGETS, *exchange.TARGETS]
+TARGETS = [*records.TARGETS, *texts.TARGETS, *binaries.TARGETS, *layouts.TARGETS, *exchange.TARGETS, *maps.TARGETS]

@@ -260,7 +260,7 @@ def _snapshot_seeds() -> list[bytes]:
     return found
 
 
-def _rezipped(data: bytes, random: Random) -> bytes:
+def rezipped(data: bytes, random: Random) -> bytes:
     """A sound archive with one damaged array."""
     buffer = io.BytesIO()
     try:
@@ -354,7 +354,7 @@ TARGETS = [
         lambda data, folder: snapshots.read_snapshots(at(folder, snapshots.SNAPSHOTS_FILE, data).parent),
         _snapshot_seeds,
         (snapshots.read_snapshots, array_files),
-        _rezipped,
+        rezipped,
     ),
     Target("stage cache entry", _read_entry, lambda: [_entry()], (StageCache.get, _unpack)),
     Target(

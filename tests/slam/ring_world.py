@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from conftest import PointWorld
+from point_world import PointWorld
 
 from dynslam_bench.geometry.camera import Camera
 

@@ -73,9 +73,11 @@ def test_maps_that_never_meet_stay_apart():
     way = [*range(25), *[None] * 20, *range(60, 90)]
     backend, states, _ = drive(RingWorld(), way, **{"loop_closing.enabled": True})
     assert (states[25:] == "lost").all() and len(backend.finalize()) == 25
-    assert set(backend.world.kf_island[backend.world.keyframes].tolist()) == {0, 1}
+    assert {record.map for record in backend.outputs().keyframes} == {0, 1}
+    last = RingWorld().blind(99, stamp=99.0)
+    assert backend.track(last, np.ones(0, bool), np.ones(0, np.float32)).maps == 2
     without, states, _ = drive(RingWorld(), way)
-    assert (states[25:] == "lost").all() and set(without.world.kf_island[without.world.keyframes].tolist()) == {0}
+    assert (states[25:] == "lost").all() and {record.map for record in without.outputs().keyframes} == {0}
 
 
 def test_an_island_lies_where_the_camera_can_have_got():

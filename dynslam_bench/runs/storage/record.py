@@ -77,6 +77,32 @@ class StageTime(Record):
     mean_s: float
 
 
+class StartMap(Record):
+    """The map of an earlier run, in which a run began.
+
+    Attributes:
+        digest: Of its content: runs that began in different maps are never repeats of each other.
+        file: Where it lay.
+        made_by: Which run made it, in words.
+        keyframes: Keyframes that it brought.
+        points: Points that it brought.
+        localisation_only: Whether it stayed as it was.
+    """
+
+    digest: Digest
+    file: str = ""
+    made_by: str = ""
+    keyframes: int
+    points: int
+    localisation_only: bool = False
+
+    def describe(self) -> str:
+        """One line: which map, of which run, and whether it stayed as it was."""
+        what = f"begun in the map {self.digest[:8]} ({self.keyframes} keyframes, {self.points} points)"
+        of = f" of {self.made_by}" if self.made_by else ""
+        return what + of + (", localisation only" if self.localisation_only else "") + f": {self.file}"
+
+
 class RunRecord(Record):
     """The outcome of a run.
 
@@ -111,6 +137,9 @@ class RunRecord(Record):
         coverage: ``n_tracked / n_frames``.
         keyframes: Keyframes at the end, None if the tracker does not say.
         map_points: Map points at the end, None if the tracker does not say.
+        maps: Maps at the end that never met, those of their own begun after a loss among them; None if the tracker does
+            not say.
+        start_map: The map that the run began in; None for one that began without.
         epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
             without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
@@ -161,6 +190,8 @@ class RunRecord(Record):
     coverage: float = 0.0
     keyframes: int | None = None
     map_points: int | None = None
+    maps: int | None = None
+    start_map: StartMap | None = None
     epipolar_skipped: float | None = None
     mask_iou: float | None = None
     timings: dict[str, StageTime] = Field(default_factory=dict)
@@ -187,6 +218,14 @@ class RunRecord(Record):
     def failed(self) -> bool:
         """Whether it did not come to its end."""
         return self.status in FAILED
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings that were asked for; in place of a map's path the digest of its content, as ``map``."""
+        if self.start_map is None:
+            return dict(self.overrides)
+        named = {name: value for name, value in self.overrides.items() if name != "backend.map.file"}
+        return named | {"map": self.start_map.digest[:8]}
 
     @property
     def repeat(self) -> str:

@@ -65,7 +65,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "offset": record.offset,
         "noise": record.sequence.noise,
         "repeat": record.repeat,
-        "settings": ", ".join(f"{name}={value}" for name, value in record.overrides.items()),
+        "settings": ", ".join(f"{name}={value}" for name, value in record.asked.items()),
         "status": record.status,
         "ate_rmse_m": errors.get("ate_rmse_m"),
         "never_move_m": errors.get("never_move_ate_rmse_m"),

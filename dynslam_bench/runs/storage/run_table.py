@@ -16,7 +16,7 @@ _TEXT = (
     *("device", "segmentation", "protocol_id", "protocol_digest", "trajectory"),
 )
 _WHOLE = ("seed", "offset", "noise", "stride", "threads", "n_frames", "n_processed", "n_tracked", "n_lost")
-_MAP = ("keyframes", "map_points")
+_MAP = ("keyframes", "map_points", "maps")
 _NUMBERS = (
     *("coverage", "frame_ms", "real_time_factor", "finalize_s", "wall_s", "peak_memory_mb"),
     *("mask_iou", "epipolar_skipped"),
@@ -37,7 +37,7 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
           (``seed 0, offset 2``), status, reason (missing for ``ok``), device, segmentation (source of the masks),
           protocol_id, protocol_digest and trajectory (``online``, ``final``): what the errors hold under and are of.
         - ``Int64``: seed, offset, noise (missing for the sequence's own), stride, threads, n_frames, n_processed,
-          n_tracked, n_lost, keyframes, map_points.
+          n_tracked, n_lost, keyframes, map_points, maps.
         - ``Float64``: coverage (0 to 1), frame_ms (median, milliseconds, segmentation included, decoding excluded),
           real_time_factor, finalize_s and wall_s (seconds), peak_memory_mb (MB), mask_iou and epipolar_skipped (0 to
           1), and every metric under its own name with its unit (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``, see
@@ -64,7 +64,7 @@ def _line(record: RunRecord, scored: MetricRecord | None) -> dict[str, Any]:
         "tracker": record.tracker.id,
         "label": record.tracker.label or record.tracker.id,
         "provenance": record.tracker.provenance,
-        "settings": "; ".join(f"{name}={value}" for name, value in record.overrides.items()),
+        "settings": "; ".join(f"{name}={value}" for name, value in record.asked.items()),
         "sequence": record.sequence.id,
         "split": record.sequence.split,
         "noise": record.sequence.noise,

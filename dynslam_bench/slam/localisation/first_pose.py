@@ -30,6 +30,9 @@ Slots = NDArray[np.int64]
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
+MANY = 100
+MANY_SHARE = 0.75
+"""So many points that fit a place let this much of the share of what should be in view suffice (`docs/backend.md`)."""
 WIDE = 2.5
 """Factor on the search window where the narrow one gave no trusted pose."""
 
@@ -84,7 +87,8 @@ def first_pose(
     """A first pose, or None.
 
     The last frame's map points come first. Where they are few, what only its depth gives helps as well. A pose that few
-    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'.
+    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'. After a loss it
+    counts only if all around agrees.
 
     Args:
         world: The map.
@@ -99,32 +103,37 @@ def first_pose(
         if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
             best = matches, estimate
         if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
-            return _agreed(*best, before.reference, relocalised=False)
-    found = _from_keyframes(
-        world, islands, seen, before, settings, ENOUGH_FIRST // 2 if best is None else best[1].count + 1
-    )
-    if found is not None:
-        return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
-    return None if best is None else _agreed(*best, before.reference, relocalised=False)
+            return _agreed(*best, before.reference)
+    lost = before.lost_on is not None
+    least = ENOUGH_FIRST // 2 if best is None or lost else best[1].count + 1
+    found = _from_keyframes(world, islands, seen, before, settings, least)
+    if found is not None or best is None:
+        return found
+    if lost:
+        return _there(world, islands, seen, Relocalised(before.reference, *best), before, settings)
+    return _agreed(*best, before.reference)
 
 
-def _is_there(
+def _there(
     world: Map, islands: Islands, seen: Observations, found: Relocalised, before: Before, settings: BackendSettings
-) -> bool:
-    """Whether the camera can have got to a keyframe's place, and what was mapped around that is there.
+) -> FirstPose | None:
+    """The pose at a keyframe's place, if the camera can have got there, and what was mapped around that is there.
 
     A place may only have something in common with another.
     """
     there = int(world.kf_island[found.keyframe])
     last, now = (se3.inverse(pose)[:3, 3] for pose in (before.last.T_cam_world, found.estimate.T_cam_world))
     if before.lost_on is not None and not islands.within(before.lost_on, there, last, now, before.reach_m):
-        return False
+        return None
     matches = found.matches.select(found.estimate.inliers)
     place = recognise(world, found.keyframe, seen, matches, found.estimate.T_cam_world, settings.tracking)
-    return place.share >= settings.relocalisation.min_share
+    many = len(place.matches) >= MANY
+    if place.share < (MANY_SHARE if many else 1.0) * settings.relocalisation.min_share:
+        return None
+    return FirstPose(place.T_cam_world, place.matches, found.keyframe, relocalised=True)
 
 
-def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool) -> FirstPose:
+def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool = False) -> FirstPose:
     return FirstPose(estimate.T_cam_world, matches.select(estimate.inliers), keyframe, relocalised)
 
 
@@ -140,7 +149,7 @@ def _from_last_frame(world: Map, seen: Observations, before: Before, s: Tracking
 
 def _from_keyframes(
     world: Map, islands: Islands, seen: Observations, before: Before, settings: BackendSettings, least: int
-) -> Relocalised | None:
+) -> FirstPose | None:
     """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike."""
     s = settings.relocalisation
     rng = stream(before.seed, "relocalisation", before.frame)
@@ -149,6 +158,9 @@ def _from_keyframes(
         found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
         if found is None or found.estimate.count < least:
             continue
-        if not alike or _is_there(world, islands, seen, found, before, settings):
-            return found
+        if not alike:
+            return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
+        there = _there(world, islands, seen, found, before, settings)
+        if there is not None:
+            return there
     return None

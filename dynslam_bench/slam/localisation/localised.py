@@ -26,6 +26,7 @@ class Localised:
         keyframe: Whether the frame became a keyframe.
         map_points: Points in the map afterwards.
         keyframes: Keyframes in the map afterwards.
+        maps: Maps that they are of: beside the first one those that began after a loss and have not met it.
         timings: Seconds of ``tracking``, ``mapping`` and ``bundle_adjustment``.
     """
 
@@ -38,4 +39,5 @@ class Localised:
     keyframe: bool
     map_points: int
     keyframes: int
+    maps: int
     timings: Mapping[str, float]

@@ -34,6 +34,7 @@ class Observations:
         info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0 without depth.
         grid: Cells of the features.
         rgb: uint8 ``[N, 3]`` colour at the feature.
+        mask: bool ``[H, W]``, the pixels held for dynamic, behind which nothing of the map is seen; None without.
     """
 
     keypoints: Keypoints
@@ -47,6 +48,7 @@ class Observations:
     info_right: NDArray[np.float64]
     grid: CellGrid
     rgb: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -107,4 +109,5 @@ def observe(
         info_right,
         CellGrid.of(xy, camera.width, camera.height),
         frame.rgb[row, column],
+        frame.mask,
     )

@@ -23,8 +23,8 @@ SUDDEN = 100
 class Reach:
     """Bounds the way since the last tracked frame."""
 
-    def __init__(self) -> None:
-        self._sudden = False
+    def __init__(self, *, anywhere: bool = False) -> None:
+        self._sudden = anywhere
 
     def lost(self, last: Tracked, features: int, enough: int) -> None:
         """The first frame that is not tracked any more.

@@ -1,7 +1,8 @@
 """Whether a frame really shows the place of a keyframe: everything around has to agree, not a few features.
 
 A few dozen matches that fit a pose are found between places that only have something in common, such as the same
-shelf or poster. What was mapped around the keyframe and should be in view then is not there.
+shelf or poster. What was mapped around the keyframe and should be in view then is not there. What somebody stands in
+front of is not expected to be.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ AROUND = 10
 """Keyframes around a place whose points are looked for."""
 WIDEN = 2.0
 """Factor on the search windows: the first pose rests on few matches."""
+ROUNDS = 6
+"""So often, at most, the pose is fitted anew to what it let find: a small patch tells its surroundings alone well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,7 @@ class Recognised:
     Attributes:
         T_cam_world: World-to-camera pose by the points around the keyframe.
         matches: The matches with points that fit it.
-        share: How many of the keyframe's own points that should be in view are among them, of one.
+        share: How many of the keyframe's own points that should be in view, and behind nobody, are among them, of one.
     """
 
     T_cam_world: Array
@@ -43,7 +46,7 @@ class Recognised:
 def recognise(
     world: Map, keyframe: int, seen: Observations, first: Matches, T_cam_world: Array, settings: TrackingSettings
 ) -> Recognised:
-    """Look for all points around a keyframe, and fit the pose to them.
+    """Look for all points around a keyframe, and fit the pose to them, as long as that finds more.
 
     Args:
         world: The map.
@@ -53,15 +56,28 @@ def recognise(
         T_cam_world: That pose.
         settings: Radius and descriptor distances.
     """
-    estimate = solve(world, seen, first, T_cam_world)
-    more, _ = match_map(world, seen, estimate.T_cam_world, first, points_around(world, keyframe), settings, WIDEN)
-    joined = first.joined(more)
-    estimate = solve(world, seen, joined, estimate.T_cam_world)
-    fitting = joined.select(estimate.inliers)
+    estimate, fitting, points = solve(world, seen, first, T_cam_world), first, points_around(world, keyframe)
+    for _ in range(ROUNDS):
+        known = len(fitting)
+        more, _ = match_map(world, seen, estimate.T_cam_world, fitting, points, settings, WIDEN)
+        joined = fitting.joined(more)
+        estimate = solve(world, seen, joined, estimate.T_cam_world)
+        fitting = joined.select(estimate.inliers)
+        if len(fitting) <= known:
+            break
     own = world.kf_point[keyframe]
-    in_view, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
+    in_view, uv, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
+    if seen.mask is not None:
+        in_view = in_view[~_behind(seen.mask, uv)]
     share = float(np.isin(in_view, fitting.point).mean()) if len(in_view) else 0.0
     return Recognised(estimate.T_cam_world, fitting, share if np.isfinite(estimate.T_cam_world).all() else 0.0)
+
+
+def _behind(mask: NDArray[np.bool_], uv: Array) -> NDArray[np.bool_]:
+    """Which undistorted pixels ``[N, 2]`` lie on a mask; the distortion is less than what masks are dilated by."""
+    height, width = mask.shape
+    column, row = np.rint(uv).astype(np.int64).T
+    return np.asarray(mask[row.clip(0, height - 1), column.clip(0, width - 1)])
 
 
 def around(world: Map, keyframe: int) -> Slots:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,10 +29,18 @@ class Island:
 
 
 class Islands:
-    """All islands so far, by number (`Map.kf_island`)."""
+    """All islands so far, by number (`Map.kf_island`).
 
-    def __init__(self) -> None:
-        self._islands: dict[int, Island] = {}
+    Args:
+        known: Those of a loaded map, from number 1 on.
+    """
+
+    def __init__(self, known: Iterable[Island] = ()) -> None:
+        self._islands = dict(enumerate(known, 1))
+
+    def all(self) -> list[Island]:
+        """All of them in the order of their numbers."""
+        return [*self._islands.values()]
 
     def begin(self, left: int, start: Array, reach_m: float) -> int:
         """A new island begins where the camera was lost, as far as anybody knows.

@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
 
+TENDER = 3
+"""So many keyframes after its own a point may still go because it is seldom found."""
+
+
 class LocalMapper:
     """Adds keyframes to the map and keeps it clean and consistent.
 
@@ -36,7 +40,8 @@ class LocalMapper:
         """Points that the last `insert` replaced by others."""
         self.dropped: list[tuple[int, int, Array]] = []
         """Keyframes that the last `insert` removed: slot, heir's slot, and the pose ``T_dropped_heir``."""
-        self._young: Slots = np.zeros(0, np.int64)
+        points = world.points
+        self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < TENDER]
 
     @property
     def close_m(self) -> float:
@@ -124,7 +129,7 @@ class LocalMapper:
         lonely = (age >= 2) & (world.n_obs[young] < s.min_observations)
         bad = poor | lonely
         world.remove_points(young[bad])
-        self._young = young[~bad & (age < 3)]
+        self._young = young[~bad & (age < TENDER)]
 
     # ------------------------------------------------------------------ fusion
 

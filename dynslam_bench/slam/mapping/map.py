@@ -5,6 +5,9 @@ Keyframes and points live in numbered slots; a freed slot is used again, after t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -117,9 +120,19 @@ class Map:
         return slots[np.flatnonzero(self.kf_island[slots] == number)]
 
     @property
+    def descriptor_bytes(self) -> int:
+        """Length of the descriptors in the map."""
+        return 8 * self._words
+
+    @property
     def keyframe_count(self) -> int:
         """Number of keyframes."""
         return int(np.count_nonzero(self.kf_alive))
+
+    @property
+    def map_count(self) -> int:
+        """Number of maps that the keyframes are of; more than one where maps of their own never met the first."""
+        return len(set(self.kf_island[self.kf_alive].tolist()))
 
     def add_keyframe(self, seen: Observations, T_cam_world: Array, frame: int, stamp: float, island: int = 0) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
@@ -169,6 +182,16 @@ class Map:
     def T_world_cam(self, slot: int) -> Array:
         """A keyframe's camera-to-world pose."""
         return se3.inverse(self.kf_pose[slot])
+
+    def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
+        """Become the map of complete tables, in which every slot is in use; see `map_store`."""
+        for name in (*self._KEYFRAME_TABLES, *self._POINT_TABLES):
+            setattr(self, name, tables[name])
+        self._features, self._words = self.kf_words.shape[1:]
+        self._top = self.alive.size
+        self.next_keyframe, self.next_point = next_keyframe, next_point
+        for slot, pose in enumerate(self.kf_pose):
+            self.set_pose(slot, pose)
 
     def covisible(self, slot: int) -> tuple[Slots, Slots]:
         """Keyframes that observe points of this one, most shared points first, and how many they share."""

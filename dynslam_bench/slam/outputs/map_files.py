@@ -23,20 +23,24 @@ _LAYOUT = np.dtype(
 
 
 def write_keyframes_csv(path: Path, outputs: MapOutputs) -> None:
-    """Write ``keyframes.csv``: id, frame, timestamp (six decimals), tx ty tz, qx qy qz qw, features, observations.
+    """Write ``keyframes.csv``: the fields of `KeyframeRecord`, the pose as tx ty tz and qx qy qz qw.
+
+    The timestamp has six decimals; it and the frame are empty for keyframes of an earlier run, in whose map this one
+    began.
 
     Raises:
         DynslamError: The folder cannot be written.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["id", "frame", "timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "features", "observations"])
+    writer.writerow(
+        ["id", "frame", "timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "features", "observations", "map"]
+    )
     for record in outputs.keyframes:
         translation, quaternion = se3.to_quaternion(record.T_world_cam)
         numbers = [f"{value:.9f}" for value in (*translation, *quaternion)]
-        writer.writerow(
-            [record.id, record.frame, f"{record.timestamp:.6f}", *numbers, record.features, record.observations]
-        )
+        when = [record.frame, f"{record.timestamp:.6f}"] if record.frame >= 0 else ["", ""]
+        writer.writerow([record.id, *when, *numbers, record.features, record.observations, record.map])
     write_atomic(path, text.getvalue())
 
 

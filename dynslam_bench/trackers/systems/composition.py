@@ -50,6 +50,10 @@ class SystemSettings(Settings):
     backend: BackendSettings = BackendSettings()
     guard: GuardSettings = GuardSettings()
 
+    def verify(self) -> None:
+        """A map that is named is there."""
+        self.backend.map.verify()
+
 
 class SemanticSystemSettings(SystemSettings):
     """A system that uses masks or boxes; one whose own default is the source ``none`` does without."""
@@ -58,6 +62,7 @@ class SemanticSystemSettings(SystemSettings):
 
     def verify(self) -> None:
         """A system that lives on masks does not quietly become another one without them."""
+        super().verify()
         default: SegmentationSettings = type(self).model_fields["segmentation"].get_default(call_default_factory=True)
         if self.segmentation.source == "none" != default.source:
             raise SettingsError(
@@ -109,7 +114,8 @@ def compose(
         segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
         if segmenter is not None:
             cached["segmentation"] = segmenter
-    backend = build_backend(settings.backend, settings.features.scale_factor, settings.features.levels)
+    features = settings.features
+    backend = build_backend(settings.backend, features.scale_factor, features.levels, features.extractor)
     return SlamPipeline(
         extractor=extractor,
         masks=masks,

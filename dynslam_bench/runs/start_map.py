@@ -1,0 +1,44 @@
+"""The map that a run begins in, looked up before anything runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.mapping.saved_map import MapFeatures, Sensors, read_map
+from dynslam_bench.slam.settings import BackendSettings
+
+from .storage.record import StartMap
+
+MAP_SETTING = "backend.map.file"
+
+
+def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:
+    """The map that settings name; None where they name none.
+
+    Args:
+        settings: A tracker's complete settings.
+        camera: Of the sequence, as the tracker sees it.
+        sensors: Of the tracker.
+        digests: Of the files that the settings name, by the setting's name.
+
+    Raises:
+        SettingsError: The file is no map, or one of another camera, other features or another sensor.
+    """
+    backend, features = getattr(settings, "backend", None), getattr(settings, "features", None)
+    if not isinstance(backend, BackendSettings) or not isinstance(features, FeatureSettings) or not backend.map.file:
+        return None
+    path = Path(backend.map.file).expanduser()
+    saved = read_map(path)
+    made_of = MapFeatures(extractor=features.extractor, levels=features.levels, scale_factor=features.scale_factor)
+    saved.check(camera, made_of, sensors, str(path))
+    return StartMap(
+        digest=digests[MAP_SETTING],
+        file=str(path),
+        made_by=saved.header.made_by,
+        keyframes=len(saved.arrays["kf_id"]),
+        points=len(saved.arrays["id"]),
+        localisation_only=backend.map.localisation_only,
+    )

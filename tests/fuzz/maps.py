@@ -1,0 +1,83 @@
+"""The reader of maps."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.mapping import map_store, saved_map, saved_map_faults
+from dynslam_bench.slam.mapping.saved_map import HEADER, MapFeatures, MapHeader, described
+
+from .records import rezipped
+from .target import Target, at
+
+CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
+FEATURES = MapFeatures(extractor="orb", levels=8, scale_factor=1.2)
+
+
+def _sound() -> dict[str, Any]:
+    """Two keyframes of three and two features, two points that both see, an island."""
+    header = MapHeader(
+        sensors="rgbd", camera=described(CAMERA), features=FEATURES, next_keyframe=4, next_point=9, made_by="nobody"
+    )
+    return {
+        HEADER: np.frombuffer(header.to_json().encode(), np.uint8),
+        "kf_id": np.array([0, 2]), "kf_island": np.array([0, 1]), "kf_pose": np.tile(np.eye(4), (2, 1, 1)),
+        "kf_count": np.array([3, 2]), "kf_raw": np.full((5, 2), 4.0, np.float32), "kf_response": np.ones(5, np.float32),
+        "kf_xy": np.full((5, 2), 4.0), "kf_right": np.array([1.0, np.nan, 1.0, 1.0, 1.0]),
+        "kf_z": np.array([1, 0, 1, 1, 1], np.float32), "kf_octave": np.array([0, 1, 2, 7, 0], np.int8),
+        "kf_angle": np.zeros(5, np.float32), "kf_info": np.ones(5), "kf_info_right": np.ones(5),
+        "kf_words": np.zeros((5, 4), np.uint64), "kf_point": np.array([1, -1, 0, 0, 1], np.int32),
+        "id": np.array([3, 8]), "position": np.array([[0.0, 0, 1], [0.1, 0, 1]]), "normal": np.eye(3)[[2, 2]],
+        "far": np.ones(2), "words": np.zeros((2, 4), np.uint64), "rgb": np.zeros((2, 3), np.uint8),
+        "visible": np.ones(2, np.int32), "found": np.ones(2, np.int32), "born": np.array([0, 1]),
+        "n_obs": np.array([2, 2], np.int32), "obs_kf": np.array([0, 1, 0, 1], np.int32),
+        "obs_ft": np.array([2, 0, 0, 1], np.int32), "island_start": np.zeros((1, 3)),
+        "island_anchor": np.zeros((1, 3)), "island_reach": np.array([np.inf]),
+    }  # fmt: skip
+
+
+def _seeds() -> list[bytes]:
+    """A sound map, and one for every kind of fault."""
+    sound = _sound()
+    far = {"kf_count": np.array([2**60, 2]), "kf_right": np.ones(5), "kf_pose": 2 * np.ones((2, 4, 4))}
+    odd: list[dict[str, Any]] = [{}, *({name: value} for name, value in far.items())]
+    odd += [{"far": np.zeros(2)}, {"id": np.array([3, 3])}, {"kf_id": np.array([0, 9])}, {"rgb": np.zeros((2, 4))}]
+    odd += [{"obs_ft": np.array([2, 2, 0, 1], np.int32)}, {"obs_ft": np.array([2, 1, 0, 0], np.int32)}]
+    odd += [{"n_obs": np.array([1, 1], np.int32)}, {"kf_point": np.array([1, 1, 0, 0, 1], np.int32)}]
+    odd += [{"visible": np.zeros(2, np.int32)}, {"position": np.full((2, 3), np.nan)}, {"more": np.zeros(1)}]
+    odd += [{HEADER: np.array([255], np.uint8)}, {HEADER: np.frombuffer(b"{}", np.uint8)}]
+    nothing = {name: value[:0] for name, value in sound.items() if name != HEADER}
+    return [_npz(sound | each) for each in (*odd, nothing)] + [_npz({"header ": np.zeros(1)})]
+
+
+def _npz(arrays: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _read(data: bytes | None, folder: Path) -> None:
+    """What is read is worked on as a run does, whose compiled loops check no index."""
+    world, islands = map_store.begin(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    world.refresh(world.points)
+    for slot in world.keyframes.tolist():
+        world.covisible(slot)
+        world.project(world.kf_pose[slot], world.points)
+    map_store.packed(world, islands)
+    world.remove_keyframe(int(world.keyframes[0]))
+
+
+TARGETS = [
+    Target(
+        "map of a run",
+        _read,
+        _seeds,
+        (saved_map.read_map, saved_map_faults, map_store.restored, map_store._table, map_store._islands),
+        rezipped,
+    )
+]

@@ -1,0 +1,60 @@
+"""Whether a place is there: what a small patch of it tells, and what people hide of it."""
+
+from dataclasses import replace
+
+import numpy as np
+from point_world import PointWorld, track_all
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.localisation.observation import observe
+from dynslam_bench.slam.localisation.recognition import recognise
+from dynslam_bench.slam.localisation.relocalisation import match_keyframe
+from dynslam_bench.slam.settings import TrackingSettings
+
+FIRST = np.eye(4)
+
+
+def mapped():
+    """A room, and the map of its first view."""
+    room, backend = PointWorld(), RgbdBackend()
+    backend.reset(room.camera, 0)
+    track_all(backend, [room.see(FIRST, 0, depthless=0.0)])
+    return room, backend
+
+
+def seen_in(backend, frame, keep):
+    """The features of a frame that are kept, as the back end uses them."""
+    return observe(
+        frame, keep, np.ones(len(frame), np.float32), backend.camera, 1.2 ** np.arange(8.0), TrackingSettings()
+    )
+
+
+def recognised(backend, seen, patch, T_cam_world):
+    """The place, begun from matches with features in a part of the image and from a pose."""
+    every = match_keyframe(backend.world, 0, seen, 60)
+    few = every.select(patch(seen.xy[every.feature]))
+    assert 8 <= len(few) < len(every) / 4
+    return recognise(backend.world, 0, seen, few, T_cam_world, TrackingSettings())
+
+
+def test_a_pose_grows_from_the_patch_that_tells_it():
+    room, backend = mapped()
+    pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
+    frame = room.see(pose, 1, noise_px=1.5)
+    seen = seen_in(backend, frame, np.ones(len(frame), bool))
+    place = recognised(backend, seen, lambda xy: np.abs(xy - 120).max(axis=1) < 70, se3.inverse(pose))
+    assert place.share > 0.7 and len(place.matches) > 150
+    assert np.linalg.norm(se3.inverse(place.T_cam_world)[:3, 3] - pose[:3, 3]) < 0.03
+
+
+def test_what_people_hide_is_not_expected_to_be_seen():
+    room, backend = mapped()
+    frame = room.see(FIRST, 1)
+    mask = np.zeros((480, 640), bool)
+    mask[:, 220:] = True
+    outside = frame.xy[:, 0] < 219
+    patch = lambda xy: (xy[:, 0] < 120) & (xy[:, 1] < 160)  # noqa: E731
+    without = recognised(backend, seen_in(backend, frame, outside), patch, FIRST)
+    behind = recognised(backend, seen_in(backend, replace(frame, mask=mask), outside), patch, FIRST)
+    assert without.share < 0.4 < 0.8 < behind.share and len(behind.matches) == len(without.matches)
