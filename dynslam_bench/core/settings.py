@@ -15,13 +15,13 @@ Example:
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -44,9 +44,9 @@ class Settings(BaseModel):
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Refuse a class with a default that lies outside its own range: studies and actions could not name it."""
-        for name, field in _leaves(cls):
+        for name, field, default in _leaves(cls):
             if _annotation(field) is not None:
-                _check_default(cls, _describe(name, field))
+                _check_default(cls, _describe(name, field, default))
 
     @property
     def idle(self) -> str:
@@ -162,7 +162,7 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
     A field of type `Path` counts as a file, too.
     """
     found = {}
-    for name, field in _leaves(type(settings)):
+    for name, field, _ in _leaves(type(settings)):
         extra = field.json_schema_extra
         note = extra.get(_NAMES) if isinstance(extra, dict) else None
         value = value_of(settings, name)
@@ -230,25 +230,29 @@ def flatten(settings: Settings) -> dict[str, Any]:
 
 def field_names(cls: type[Settings]) -> list[str]:
     """Dotted names of every leaf field, tunable or not, in order of definition."""
-    return [name for name, _ in _leaves(cls)]
+    return [name for name, _, _ in _leaves(cls)]
 
 
 def parameters(cls: type[Settings], *, online_only: bool = False) -> list[Parameter]:
     """The tunable fields of a settings class, in order of definition."""
-    found = [_describe(name, field) for name, field in _leaves(cls) if _annotation(field) is not None]
-    return [parameter for parameter in found if parameter.online or not online_only]
+    return [parameter for parameter in _parameters(cls) if parameter.online or not online_only]
+
+
+@cache
+def _parameters(cls: type[Settings]) -> tuple[Parameter, ...]:
+    return tuple(_describe(*leaf) for leaf in _leaves(cls) if _annotation(leaf[1]) is not None)
 
 
 def settings_table(cls: type[Settings]) -> str:
     """Markdown table of every leaf field: name, default, range, unit, online, meaning."""
     described = {parameter.name: parameter for parameter in parameters(cls)}
     rows = ["| setting | default | range | unit | online | meaning |", "| --- | --- | --- | --- | --- | --- |"]
-    for name, field in _leaves(cls):
+    for name, field, default in _leaves(cls):
         p = described.get(name)
         span = "" if p is None else _span(p)
-        default = json.dumps(field.get_default(call_default_factory=True), default=str)
+        given = json.dumps(default, default=str)
         rows.append(
-            f"| `{name}` | `{default}` | {span} | {p.unit if p else ''} | {'yes' if p and p.online else ''} "
+            f"| `{name}` | `{given}` | {span} | {p.unit if p else ''} | {'yes' if p and p.online else ''} "
             f"| {field.description or ''} |"
         )
     return "\n".join(rows) + "\n"
@@ -262,21 +266,22 @@ def _span(p: Parameter) -> str:
     return f"{p.low:g} to {p.high:g}{' (log)' if p.scale == 'log' else ''}"
 
 
-def _leaves(cls: type[Settings], prefix: str = "", defaults: Settings | None = None) -> Iterable[tuple[str, FieldInfo]]:
-    """Leaf fields by dotted name; the defaults are those of `cls`, also where it gives a group other ones."""
+def _leaves(
+    cls: type[Settings], prefix: str = "", defaults: Settings | None = None
+) -> Iterator[tuple[str, FieldInfo, Any]]:
+    """Leaf fields: dotted name, field, and the default in `cls`, also where it gives a group other ones."""
     for key, field in cls.model_fields.items():
         nested = _nested(field)
-        given = getattr(defaults, key) if defaults is not None else field.get_default(call_default_factory=True)
+        default = getattr(defaults, key) if defaults is not None else _default(field)
         if nested is not None:
-            yield from _leaves(nested, f"{prefix}{key}.", given if isinstance(given, Settings) else None)
+            yield from _leaves(nested, f"{prefix}{key}.", default if isinstance(default, Settings) else None)
         else:
-            yield f"{prefix}{key}", field if defaults is None else _with_default(field, given)
+            yield f"{prefix}{key}", field, default
 
 
-def _with_default(field: FieldInfo, default: Any) -> FieldInfo:
-    changed = copy.copy(field)
-    changed.default, changed.default_factory = default, None
-    return changed
+def _default(field: FieldInfo) -> Any:
+    """A field's default; pydantic's own way to ask copies whole groups, which cannot change."""
+    return field.default if isinstance(field.default, Settings) else field.get_default(call_default_factory=True)
 
 
 def _check_default(cls: type[Settings], p: Parameter) -> None:
@@ -301,14 +306,14 @@ def _annotation(field: FieldInfo) -> dict[str, Any] | None:
     return typing.cast("dict[str, Any]", extra[_KEY]) if isinstance(extra, dict) and _KEY in extra else None
 
 
-def _describe(name: str, field: FieldInfo) -> Parameter:
+def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
     note = _annotation(field)
     assert note is not None
     prefix = name.rpartition(".")[0]
     when = tuple((f"{prefix}.{key}" if prefix else key, tuple(values)) for key, values in note["when"].items())
     common: dict[str, Any] = {
         "name": name,
-        "default": field.default,
+        "default": default,
         "unit": note["unit"],
         "online": note["online"],
         "meaning": field.description or "",

@@ -14,10 +14,9 @@ _SYSTEMS = (
     "huai_slam", "mask_rcnn", "mor_slam", "ngd_slam", "opf_slam", "orb_slam2", "orb_slam2_mono", "seg_slam", "sgc_slam",
     "sof_slam", "yolo_slam",
 )  # fmt: skip
-"""Modules of ``systems/`` with one spec each."""
+_SINGLE = [import_module(f".systems.{name}", __package__).SPEC for name in _SYSTEMS]
 
 
 def all_specs() -> list[TrackerSpec]:
     """Every built-in tracker's spec."""
-    single = [import_module(f".systems.{name}", __package__).SPEC for name in _SYSTEMS]
-    return [*emfoa_oft.SPECS, emfoa_oft_mono.SPEC, *dynaslam.SPECS, *chen_slam.SPECS, *single, *adapter_specs()]
+    return [*emfoa_oft.SPECS, emfoa_oft_mono.SPEC, *dynaslam.SPECS, *chen_slam.SPECS, *_SINGLE, *adapter_specs()]

@@ -281,9 +281,10 @@ def test_degradation(cli, walk):
 STUDY = """
 name = "tiny"
 tracker = "orb-slam2"
-tune = ["synthetic/sitting_xyz@1?frames=12"]
-held_out = ["synthetic/sitting_xyz@101?frames=12"]
+tune = ["synthetic/sitting_xyz@1?frames=8"]
+held_out = ["synthetic/sitting_xyz@101?frames=8"]
 seeds = [0]
+offsets = [0]
 trials = 2
 top = 1
 [space]
@@ -302,7 +303,7 @@ def test_a_study(cli, tmp_path):
     assert json.loads(cli("tune", "status", "study.toml", "--json")[1])["complete"] == 2
     assert "has its 2 trials" in cli("tune", "worker", "study.toml")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
-    code, out, _ = cli("run", "orb-slam2", "synthetic/sitting_xyz@1?frames=12", "--settings", "preset.toml", "--json")
+    code, out, _ = cli("run", "orb-slam2", "synthetic/sitting_xyz@1?frames=8", "--settings", "preset.toml", "--json")
     assert code == 0 and json.loads(out)[0]["status"] == "ok"
     assert cli("tune", "report", "study.toml")[1].splitlines()[0] == found["summary"]["conclusion"]
     Path("study.toml").write_text(STUDY.replace("n_features", "n_featurs"))

@@ -34,15 +34,37 @@ def sources() -> list[Path]:
     return [file for room in ROOMS for file in sorted((ROOT / room).rglob("*.py"))]
 
 
+@dataclass(frozen=True)
+class Source:
+    """What a Python file names: in its docstrings, and by its identifiers and other texts."""
+
+    docstrings: tuple[tuple[int, str], ...]
+    names: frozenset[str]
+    texts: frozenset[str]
+
+
+@cache
+def read(file: Path) -> Source:
+    """A file's docstrings with their lines, its names and the words of its texts, and those texts."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    docstrings = {id(node): (node.lineno, str(node.value)) for node in _docstrings(nodes)}
+    texts = {
+        node.value
+        for node in nodes
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
+    }
+    names = {name for node in nodes for name in _names_of(node)}
+    words = {word for text in texts for word in (text, *re.findall(r"[A-Za-z0-9_][A-Za-z0-9_-]*", text))}
+    return Source(tuple(docstrings.values()), frozenset(names | words), frozenset(texts))
+
+
 @cache
 def words() -> frozenset[str]:
     """Every identifier of the code, and every word of its string constants that are no docstrings."""
     found: set[str] = set()
     for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]:
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        texts = {id(node) for node in _docstrings(tree)}
-        for node in ast.walk(tree):
-            found.update(_names_of(node, texts))
+        found.update(read(file).names)
         found.add(file.stem)
         found.update(file.parent.relative_to(ROOT).parts)
     data = [file for room in ROOMS for kind in ("toml", "csv") for file in (ROOT / room).rglob(f"*.{kind}")]
@@ -51,7 +73,7 @@ def words() -> frozenset[str]:
     return frozenset(found)
 
 
-def _names_of(node: ast.AST, docstrings: set[int]) -> Iterator[str]:
+def _names_of(node: ast.AST) -> Iterator[str]:
     match node:
         case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name):
             yield name
@@ -62,14 +84,11 @@ def _names_of(node: ast.AST, docstrings: set[int]) -> Iterator[str]:
         case ast.Import(names=names) | ast.ImportFrom(names=names):
             for alias in names:
                 yield from (alias.asname or alias.name).split(".")
-        case ast.Constant(value=str(text)) if id(node) not in docstrings:
-            yield text
-            yield from re.findall(r"[A-Za-z0-9_][A-Za-z0-9_-]*", text)
 
 
-def _docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
+def _docstrings(nodes: list[ast.AST]) -> Iterator[ast.Constant]:
     """The docstrings of a module: of itself, its classes and functions, and those below assignments."""
-    for node in ast.walk(tree):
+    for node in nodes:
         for statement in getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []:
             if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
                 if isinstance(statement.value.value, str):
@@ -82,12 +101,7 @@ def file_names() -> frozenset[str]:
     tracked = [*ROOT.glob("*"), *PAGES, *sources(), *(ROOT / "tests").rglob("*"), *(ROOT / ".ci").rglob("*")]
     found = {file.name for file in tracked}
     for file in sources():
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        texts = {id(node) for node in _docstrings(tree)}
-        constants = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in texts)
-        found.update(
-            re.split(r"[/\s]", node.value)[-1] for node in constants if isinstance(node.value, str) and node.value
-        )
+        found.update(re.split(r"[/\s]", text)[-1] for text in read(file).texts if text)
     data = [file for room in ROOMS for file in (ROOT / room).rglob("*.*") if file.suffix not in (".py", ".pyc")]
     return frozenset(found | {file.name for file in data})
 
@@ -104,9 +118,9 @@ def in_pages() -> Iterator[Mention]:
 def in_docstrings() -> Iterator[Mention]:
     """Single and double backticks of all docstrings of the package."""
     for file in sources():
-        for node in _docstrings(ast.parse(file.read_text(encoding="utf-8"))):
-            for found in re.finditer(r"(`+)([^`\n]+)\1", str(node.value)):
-                yield Mention(f"{file.relative_to(ROOT)}:{node.lineno}", found.group(2))
+        for line, text in read(file).docstrings:
+            for found in re.finditer(r"(`+)([^`\n]+)\1", text):
+                yield Mention(f"{file.relative_to(ROOT)}:{line}", found.group(2))
 
 
 def links() -> Iterator[Mention]:

@@ -26,7 +26,6 @@ from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.testing.pytest_plugin import OPTIONS as CHECKED_KINDS
 from dynslam_bench.trackers import TRACKERS
 
-MENTIONS = [*in_pages(), *in_docstrings()]
 OF_USERS = ("results/", "path/", "~/", "videos/")
 """How paths begin that are made by runs or by the reader."""
 FOREIGN = {
@@ -61,6 +60,12 @@ POSE = re.compile(r"[TR]_[a-z]+_[a-z]+")
 
 
 @cache
+def mentions() -> list[Mention]:
+    """Of all pages and docstrings; read when a test asks, not by every process that collects."""
+    return [*in_pages(), *in_docstrings()]
+
+
+@cache
 def setting_names() -> frozenset[str]:
     """Dotted names of all settings of all trackers, and of every group of them."""
     names = {name for found in TRACKERS.all() for name in field_names(found.spec.settings)}
@@ -80,20 +85,20 @@ def options() -> frozenset[str]:
     return frozenset(found.union(*(re.findall(r'"(--[a-z-]+)"', file.read_text()) for file in scripts.glob("*.py"))))
 
 
-def missing(mentions: list[Mention], known: object) -> list[str]:
-    assert mentions, "nothing was looked at"
-    return sorted({f"{mention.where}: {mention.text}" for mention in mentions if not known(mention.text)})  # type: ignore[operator]
+def missing(named: list[Mention], known: object) -> list[str]:
+    assert named, "nothing was looked at"
+    return sorted({f"{mention.where}: {mention.text}" for mention in named if not known(mention.text)})  # type: ignore[operator]
 
 
 def test_files_and_folders_exist() -> None:
     path = re.compile(r"(?:[\w.-]+/)+(?:[\w.-]+\.(?:py|toml|md|jsonl))?")
-    named = [m for m in MENTIONS if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
+    named = [m for m in mentions() if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
     assert not missing(named, lambda text: exists(text) or (text.endswith("/") and text.strip("/") in words()))
 
 
 def test_bare_file_names_exist() -> None:
     name = re.compile(rf"[\w-]*[A-Za-z_][\w-]*(?:\.[\w-]+)*\.{SUFFIXES}")
-    named = [m for m in MENTIONS if name.fullmatch(m.text)]
+    named = [m for m in mentions() if name.fullmatch(m.text)]
     assert len(named) > 100
     known = file_names() | set(FOREIGN_FILES)
     assert not missing(named, known.__contains__)
@@ -106,7 +111,7 @@ def test_links_lead_somewhere() -> None:
 
 
 def test_scripts_in_commands_exist() -> None:
-    named = [Mention(m.where, s) for m in MENTIONS for s in re.findall(r"python (tests/[\w/]+\.py)", m.text)]
+    named = [Mention(m.where, s) for m in mentions() for s in re.findall(r"python (tests/[\w/]+\.py)", m.text)]
     assert not missing(named, exists)
 
 
@@ -115,7 +120,7 @@ def test_settings_exist() -> None:
     dotted = re.compile(r"([a-z_]+(?:\.[a-z0-9_]+)+)(?: ?=.*)?")
     named = [
         Mention(m.where, found.group(1))
-        for m in MENTIONS
+        for m in mentions()
         if (found := dotted.fullmatch(m.text))
         and found.group(1).partition(".")[0] in groups
         and not re.search(rf"\.{SUFFIXES}$", found.group(1))
@@ -129,13 +134,13 @@ def _is_symbol(text: str) -> bool:
 
 def test_identifiers_exist() -> None:
     identifier = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?:\(\))?")
-    named = [Mention(m.where, found.group(1)) for m in MENTIONS if (found := identifier.fullmatch(m.text))]
+    named = [Mention(m.where, found.group(1)) for m in mentions() if (found := identifier.fullmatch(m.text))]
     assert not missing(named, lambda text: text in words() | FOREIGN or POSE.fullmatch(text) is not None)
 
 
 def test_dotted_symbols_exist() -> None:
     dotted = re.compile(r"[A-Za-z_][\w]*(?:\.[A-Za-z_]\w*)+(?:\(.*\))?")
-    named = [m for m in MENTIONS if dotted.fullmatch(m.text)]
+    named = [m for m in mentions() if dotted.fullmatch(m.text)]
     assert not missing(named, lambda text: _is_known(IDENTIFIER.findall(text.partition("(")[0])))
 
 
@@ -144,13 +149,14 @@ def _is_known(parts: list[str]) -> bool:
 
 
 def test_options_exist() -> None:
-    named = [Mention(m.where, option) for m in MENTIONS for option in re.findall(r"(?<![\w-])--[a-z][a-z_-]*", m.text)]
+    option = re.compile(r"(?<![\w-])--[a-z][a-z_-]*")
+    named = [Mention(m.where, found) for m in mentions() for found in option.findall(m.text)]
     assert not missing(named, lambda text: text in options())
 
 
 def test_hyphenated_ids_exist() -> None:
     hyphenated = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+")
-    named = [m for m in MENTIONS if hyphenated.fullmatch(m.text)]
+    named = [m for m in mentions() if hyphenated.fullmatch(m.text)]
     assert not missing(
         named, lambda text: text in words() or text in {found.spec.id for found in TRACKERS.all()} or text in PROTOCOLS
     )

@@ -1,5 +1,6 @@
 """Agreement with evo to 1e-9 under equal association, alignment and pair selection."""
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,9 @@ def to_evo(trajectory):
     return PoseTrajectory3D(poses_se3=list(trajectory.T_world_cam), timestamps=trajectory.timestamps.copy())
 
 
+@lru_cache(maxsize=128)
 def evo_pair(estimate, truth, alignment, max_dt):
+    """What evo compares, associated and aligned; its metrics only read it."""
     reference, estimated = sync.associate_trajectories(to_evo(truth), to_evo(estimate), max_diff=max_dt)
     if alignment == "origin":
         estimated.align_origin(reference)

@@ -84,7 +84,6 @@ def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:
 
 
 def test_any_executor(tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for one run in the worker
     here = run_many(specs(toy_folder, range(2)), results=tmp_path / "here")
     executors = [
         ThreadPoolExecutor(2),

@@ -290,8 +290,8 @@ def test_video(store: RunStore, toy_folder: str) -> None:
     assert data.startswith(b"\x1aE\xdf\xa3") and b"V_VP9" in data[:1000]  # Matroska's head, and a codec of browsers
 
 
-def test_sheet(store: RunStore, tmp_path: Path) -> None:
-    spec = RunSpec(tracker="orb-slam2", sequence="synthetic/sitting_xyz?frames=12", sheet=True, data_root=str(tmp_path))
+def test_sheet(store: RunStore) -> None:
+    spec = RunSpec(tracker="orb-slam2", sequence="synthetic/sitting_xyz?frames=12", sheet=True)
     folder = store.folder(run_one(spec, store).run_id)
     picture = cv2.imread(str(folder / "sheet.png"))
     assert picture.shape == (856, 1488, 3)
@@ -301,14 +301,13 @@ def test_sheet(store: RunStore, tmp_path: Path) -> None:
     assert all(panel.std() > 4 for panel in panels), "each panel shows something"
 
 
-def test_the_same_bits_on_one_thread_and_on_two(store: RunStore, tmp_path: Path) -> None:
+def test_the_same_bits_on_one_thread_and_on_two(store: RunStore) -> None:
     """Features, flow, culling, tracking and mapping; the networks that make masks are not part of it."""
     folders = []
     for threads in (1, 2):
         spec = RunSpec(
             tracker="emfoa-oft",
-            sequence="synthetic/walking_xyz?frames=12",
-            data_root=str(tmp_path),
+            sequence="synthetic/walking_xyz?frames=9",
             seed=3,
             settings={"segmentation.source": "oracle"},
             threads=threads,

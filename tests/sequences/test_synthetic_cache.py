@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,16 +23,22 @@ from dynslam_bench.sequences.synthetic.scenes.scene import Scene
 from dynslam_bench.sequences.synthetic.settings import RenderSettings
 
 HASHER = """
-import hashlib, sys
-from dynslam_bench.sequences.synthetic import open_synthetic
-sequence = open_synthetic(sys.argv[1], None, threads=int(sys.argv[2]))
-total = hashlib.sha256()
-for index in map(int, sys.argv[3:]):
-    frame = sequence[index]
-    for part in (frame.rgb, frame.depth, sequence.masks[index].instances, sequence.flow(index, max(index - 1, 0))):
-        total.update(part.tobytes())
-print(total.hexdigest())
+import sys
+from test_synthetic_cache import pixels_hash
+print(pixels_hash(sys.argv[1], int(sys.argv[2])))
 """
+DAMAGES = ("cut", "flip", "empty", "other", "gone")
+
+
+def pixels_hash(name: str, threads: int) -> str:
+    """Of everything that two frames of a sequence hold."""
+    sequence = open_synthetic(name, None, threads=threads)
+    total = hashlib.sha256()
+    for index in (0, 77):
+        frame = sequence[index]
+        for part in (frame.rgb, frame.depth, sequence.masks[index].instances, sequence.flow(index, max(index - 1, 0))):
+            total.update(part.tobytes())
+    return total.hexdigest()
 
 
 def frame_hash(frame) -> str:
@@ -39,16 +46,17 @@ def frame_hash(frame) -> str:
 
 
 def in_child(code: str, *arguments: object) -> str:
-    root = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    here = Path(__file__).resolve()
+    paths = (str(here.parents[2]), str(here.parent), os.environ.get("PYTHONPATH", ""))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.strip()
 
 
 def test_pixels_are_the_same_across_processes_and_threads() -> None:
-    hashes = {in_child(HASHER, "synthetic/walking_halfsphere@3", threads, 0, 77) for threads in (1, 3)}
-    assert len(hashes) == 1
-    assert in_child(HASHER, "synthetic/walking_halfsphere@4", 1, 0, 77) not in hashes
+    here = pixels_hash("synthetic/walking_halfsphere@3", 1)
+    assert in_child(HASHER, "synthetic/walking_halfsphere@3", 3) == here
+    assert pixels_hash("synthetic/walking_halfsphere@4", 1) != here
 
 
 def test_the_first_read_is_what_later_reads_give(tmp_path: Path) -> None:
@@ -111,24 +119,39 @@ def test_rendering_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert raw.dtype == np.uint16
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "empty", "other", "gone"])
-@pytest.mark.parametrize("kind", ["rgb", "depth", "masks"])
-def test_damaged_files_are_rendered_again(tmp_path: Path, kind: str, damage: str) -> None:
-    sequence = open_synthetic("synthetic/walking_static?frames=2", tmp_path, threads=1)
-    frame, masks = sequence[1], sequence.masks[1]
-    path = sequence.store.path(kind, float(sequence.timestamps[1]))
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache with a frame for each kind of damage."""
+    root = tmp_path_factory.mktemp("rendered")
+    open_synthetic(f"synthetic/walking_static?frames={len(DAMAGES)}", root, threads=1).render()
+    return root
+
+
+def spoil(path: Path, damage: str) -> None:
     data = bytearray(path.read_bytes())
     if damage == "gone":
         path.unlink()
-    else:
-        data[len(data) // 2] ^= 0x10
-        changed = {"cut": data[: len(data) // 2], "empty": b"", "other": encode_png(np.zeros((4, 4), np.uint8))}
-        path.write_bytes(bytes(changed.get(damage, data)))
-    fresh = open_synthetic("synthetic/walking_static?frames=2", tmp_path, threads=1)
-    assert frame_hash(fresh[1]) == frame_hash(frame)
-    assert np.array_equal(fresh.masks[1].instances, masks.instances)
-    assert fresh.render() <= 2
-    assert is_intact_png(path.read_bytes())
+        return
+    data[len(data) // 2] ^= 0x10
+    changed = {"cut": data[: len(data) // 2], "empty": b"", "other": encode_png(np.zeros((4, 4), np.uint8))}
+    path.write_bytes(bytes(changed.get(damage, data)))
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth", "masks"])
+def test_damaged_files_are_rendered_again(tmp_path: Path, rendered: Path, kind: str) -> None:
+    root = shutil.copytree(rendered, tmp_path / "cache")
+    before, after = (
+        open_synthetic(f"synthetic/walking_static?frames={len(DAMAGES)}", each, threads=1) for each in (rendered, root)
+    )
+    paths = [after.store.path(kind, float(stamp)) for stamp in after.timestamps]
+    for path, damage in zip(paths, DAMAGES, strict=True):
+        spoil(path, damage)
+    for index, damage in enumerate(DAMAGES):
+        assert frame_hash(after[index]) == frame_hash(before[index]), damage
+        assert np.array_equal(after.masks[index].instances, before.masks[index].instances), damage
+    assert "renderer" not in vars(before), "what it is compared with was rendered before the damage"
+    assert after.render() == (len(DAMAGES) if kind == "masks" else 0), "masks by themselves are not stored"
+    assert all(is_intact_png(path.read_bytes()) for path in paths)
 
 
 def test_the_cache_is_a_folder_in_tum_layout(tmp_path: Path) -> None:

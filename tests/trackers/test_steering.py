@@ -21,7 +21,7 @@ from dynslam_bench.trackers.specs import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 
 SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
-SHORT = 8
+SHORT = 6
 """Frames of the episodes in which all settings of a tracker are steered at once."""
 AFTER = 3
 """Frames that an episode goes on for after the first on which a setting has shown."""

@@ -35,6 +35,7 @@ PRELOADED = (
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
     *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.build_flow"),
     *("dynslam_bench.segmentation.masks.schedule", "dynslam_bench.runs.process.keeper"),
+    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.specs"),
 )
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""

@@ -24,7 +24,7 @@ from dynslam_bench.trackers.measured import epipolar_skipped
 from dynslam_bench.trackers.specs import all_specs
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
 
-FRAMES = 9
+FRAMES = 6
 SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)]
 IDENTITY = {"orb-slam2-mono", "orb-slam2"}
 SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
