@@ -195,9 +195,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             TrackerError: The tracker cannot save its map, or has none.
             DynslamError: The file cannot be written.
         """
-        if not hasattr(self._tracker, "save_map"):
+        save = getattr(self._tracker, "save_map", None)
+        if save is None:
             raise TrackerError(f"tracker '{self.tracker_spec.id}' cannot save its map")
-        self._tracker.save_map(path, made_by)
+        save(path, made_by)
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
