@@ -188,17 +188,17 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         outputs = getattr(self._tracker, "map_outputs", None)
         return outputs() if outputs is not None else None
 
-    def save_map(self, path: Path, made_by: str = "") -> None:
+    def save_map(self, path: Path | str, made_by: str = "") -> None:
         """Write the tracker's map to a file from which a later run may start; `made_by` says in words by which run.
 
         Raises:
-            TrackerError: The tracker cannot save its map, or has none.
-            DynslamError: The file cannot be written.
+            DynslamError: The tracker cannot save its map, or has none; the file cannot be written.
         """
         save = getattr(self._tracker, "save_map", None)
         if save is None:
-            raise TrackerError(f"tracker '{self.tracker_spec.id}' cannot save its map")
-        save(path, made_by)
+            why = "has not begun: call reset()" if self._tracker is None else "cannot save its map"
+            raise TrackerError(f"tracker '{self.tracker_spec.id}' {why}")
+        save(Path(path), made_by)
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 

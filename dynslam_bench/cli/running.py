@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
@@ -107,8 +107,9 @@ def run(
     from dynslam_bench.sequences.catalogue import parse_frames
 
     chosen = {} if preset is None else preset_of(tracker, preset)
-    chosen |= map_settings(tracker, start_map, localisation_only)
-    asked: dict[str, Any] = {"tracker": tracker, "settings": gather_settings(assignments, settings, chosen)}
+    given = gather_settings(assignments, settings, chosen)
+    given |= map_settings(tracker, start_map, localisation_only, given)
+    asked: dict[str, Any] = {"tracker": tracker, "settings": given}
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
     asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
@@ -141,21 +142,25 @@ def checked(kind: type[R], **values: Any) -> R:
         raise RunError(f"{name} is {first['input']!r}", first["msg"].lower()) from None
 
 
-def map_settings(tracker: str, start_map: Path | None, localisation_only: bool) -> dict[str, Any]:
-    """The settings that ``--map`` and ``--localisation-only`` stand for.
+def map_settings(
+    tracker: str, start_map: Path | None, localisation_only: bool, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The settings that ``--map`` and ``--localisation-only`` stand for, beside those that are given otherwise.
 
     Raises:
-        RunError: The tracker begins in no map of ours.
+        RunError: The tracker begins in no map of ours, or such a setting is given otherwise, too.
         PluginError: There is no such tracker.
     """
     from dynslam_bench.core.errors import RunError
     from dynslam_bench.core.settings import field_names
     from dynslam_bench.trackers import TRACKERS
 
-    settings: dict[str, Any] = {} if start_map is None else {"backend.map.file": str(start_map.expanduser().absolute())}
+    settings: dict[str, Any] = {} if start_map is None else {"backend.map.file": str(start_map)}
     settings |= {"backend.map.localisation_only": True} if localisation_only else {}
     if settings and "backend.map.file" not in field_names(TRACKERS.get(tracker).settings):
         raise RunError(f"tracker '{tracker}' cannot begin in a map", "the systems on our back end can, e.g. orb-slam2")
+    for name in sorted(settings.keys() & given.keys()):
+        raise RunError(f"'{name}' is given twice", "leave out either the option or the setting")
     return settings
 
 

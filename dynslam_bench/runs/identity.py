@@ -30,7 +30,7 @@ from dynslam_bench.sequences.part import part_of
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
 from .spec import RunSpec
-from .start_map import start_map_of
+from .start_map import MAP_SETTING, start_map_of
 from .storage.record import StartMap
 
 _ROOMS = (
@@ -93,17 +93,20 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     _check_degradation(spec.degrade)
     device = resolve_device(spec.device)
     source = segmentation_source(settings, sequence)
+    weights = weights_of(settings, source)
+    start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
+    by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
     known = versions()
     part = part_of(sequence, spec.offset)
-    identity: dict[str, Any] = {
+    identity = {
         "tracker": tracker.id,
         "tracker_version": tracker.version,
         "distribution": distribution_of(tracker),
         "source": source_fingerprint(tracker, settings, source),
         "requires": {module: _version_of(module) for module in sorted(tracker.requires)},
-        "settings": flatten(settings),
+        "settings": flatten(settings) | by_content,
         "segmentation": source,
-        "weights": weights_of(settings, source),
+        "weights": weights,
         **files_of(tracker, settings),
         "sequence": part.id,
         "content": part.content,
@@ -121,7 +124,6 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "opencv": known.get("opencv", ""),
         "torch": known.get("torch", ""),
     }
-    start_map = start_map_of(settings, sequence.camera, tracker.sensors, identity["weights"])
     return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
 
 

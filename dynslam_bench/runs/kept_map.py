@@ -58,9 +58,12 @@ def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> KeptMap:
 def _save(env: SlamEnv, folder: Path, spec: RunSpec) -> tuple[str, ...]:
     """Write the map; why that was not possible, if it was not."""
     start, stop = spec.frames_seen or (0, None)
-    part = f"frames {start}:{'' if stop is None else stop}, seed {spec.seed}"
+    asked = spec.settings | {f"degrade.{kind}": strength for kind, strength in spec.degrade.items()}
+    words = [f"{env.tracker_spec.id} on {env.sequence.id}", f"frames {start}:{'' if stop is None else stop}"]
+    words += [f"stride {spec.stride}"] * (spec.stride != 1) + [f"seed {spec.seed}"]
+    words += [f"{name}={value}" for name, value in asked.items()]
     try:
-        env.save_map(folder / MAP_FILE, f"{env.tracker_spec.id} on {env.sequence.id}, {part}")
+        env.save_map(folder / MAP_FILE, ", ".join(words))
     except TrackerError as error:
         return (f"no {MAP_FILE}: {error}",)
     return ()

@@ -24,6 +24,7 @@ from .process.job import make_job
 from .process.log_file import LogFile
 from .process.supervise import Verdict, supervise
 from .spec import RunSpec, place_of
+from .start_map import check_unchanged
 from .storage.frames import FrameLog
 from .storage.record import RunRecord, SequenceInfo, Status, TrackerInfo
 from .storage.scoring import DEFAULT_PROTOCOL
@@ -98,6 +99,7 @@ def run_one(
             (work / FRAMES_FILE).unlink(missing_ok=True)
         except OSError as error:
             raise InfrastructureError(f"cannot write {work}: {error.strerror}", "the run is not stored") from error
+        check_unchanged(resolved.start_map, resolved.settings)
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)

@@ -112,6 +112,7 @@ class RunSpec(Record):
                 "sequence": _absolute_folder(self.sequence),
                 "data_root": None if self.data_root is None else str(Path(self.data_root).expanduser().absolute()),
                 "camera": _absolute_file(self.camera),
+                "settings": {name: _absolute_map(name, value) for name, value in self.settings.items()},
             }
         )
 
@@ -136,6 +137,11 @@ def _absolute_folder(sequence: str) -> str:
 
 def _absolute_file(name: str | None) -> str | None:
     return str(Path(name).expanduser().absolute()) if name is not None and Path(name).expanduser().is_file() else name
+
+
+def _absolute_map(name: str, value: Any) -> Any:
+    """A map's path with its links followed: ``latest`` is another run's folder soon."""
+    return str(Path(value).expanduser().resolve()) if name == "backend.map.file" and value else value
 
 
 def place_of(sequence: str) -> str:

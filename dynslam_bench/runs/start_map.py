@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.fingerprint import named_digests
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry.camera import Camera
@@ -13,6 +15,17 @@ from dynslam_bench.slam.settings import BackendSettings
 from .storage.record import StartMap
 
 MAP_SETTING = "backend.map.file"
+
+
+def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:
+    """A run began in the map that was looked up for it, and in no other at its path.
+
+    Raises:
+        RunError: The file has changed since.
+        PluginError: It is gone.
+    """
+    if start_map is not None and named_digests(settings)[MAP_SETTING] != start_map.digest:
+        raise RunError(f"the map {start_map.file} has changed since the run was asked for", "the run is not stored")
 
 
 def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:

@@ -29,7 +29,7 @@ from .loop_closing import LoopCloser
 from .mapping.history import History
 from .mapping.keyframes import KeyframeRule
 from .mapping.local_mapping import LocalMapper
-from .mapping.map_store import begin, save
+from .mapping.map_store import begin_map, save
 from .mapping.saved_map import MapFeatures
 from .settings import BackendSettings
 from .views import MapViews
@@ -88,7 +88,7 @@ class RgbdBackend:
         self.camera = camera.undistorted()
         self.seed = int(seed)
         start = self.settings.map
-        self.world, self._islands = begin(start.file, self.camera, self._made_of, depth=self.uses_depth)
+        self.world, self._islands = begin_map(start.file, self.camera, self._made_of, depth=self.uses_depth)
         self._grows = not start.localisation_only
         self.mapper = LocalMapper(self.world, self.settings)
         self.history = History()

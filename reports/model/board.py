@@ -168,7 +168,8 @@ def make_board(
     scored = [key for key in shown if any(_scored(board, key))]
     _choose_ranked(board, scored)
     wanted = reference or DEFAULT_REFERENCE
-    candidates = [k for k in scored if board.first(k).tracker == wanted and set(board.common) <= set(_scored(board, k))]
+    candidates = [k for k in scored if board.first(k).tracker == wanted and "map" not in board.first(k).variant]
+    candidates = [k for k in candidates if set(board.common) <= set(_scored(board, k))]
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
         board.reference_name = board.labels[board.reference]

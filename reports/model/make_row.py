@@ -37,7 +37,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         label=tracker.label or tracker.id,
         variant=variant_of(record),
         provenance=tracker.provenance,
-        ranked=tracker.ranked,
+        ranked=tracker.ranked and record.start_map is None,
         monocular=tracker.sensors == "rgb",
         sequence=sequence.id,
         frames=part_words(record),

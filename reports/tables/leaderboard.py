@@ -104,7 +104,8 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"{board.reference_name}; below 1 is better. {intervals}",
         f"A run that failed or was lost counts as a camera that never moves, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
-        "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, trackers that lack "
+        "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
+        "in the map of an earlier one, trackers that lack "
         "sequences or never succeeded.",
     ]
     if board.asked_reference and board.reference is None:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
-from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.errors import RunError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.labels import make_labels
 from dynslam_bench.reports.model.make_row import make_row
 from dynslam_bench.reports.model.missing import run_command
@@ -19,6 +20,7 @@ from dynslam_bench.reports.model.row_values import variant_of
 from dynslam_bench.runs import RunSpec, RunStore, run_many
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.kept_map import keep_map
+from dynslam_bench.runs.start_map import check_unchanged
 from dynslam_bench.runs.storage.run_index import run_row
 from dynslam_bench.runs.storage.run_table import runs_frame
 from dynslam_bench.slam.mapping.saved_map import MAP_FILE, SavedMap, read_map, write_map
@@ -36,9 +38,11 @@ def begun(file: Path, **changes: object) -> RunSpec:
 def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_path: Path) -> None:
     file = tmp_path / MAP_FILE
     first = SlamEnv(SEQUENCE, "orb-slam2", frames=(0, 3))
+    with pytest.raises(TrackerError, match="has not begun"):
+        first.save_map(file)
     first.reset(seed=0)
     first.step(0)
-    first.save_map(file, "another run")
+    first.save_map(str(file), "another run")
     (found,) = run_many([begun(file)], results=store)
     assert found.status == "ok" and found.n_tracked == 3 and found.maps == 1
     own = read_map(store.folder(found.run_id) / MAP_FILE)
@@ -51,6 +55,14 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
     keyframes = (store.folder(found.run_id) / "keyframes.csv").read_text().splitlines()
     assert len(keyframes) == 1 + found.keyframes and all(line.split(",")[1:3] == ["", ""] for line in keyframes[1:])
 
+    copy, link = tmp_path / "copy.npz", tmp_path / "latest"
+    copy.write_bytes(file.read_bytes())
+    link.symlink_to(file)
+    assert resolve(begun(copy)).run_id == found.run_id, "what counts is the map, not where it lies"
+    assert begun(link).absolute().settings["backend.map.file"] == str(file), "another run moves the link"
+    asked = found.asked
+    assert asked == found.model_copy(update={"overrides": {"backend.map.localisation_only": "true"}}).asked
+
     other = tmp_path / "other.npz"  # another map at the same path is another run, and no repeat of the first
     changed = SavedMap(read_map(file).header.model_copy(update={"made_by": "somebody"}), read_map(file).arrays)
     write_map(other, changed)
@@ -58,7 +70,11 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
     again = resolve(begun(file))
     assert again.run_id != found.run_id and again.start_map is not None
     assert variant_of(found) != variant_of(found.model_copy(update={"start_map": again.start_map}))
+    with pytest.raises(RunError, match="has changed since the run was asked for"):
+        check_unchanged(begun_in, again.settings)
     row = make_row(store, found, get_protocol("tum-rgbd/v1"))
+    assert not row.ranked, "it knows more than one that begins without"
+    assert make_board([row]).reference is None
     name = f"map={begun_in.digest[:8]}"
     assert name in make_labels([row])[row.variant_key], "named though no other variant stands beside it"
     assert f"--map {file}" in run_command(row) and "backend.map.localisation_only=True" in run_command(row)

@@ -145,13 +145,9 @@ def test_a_file_of_another_version_or_kind_is_none(made, tmp_path):
         ({"schema_version": MAP_SCHEMA + 1}, "upgrade"),
         ({"kind": "a run"}, "kind"),
         ({"next_point": 5}, "'id' holds values above 4"),
-        ({"features": header["features"] | {"levels": 2}}, "kf_octave|other features"),
     ):
         text = json.dumps(header | change).encode()
         np.savez(tmp_path / "odd.npz", **(arrays | {HEADER: np.frombuffer(text, np.uint8)}))
-        if "features" in change:
-            assert read_map(tmp_path / "odd.npz").header.features.levels == 2, "all points are of octave 0 here"
-            continue
         with pytest.raises(SettingsError, match=words):
             read_map(tmp_path / "odd.npz")
     (tmp_path / "odd.npz").write_bytes(file.read_bytes()[:-100])
@@ -171,7 +167,7 @@ FAULTS = {
     "obs_ft": (lambda a: a.__setitem__(0, 30000), "features that the keyframe does not have"),
     "obs_kf": (lambda a: a.__setitem__(0, 99), "values above"),
     "n_obs": (lambda a: a.__setitem__(0, a[0] + 1), "does not add up"),
-    "kf_count": (lambda a: a.__setitem__(0, 2**60), "claims a table"),
+    "kf_count": (lambda a: a.__setitem__(0, 2**60), "claims tables"),
     "kf_pose": (lambda a: a.__imul__(1.5), "no rigid transformation"),
     "position": (lambda a: a.__setitem__((0, 0), np.nan), "not finite"),
     "kf_right": (lambda a: a.__setitem__(0, np.inf), "'kf_right'"),
@@ -193,3 +189,23 @@ def test_a_damaged_map_is_refused_before_anything_is_looked_up_in_it(made, tmp_p
         np.savez(tmp_path / "odd.npz", **{key: arrays.get(key, np.zeros(1)) for key in missing})
         with pytest.raises(SettingsError, match=r"no array|unknown array"):
             read_map(tmp_path / "odd.npz")
+
+
+def test_a_small_file_claims_no_large_tables(made, tmp_path):
+    _, _, file, _ = made
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    for name in ("kf_words", "words"):
+        arrays[name] = np.zeros((len(arrays[name]), 8000), np.uint64)
+    np.savez_compressed(tmp_path / "odd.npz", **arrays)
+    with pytest.raises(SettingsError, match="a descriptor has 8000 words of 64 bits, at most 64"):
+        read_map(tmp_path / "odd.npz")
+
+
+def test_a_higher_octave_than_the_features_have_is_refused(made, tmp_path):
+    _, _, file, _ = made
+    with np.load(file) as stored:
+        arrays = spoiled(dict(stored), "kf_octave", lambda a: a.__setitem__(0, 63))
+    np.savez(tmp_path / "odd.npz", **arrays)
+    with pytest.raises(SettingsError, match="'kf_octave' holds values above"):
+        read_map(tmp_path / "odd.npz")

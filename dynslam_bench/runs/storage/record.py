@@ -224,8 +224,9 @@ class RunRecord(Record):
         """The settings that were asked for; in place of a map's path the digest of its content, as ``map``."""
         if self.start_map is None:
             return dict(self.overrides)
-        named = {name: value for name, value in self.overrides.items() if name != "backend.map.file"}
-        return named | {"map": self.start_map.digest[:8]}
+        named = {name: value for name, value in self.overrides.items() if not name.startswith("backend.map.")}
+        alone = {"backend.map.localisation_only": True} if self.start_map.localisation_only else {}
+        return named | {"map": self.start_map.digest[:8]} | alone
 
     @property
     def repeat(self) -> str:

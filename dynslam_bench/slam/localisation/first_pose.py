@@ -72,7 +72,7 @@ class FirstPose:
         T_cam_world: World-to-camera pose.
         matches: The matches that agree.
         keyframe: Slot of a keyframe nearby: the one that they are with, or else the last frame's reference.
-        relocalised: Whether they are a keyframe's, not the last frame's.
+        relocalised: Whether the camera was lost before, or they are a keyframe's.
     """
 
     T_cam_world: Array

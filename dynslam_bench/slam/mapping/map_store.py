@@ -31,7 +31,7 @@ UNKNOWN_FRAME = -1
 """Frame of a keyframe that is of another run; its stamp is NaN."""
 
 
-def begin(file: str, camera: Camera, features: MapFeatures, *, depth: bool) -> tuple[Map, Islands]:
+def begin_map(file: str, camera: Camera, features: MapFeatures, *, depth: bool) -> tuple[Map, Islands]:
     """The map that a run begins with: that of a file, or an empty one where none is named.
 
     Args:

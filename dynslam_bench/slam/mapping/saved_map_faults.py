@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 Arrays = Mapping[str, NDArray[Any]]
 Layout = Mapping[str, tuple[str, str]]
 
-MOST_CELLS = 1 << 24
-"""Of a table of features or observations; a keyframe of a thousand features fills a thousand."""
+MOST_BYTES = 1 << 30
+"""Of all features of a map as tables; two thousand keyframes of a thousand features fill a fifth."""
+MOST_WORDS = 64
+"""Words of 64 bits of a descriptor; ORB's has four."""
 _FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_info", "kf_info_right", "position",
            "normal", "far", "island_start", "island_anchor")  # fmt: skip
 _NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
@@ -96,10 +98,13 @@ def _bounds(header: Numbered, arrays: Arrays) -> Iterator[str]:
 
 def _references(arrays: Arrays) -> Iterator[str]:
     """Features say which point they observe, and points which features observe them; both have to say the same."""
-    for name in ("kf_count", "n_obs"):  # as tables they have a row each, and as many columns as the longest needs
-        claimed = len(arrays[name]) * int(arrays[name].max(initial=0))
-        if claimed > MOST_CELLS:
-            yield f"'{name}' claims a table of {claimed} cells, at most {MOST_CELLS} are made"
+    words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
+    if words > MOST_WORDS:
+        yield f"a descriptor has {words} words of 64 bits, at most {MOST_WORDS} are read"
+    for name, cell in (("kf_count", 64 + 8 * words), ("n_obs", 8)):  # as tables: as many columns as the longest needs
+        claimed = len(arrays[name]) * int(arrays[name].max(initial=0)) * cell
+        if claimed > MOST_BYTES:
+            yield f"'{name}' claims tables of {claimed} bytes, at most {MOST_BYTES} are made"
     for name, total in (("kf_count", len(arrays["kf_point"])), ("n_obs", len(arrays["obs_kf"]))):
         counts = arrays[name].astype(np.int64)
         if (counts > total).any() or int(counts.sum()) != total:
@@ -112,5 +117,7 @@ def _references(arrays: Arrays) -> Iterator[str]:
     said = np.repeat(np.arange(len(arrays["id"])), arrays["n_obs"])
     if len(np.unique(seen)) != len(seen) or not np.array_equal(arrays["kf_point"][seen], said):
         yield "observations do not agree with 'kf_point'"
+    if len(np.unique(said * len(arrays["kf_id"]) + keyframe)) != len(seen):
+        yield "a keyframe observes a point with two features"
     if np.count_nonzero(arrays["kf_point"] >= 0) != len(seen):
         yield "'kf_point' names points that do not know of it"
