@@ -106,8 +106,7 @@ def run(
     from dynslam_bench.runs import Limits, RunSpec
     from dynslam_bench.sequences.catalogue import parse_frames
 
-    chosen = {} if preset is None else preset_of(tracker, preset)
-    given = gather_settings(assignments, settings, chosen)
+    given = gather_settings(assignments, settings, {} if preset is None else preset_of(tracker, preset))
     given |= map_settings(tracker, start_map, localisation_only, given)
     asked: dict[str, Any] = {"tracker": tracker, "settings": given}
     asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
