@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import RunError, SettingsError
 from dynslam_bench.core.fingerprint import named_digests
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.settings import FeatureSettings
@@ -38,11 +38,14 @@ def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: 
         digests: Of the files that the settings name, by the setting's name.
 
     Raises:
-        SettingsError: The file is no map, or one of another camera, other features or another sensor.
+        SettingsError: The tracker has features of its own; the file is no map, or one of another camera, other features
+            or another sensor.
     """
     backend, features = getattr(settings, "backend", None), getattr(settings, "features", None)
-    if not isinstance(backend, BackendSettings) or not isinstance(features, FeatureSettings) or not backend.map.file:
+    if not isinstance(backend, BackendSettings) or not backend.map.file:
         return None
+    if not isinstance(features, FeatureSettings):
+        raise SettingsError(f"'{MAP_SETTING}' is set, and the tracker's features are none that maps are made of")
     path = Path(backend.map.file).expanduser()
     saved = read_map(path)
     made_of = MapFeatures(extractor=features.extractor, levels=features.levels, scale_factor=features.scale_factor)

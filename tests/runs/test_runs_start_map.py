@@ -20,10 +20,11 @@ from dynslam_bench.reports.model.row_values import variant_of
 from dynslam_bench.runs import RunSpec, RunStore, run_many
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.kept_map import keep_map
-from dynslam_bench.runs.start_map import check_unchanged
+from dynslam_bench.runs.start_map import check_unchanged, start_map_of
 from dynslam_bench.runs.storage.run_index import run_row
 from dynslam_bench.runs.storage.run_table import runs_frame
 from dynslam_bench.slam.mapping.saved_map import MAP_FILE, SavedMap, read_map, write_map
+from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 
 SEQUENCE = "synthetic/walking_xyz"
 PLAIN = RunSpec(tracker="orb-slam2", sequence=SEQUENCE, frames=(0, 3), save_map=True)
@@ -108,3 +109,9 @@ def test_maps_that_never_met_are_said(tmp_path: Path) -> None:
     one = MapOutputs(keyframes[:2], none, outputs.positions, outputs.colours, none)
     met = keep_map(SimpleNamespace(map_outputs=lambda: one), tmp_path, RunSpec(tracker="a", sequence="b"))
     assert met.counts["maps"] == 1 and met.notes == ()
+
+
+def test_features_of_another_kind_begin_in_no_map() -> None:
+    backend = BackendSettings(map=StartMapSettings(file="map.npz"))
+    with pytest.raises(SettingsError, match="features are none that maps are made of"):
+        start_map_of(SimpleNamespace(backend=backend, features=None), None, "rgbd", {})

@@ -46,7 +46,7 @@ class Recognised:
 def recognise(
     world: Map, keyframe: int, seen: Observations, first: Matches, T_cam_world: Array, settings: TrackingSettings
 ) -> Recognised:
-    """Look for all points around a keyframe, and fit the pose to them, as long as that finds more.
+    """Look for all points around a keyframe, and fit the pose to them, again while that finds more.
 
     Args:
         world: The map.

@@ -24,6 +24,8 @@ from dynslam_bench.geometry.camera import Camera
 MAP_FILE = "map.npz"
 MAP_SCHEMA = 1
 HEADER = "header"
+ARRAY_HEADER_BYTES = 256
+"""What numpy writes before an array, at most."""
 MAKE_ONE = "a map is made by: run --save-map"
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -154,13 +156,13 @@ def write_map(path: Path, saved: SavedMap) -> None:
         TrackerError: The map is too large to be read again.
         DynslamError: The folder cannot be written.
     """
-    size = sum(array.nbytes for array in saved.arrays.values())
+    header = np.frombuffer(saved.header.to_json().encode(), np.uint8)
+    size = sum(array.nbytes + ARRAY_HEADER_BYTES for array in (header, *saved.arrays.values()))
     if size > MOST_BYTES:
         raise TrackerError(
             f"the map holds {size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read of such a file",
             "keep fewer keyframes (backend.keyframes.maximum) or features (features.n_features)",
         )
-    header = np.frombuffer(saved.header.to_json().encode(), np.uint8)
     data = io.BytesIO()
     np.savez_compressed(data, **{HEADER: header}, **saved.arrays)  # type: ignore[arg-type]
     write_atomic(path, data.getvalue())
