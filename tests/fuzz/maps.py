@@ -63,7 +63,7 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 def _read(data: bytes | None, folder: Path) -> None:
     """What is read is worked on as a run does, whose compiled loops check no index."""
-    world, islands = map_store.begin(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    world, islands = map_store.begin_map(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
     world.refresh(world.points)
     for slot in world.keyframes.tolist():
         world.covisible(slot)
