@@ -29,8 +29,8 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.part import part_of
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-from .spec import RunSpec
-from .start_map import MAP_SETTING, start_map_of
+from .spec import MAP_SETTING, RunSpec
+from .start_map import start_map_of
 from .storage.record import StartMap
 
 _ROOMS = (

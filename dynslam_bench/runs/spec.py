@@ -12,6 +12,9 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.records import Record
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 
+MAP_SETTING = "backend.map.file"
+"""The setting that names the map to begin in."""
+
 
 class Limits(Record):
     """What a run may take; no part of its identity.
@@ -141,7 +144,7 @@ def _absolute_file(name: str | None) -> str | None:
 
 def _absolute_map(name: str, value: Any) -> Any:
     """A map's path with its links followed: ``latest`` is another run's folder soon."""
-    return str(Path(value).expanduser().resolve()) if name == "backend.map.file" and value else value
+    return str(Path(value).expanduser().resolve()) if name == MAP_SETTING and value else value
 
 
 def place_of(sequence: str) -> str:

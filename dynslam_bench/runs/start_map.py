@@ -12,9 +12,8 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.mapping.saved_map import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 
+from .spec import MAP_SETTING
 from .storage.record import StartMap
-
-MAP_SETTING = "backend.map.file"
 
 
 def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:

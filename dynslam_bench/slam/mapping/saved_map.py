@@ -7,10 +7,10 @@ recording the keyframes were is left out: in another one it means nothing. `docs
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.records import Record, schema, write_atomic
 from dynslam_bench.geometry.camera import Camera
 
+from .saved_map_faults import Arrays, array_faults, content_faults
+
 MAP_FILE = "map.npz"
 MAP_SCHEMA = 1
 HEADER = "header"
@@ -28,7 +30,6 @@ ARRAY_HEADER_BYTES = 256
 """What numpy writes before an array, at most."""
 MAKE_ONE = "a map is made by: run --save-map"
 
-Arrays = Mapping[str, NDArray[Any]]
 Sensors = Literal["rgbd", "rgb"]
 
 KEYFRAME_ARRAYS = {
@@ -185,14 +186,7 @@ def read_map(path: Path) -> SavedMap:
     except DynslamError as error:
         raise SettingsError(str(error)) from error
     arrays = {name: np.ascontiguousarray(array) for name, array in found.items()}
-    for fault in _faults(header, arrays):
+    numbers = header.next_keyframe, header.next_point, header.features.levels
+    for fault in chain(array_faults(arrays, _LAYOUT), content_faults(arrays, *numbers)):  # basic ones first
         raise SettingsError(f"{path} is a damaged map: {fault}", MAKE_ONE)
     return SavedMap(header, arrays)
-
-
-def _faults(header: MapHeader, arrays: Arrays) -> Any:
-    """What is wrong with the arrays, the most basic first: what comes later takes it for granted."""
-    from .saved_map_faults import array_faults, content_faults
-
-    yield from array_faults(arrays, _LAYOUT)
-    yield from content_faults(header, arrays)

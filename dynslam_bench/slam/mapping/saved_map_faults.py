@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +20,6 @@ _FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_
 _NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
               "kf_octave": 0, "kf_point": -1, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_island": 0, "id": 0,
               "born": 0, "island_reach": 0}  # fmt: skip
-
-
-class Numbered(Protocol):
-    """What a map's header says that its arrays have to agree with."""
-
-    @property
-    def next_keyframe(self) -> int:
-        """Number of the next keyframe."""
-        ...
-
-    @property
-    def next_point(self) -> int:
-        """Number of the next point."""
-        ...
-
-    @property
-    def features(self) -> Any:
-        """With ``levels``."""
-        ...
 
 
 def array_faults(arrays: Arrays, layout: Layout) -> Iterator[str]:
@@ -60,25 +41,32 @@ def array_faults(arrays: Arrays, layout: Layout) -> Iterator[str]:
             yield f"'{name}' is {found.dtype} of shape {str(found.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
 
 
-def content_faults(header: Numbered, arrays: Arrays) -> Iterator[str]:
-    """Values out of bounds, and references that lead nowhere or are not answered."""
+def content_faults(arrays: Arrays, next_keyframe: int, next_point: int, levels: int) -> Iterator[str]:
+    """Values out of bounds, and references that lead nowhere or are not answered.
+
+    Args:
+        arrays: The arrays, complete and of the right shapes.
+        next_keyframe: Number of the next keyframe, above all there are.
+        next_point: Number of the next point, likewise.
+        levels: Levels of the features' image pyramid.
+    """
     for name in _FINITE:
         if not np.isfinite(arrays[name]).all():
             yield f"'{name}' holds values that are not finite"
     for name, least in _NOT_BELOW.items():
         if not (arrays[name] >= least).all():
             yield f"'{name}' holds values below {least}"
-    yield from _bounds(header, arrays)
+    yield from _bounds(arrays, next_keyframe, next_point, levels)
     yield from _references(arrays)
 
 
-def _bounds(header: Numbered, arrays: Arrays) -> Iterator[str]:
+def _bounds(arrays: Arrays, next_keyframe: int, next_point: int, levels: int) -> Iterator[str]:
     if not len(arrays["kf_id"]):
         yield "it holds no keyframe"
     if not (arrays["far"] > 0).all():
         yield "'far' holds values that are not above 0"
-    most = {"kf_island": len(arrays["island_reach"]), "kf_octave": header.features.levels - 1,
-            "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
+    most = {"kf_island": len(arrays["island_reach"]), "kf_octave": levels - 1,
+            "kf_id": next_keyframe - 1, "born": next_keyframe - 1, "id": next_point - 1,
             "kf_point": len(arrays["id"]) - 1, "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
     for name, largest in most.items():
         if not (arrays[name] <= largest).all():
