@@ -59,7 +59,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             _picks(summary),
             _preset(tuner, summary, tables[2]),
         ),
-        Section("course", "How it went", "Course", _warnings(tuner), _shown(figures, "history", "front")),
+        Section("course", "How it went", "Course", warnings_of(tuner), _shown(figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
         Section("trials", "All trials", "Trials", [], [Piece("table", table=tables[1])]),
     ]
@@ -241,13 +241,19 @@ def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Piece]:
     return [Piece("figure", figure=name, caption=captions[name]) for name in names if name in figures]
 
 
-def _warnings(tuner: Tuner) -> list[str]:
+def warnings_of(tuner: Tuner) -> list[str]:
+    """What a reader of the course should know, in sentences."""
     notes = _copies(tuner)
     finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if len(finished) < 20:
         notes.append(f"Only {len(finished)} trials were finished: the best value is partly luck.")
     broken = [trial for trial in finished if not is_feasible(trial)]
-    if broken:
+    if broken and len(broken) == len(finished):
+        notes.append(
+            f"None of the {len(finished)} trials fulfils the constraints on its own blocks, which may be too few to "
+            "show it: the least bad were judged on blocks that no trial had seen, and have to fulfil them there."
+        )
+    elif broken:
         notes.append(f"{len(broken)} trials violate a constraint and are not candidates.")
     return notes
 

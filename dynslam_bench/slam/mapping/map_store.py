@@ -16,7 +16,6 @@ from .saved_map import (
     FEATURE_ARRAYS,
     KEYFRAME_ARRAYS,
     POINT_ARRAYS,
-    Arrays,
     MapFeatures,
     MapHeader,
     SavedMap,
@@ -25,6 +24,7 @@ from .saved_map import (
     read_map,
     write_map,
 )
+from .saved_map_faults import Arrays
 
 Array = NDArray[np.float64]
 UNKNOWN_FRAME = -1
