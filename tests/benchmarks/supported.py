@@ -4,7 +4,7 @@
         [--install [--tests tests]] [--into FOLDER] [--record FILE]
 
 Needs `uv` (``pip install uv``). Each pair is resolved: there are versions of all dependencies that fit together for
-that Python, the oldest of the direct ones being those that `pyproject.toml` names. The sources are compiled by that
+that Python, the oldest of the direct ones being the first with a wheel for it since those that `pyproject.toml` names. The sources are compiled by that
 Python where it is installed. With `--install` all is installed into a fresh environment, several GB with torch, and
 used there as a newcomer would: `STEPS`. With `--tests` those tests are run there, too, as the project's workflow does.
 `--into` keeps the environments, and takes those that are there.
@@ -53,7 +53,8 @@ STEPS = {
 def tried(python: str, versions: str, uv: str, install: Path | None, tests: list[str], work: Path) -> dict[str, Any]:
     """What became of one pair: which versions, whether the sources compile, and what ran."""
     needs = work / "needs.txt"
-    resolve = ["pip", "compile", "-q", "--extra", "test", "--python-version", python, "--no-header", "--no-annotate"]
+    resolve = ["pip", "compile", "-q", "--only-binary", ":all:", "--extra", "test", "--python-version", python]
+    resolve += ["--no-header", "--no-annotate"]
     found = call(uv, *resolve, "--resolution", RESOLUTION[versions], "-o", str(needs), str(ROOT / "pyproject.toml"))
     row: dict[str, Any] = {"python": python, "versions": versions, "resolved": found}
     if found == "fine":

@@ -25,6 +25,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, TWIN_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
 from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
 
@@ -63,17 +64,53 @@ def without(frame: Frame, hidden: np.ndarray) -> Frame:
     return Frame(frame.index, frame.timestamp, mixed, np.where(grown > 0, np.float32(0), frame.depth))
 
 
+class SideBySide:
+    """Several runs of ORB-SLAM3: each frame is read once and given to one run after the other.
+
+    Args:
+        sequence: What its frames are of.
+        runs: The seed of each.
+        fps: Frames a second, where not all of the sequence's are given.
+    """
+
+    def __init__(self, sequence: SyntheticSequence, runs: list[int], fps: float) -> None:
+        settings = OrbSlam3Settings(vocabulary=str(VOCABULARY))
+        self.runs, self._truth = runs, sequence.ground_truth
+        self._trackers = [OrbSlam3(settings, TrackerContext(sequence_id=sequence.id, fps=fps)) for _ in runs]
+        for tracker, run in zip(self._trackers, runs, strict=True):
+            tracker.reset(sequence.camera, rng=np.random.default_rng(run))
+        self._online: list[list[tuple[float, np.ndarray]]] = [[] for _ in runs]
+        self._frames = 0
+
+    def track(self, frame: Frame) -> None:
+        """One frame for each."""
+        self._frames += 1
+        for online, tracker in zip(self._online, self._trackers, strict=True):
+            result = tracker.track(frame)
+            if result.T_world_cam is not None and result.state == "ok":
+                online.append((frame.timestamp, result.T_world_cam))
+
+    def results(self) -> list[dict[str, object]]:
+        """Of each run its number, the RMSE of the final and the online trajectory in metres, and the coverage."""
+        rows: list[dict[str, object]] = []
+        for run, online, tracker in zip(self.runs, self._online, self._trackers, strict=True):
+            final = tracker.finalize()
+            tracker.close()
+            tracked = Trajectory(*(np.array(column) for column in zip(*online, strict=True)))  # some frame is
+            rows.append({
+                "run": run, "final": round(rmse(final, self._truth), 5),
+                "online": round(rmse(tracked, self._truth), 5),
+                "coverage": round(len(online) / self._frames, 4),
+            })  # fmt: skip
+        return rows
+
+
 def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
-    """Several runs of ORB-SLAM3 side by side: each frame is read once and given to one run after the other."""
+    """Several runs of ORB-SLAM3 on one control of one sequence."""
     settings = RenderSettings(people={"none": "none", "frozen": "frozen"}.get(control, "moving"))
     sequence = open_synthetic(id, cache, settings=settings)
     sequence.render()
-    orbslam3 = OrbSlam3Settings(vocabulary=str(VOCABULARY))
-    trackers = [OrbSlam3(orbslam3, TrackerContext(sequence_id=id, fps=sequence.fps)) for _ in runs]
-    for tracker, run in zip(trackers, runs, strict=True):
-        tracker.reset(sequence.camera, rng=np.random.default_rng(run))
-    stamps: list[list[float]] = [[] for _ in runs]
-    poses: list[list[np.ndarray]] = [[] for _ in runs]
+    together = SideBySide(sequence, runs, sequence.fps)
     for index in range(len(sequence)):
         frame = sequence[index]
         if control in ("masked", "persons"):
@@ -81,24 +118,11 @@ def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str,
             names = masks.class_names
             ids = [k for k in names if names[k] == "person" or (control == "masked" and k in masks.moving)]
             frame = without(frame, np.isin(masks.instances, ids))
-        for k, tracker in enumerate(trackers):
-            result = tracker.track(frame)
-            if result.T_world_cam is not None and result.state == "ok":
-                stamps[k].append(frame.timestamp)
-                poses[k].append(result.T_world_cam)
+        together.track(frame)
     truth = sequence.ground_truth
     never = float(np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean()))
-    rows: list[dict[str, object]] = []
-    for k, tracker in enumerate(trackers):
-        final = tracker.finalize()
-        tracker.close()
-        rows.append({
-            "id": id, "control": control, "run": runs[k], "digest": sequence.digest(), "frames": len(sequence),
-            "final": round(rmse(final, truth), 5),
-            "online": round(rmse(Trajectory(np.array(stamps[k]), np.array(poses[k])), truth), 5),
-            "coverage": round(len(stamps[k]) / len(sequence), 4), "never": round(never, 4),
-        })  # fmt: skip
-    return rows
+    about = {"id": id, "control": control, "digest": sequence.digest(), "frames": len(sequence)}
+    return [about | row | {"never": round(never, 4)} for row in together.results()]
 
 
 def table(rows: list[dict]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dynslam_bench.features.matching import match_brute_force
 from dynslam_bench.geometry.camera import Camera
@@ -18,6 +19,9 @@ from .pose import PoseEstimate, optimise_pose
 from .tracking import Matches
 
 Array = NDArray[np.float64]
+
+BATCH = 25
+"""Samples that are drawn and judged together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,38 +65,54 @@ def ransac_pose(
     if n < 4:
         return None
     best: tuple[Array, NDArray[np.bool_]] | None = None
-    best_count = 3
-    needed = iterations
-    drawn = 0
+    best_count, needed, drawn = 3, iterations, 0
     while drawn < min(needed, iterations):
-        drawn += 1
-        sample = rng.choice(n, 3, replace=False)
-        try:
-            _, rotations, translations = cv2.solveP3P(
-                position[sample], xy[sample], camera.matrix, None, flags=cv2.SOLVEPNP_AP3P
-            )
-        except cv2.error:  # a degenerate sample, e.g. collinear points
+        samples = _triples(n, min(BATCH, iterations - drawn), rng)
+        drawn += len(samples)
+        poses = _three_point_poses(position[samples], xy[samples], camera)
+        if not len(poses):
             continue
-        for rotation, translation in zip(rotations, translations, strict=True):
-            pose = np.eye(4)
-            pose[:3, :3] = cv2.Rodrigues(rotation)[0]
-            pose[:3, 3] = np.asarray(translation).ravel()
-            if not np.isfinite(pose).all():
-                continue
-            inliers = _inliers(pose, position, xy, info, camera)
-            count = int(np.count_nonzero(inliers))
-            if count > best_count:
-                best, best_count = (pose, inliers), count
-                share = min(count / n, 0.999)
-                needed = int(np.ceil(np.log(0.001) / np.log1p(-(share**3)))) + 1
+        inliers = _inliers(poses, position, xy, info, camera)
+        count = np.count_nonzero(inliers, axis=1)
+        most = int(count.argmax())
+        if count[most] > best_count:
+            best, best_count = (poses[most], inliers[most]), int(count[most])
+            share = min(best_count / n, 0.999)
+            needed = int(np.ceil(np.log(0.001) / np.log1p(-(share**3)))) + 1
     return best
 
 
-def _inliers(pose: Array, position: Array, xy: Array, info: Array, camera: Camera) -> NDArray[np.bool_]:
-    local = position @ pose[:3, :3].T + pose[:3, 3]
-    ahead = local[:, 2] > 0.05
-    error = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0])) - xy
-    return np.asarray(ahead & (info * (error**2).sum(axis=1) < 2.0 * 5.991))
+def _triples(n: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """So many samples ``[count, 3]`` of three different indices below `n`, all equally likely."""
+    a, b, c = (rng.integers(n - k, size=count) for k in range(3))
+    b += b >= a
+    for other in (np.minimum(a, b), np.maximum(a, b)):
+        c += c >= other
+    return np.stack([a, b, c], axis=1)
+
+
+def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
+    """All poses ``[H, 4, 4]``, world to camera, that fit any of the samples ``[S, 3, 3]`` and ``[S, 3, 2]``."""
+    vectors: list[tuple[Array, Array]] = []
+    for points, pixels in zip(position, xy, strict=True):
+        try:
+            _, rotations, translations = cv2.solveP3P(points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_AP3P)
+        except cv2.error:  # a degenerate sample, e.g. collinear points
+            continue
+        vectors += zip(rotations, translations, strict=True)
+    flat = np.reshape(vectors, (-1, 6))
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    poses = np.tile(np.eye(4), (len(flat), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(flat[:, :3]).as_matrix()
+    poses[:, :3, 3] = flat[:, 3:]
+    return poses
+
+
+def _inliers(poses: Array, position: Array, xy: Array, info: Array, camera: Camera) -> NDArray[np.bool_]:
+    """Which points ``[H, N]`` each of the poses ``[H, 4, 4]`` explains."""
+    local = np.swapaxes(poses[:, :3, :3] @ position.T + poses[:, :3, 3:], 1, 2)
+    error = camera.project(local) - xy
+    return np.asarray((local[..., 2] > 0.05) & (info * np.square(error).sum(axis=-1) < 2.0 * 5.991))
 
 
 def locate(
