@@ -1,8 +1,8 @@
 """Loop closing, the last row of the paper's Figure 2: recognise a place, verify it, correct the map, fuse it.
 
-1. *Detect*: keyframes that share no point with the newest one nor with its neighbours, and are old, are ranked by how
-   much they look like it (`places`: nothing is trained or downloaded). Those that do so no less than its neighbours do,
-   the best few of them, are matched feature by feature.
+1. *Detect*: keyframes that share few points with the newest one, and are old, are ranked by how much they look like
+   it (`places`: nothing is trained or downloaded). Those that do so no less than its neighbours do, the best few of
+   them, are matched feature by feature.
 2. *Verify*: a pose by RANSAC, then by all points around the candidate, in metres since depth is known. It must explain
    most of what should be in view, agree with the keyframes before, and ask for no more correction than the way since
    the candidate may have drifted. The last condition is ours: rooms that look the same pass all others.
@@ -25,7 +25,7 @@ from .bundle.pose_graph import Edge, optimise_poses
 from .localisation.observation import Observations
 from .localisation.recognition import around, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
-from .localisation.surroundings import apart
+from .localisation.surroundings import not_held
 from .localisation.tracking import Matches
 from .mapping.islands import Islands
 from .mapping.local_mapping import LocalMapper
@@ -137,7 +137,7 @@ class LoopCloser:
 
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
         s = self.settings.loop_closing
-        elsewhere = apart(self.world, slot, s.away)
+        elsewhere = not_held(self.world, slot, s.away)
         there, here = self.world.kf_island[elsewhere], self.world.kf_island[slot]
         elsewhere = elsewhere[(there == here) | (there == 0) | (here == 0)]
         if not len(elsewhere):

@@ -5,7 +5,8 @@ import pytest
 
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.surroundings import Surroundings, apart
+from dynslam_bench.slam.localisation import surroundings as rules
+from dynslam_bench.slam.localisation.surroundings import Surroundings, apart, not_held
 from dynslam_bench.slam.mapping.map import Map
 from dynslam_bench.slam.settings import BackendSettings
 
@@ -40,6 +41,13 @@ def surroundings(chain, *, enabled):
 )
 def test_what_is_apart_is_connected_over_no_third_and_was_made_long_before_or_after(chain, keyframe, away, expected):
     assert apart(chain, keyframe, away).tolist() == expected
+
+
+def test_who_shares_few_points_may_be_recognised_anew(chain, monkeypatch):
+    assert not_held(chain, 5, 1).tolist() == [0, 1, 2, 3, 4], "ten points do not hold the fourth in place"
+    monkeypatch.setattr(rules, "HELD", SHARED)
+    assert not_held(chain, 5, 1).tolist() == [0, 1, 2, 3]
+    assert not_held(chain, 5, 3).tolist() == [0, 1, 2], "nor who was made just before"
 
 
 def test_without_loop_closing_everything_is_near(chain):

@@ -15,6 +15,8 @@ from ..settings import BackendSettings
 
 Slots = NDArray[np.int64]
 
+HELD = 15
+"""Two keyframes that share so many points hold each other in place (the least that ORB-SLAM2 calls covisible)."""
 LIMIT = 80
 """Keyframes at most whose points are looked for where the local map is the covisible one."""
 
@@ -72,13 +74,26 @@ def apart(world: Map, keyframe: int, away: int) -> Slots:
     Those of other islands always are.
     """
     near, _ = world.covisible(keyframe)
-    connected = np.zeros(world.kf_alive.size, bool)
-    connected[keyframe] = True
-    connected[near] = True
     table = world.kf_point[near]
     further, _ = world.covisible_of(np.unique(table[table >= 0]))
-    connected[further] = True
-    long_ago = (np.abs(world.kf_id - world.kf_id[keyframe]) >= away) & ~connected
+    return _long_ago(world, keyframe, away, np.concatenate([near, further]))
+
+
+def not_held(world: Map, keyframe: int, away: int) -> Slots:
+    """Slots of the keyframes made `away` before or after one, or longer, that share fewer than `HELD` points with it.
+
+    After a loop that was closed a little off, a second visit is connected with the first by few points, and drifts
+    beside it: who shares so few may be recognised anew. Those of other islands always may.
+    """
+    near, shared = world.covisible(keyframe)
+    return _long_ago(world, keyframe, away, near[shared >= HELD])
+
+
+def _long_ago(world: Map, keyframe: int, away: int, connected: Slots) -> Slots:
+    here = np.zeros(world.kf_alive.size, bool)
+    here[keyframe] = True
+    here[connected] = True
+    long_ago = (np.abs(world.kf_id - world.kf_id[keyframe]) >= away) & ~here
     return np.flatnonzero(world.kf_alive & (long_ago | (world.kf_island != world.kf_island[keyframe])))
 
 
