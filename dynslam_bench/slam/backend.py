@@ -272,6 +272,7 @@ class RgbdBackend:
             map_points=len(self.map_points()[0]),
             keyframes=self.world.keyframe_count,
             maps=self.world.map_count,
+            loops=len(self.loops.closed),
             timings=spent or {},
         )
 

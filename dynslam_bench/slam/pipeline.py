@@ -235,6 +235,7 @@ class SlamPipeline:
             "keyframes": float(located.keyframes),
             "keyframe": float(located.keyframe),
             "maps": float(located.maps),
+            "loops": float(located.loops),
             "residual_px": located.residual_px,
             "mask_fraction": 0.0 if culled.mask is None else float(culled.mask.mean()),
             "relocalised": float(located.relocalised),

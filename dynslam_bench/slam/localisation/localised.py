@@ -27,6 +27,7 @@ class Localised:
         map_points: Points in the map afterwards.
         keyframes: Keyframes in the map afterwards.
         maps: Maps that they are of: beside the first one those that began after a loss and have not met it.
+        loops: Loops that were closed so far.
         timings: Seconds of ``tracking``, ``mapping`` and ``bundle_adjustment``.
     """
 
@@ -40,4 +41,5 @@ class Localised:
     map_points: int
     keyframes: int
     maps: int
+    loops: int
     timings: Mapping[str, float]
