@@ -36,7 +36,7 @@ PARTS = {
         )
     ),
     "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=8-30",),
-    "fr1": tuple(f"{SHARED}/data/tum/rgbd_dataset_freiburg1_{name}?offsets=4-7" for name in ("xyz", "rpy")),
+    "fr1": tuple(f"{SHARED}/data/tum/rgbd_dataset_freiburg1_{name}?offsets=4-15" for name in ("xyz", "rpy")),
 }  # fmt: skip
 
 

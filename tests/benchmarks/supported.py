@@ -4,10 +4,10 @@
         [--install [--tests tests]] [--into FOLDER] [--record FILE]
 
 Needs `uv` (``pip install uv``). Each pair is resolved: there are versions of all dependencies that fit together for
-that Python, the oldest of the direct ones being the first with a wheel for it since those that `pyproject.toml` names. The sources are compiled by that
-Python where it is installed. With `--install` all is installed into a fresh environment, several GB with torch, and
-used there as a newcomer would: `STEPS`. With `--tests` those tests are run there, too, as the project's workflow does.
-`--into` keeps the environments, and takes those that are there.
+that Python, the oldest of the direct ones being the first with a wheel for it since those that `pyproject.toml` names.
+The sources are compiled by that Python where it is installed. With `--install` all is installed into a fresh
+environment, several GB with torch, and used there as a newcomer would: `STEPS`. With `--tests` those tests are run
+there, too, as the project's workflow does. `--into` keeps the environments, and takes those that are there.
 
 Bar: every pair resolves, compiles and passes.
 """

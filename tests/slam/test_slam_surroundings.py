@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dynslam_bench.core.settings import apply_overrides
-from dynslam_bench.slam.localisation.observation import observe
 from dynslam_bench.slam.localisation import surroundings as rules
+from dynslam_bench.slam.localisation.observation import observe
 from dynslam_bench.slam.localisation.surroundings import Surroundings, apart, not_held
 from dynslam_bench.slam.mapping.map import Map
 from dynslam_bench.slam.settings import BackendSettings
