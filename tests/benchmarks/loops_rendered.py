@@ -1,10 +1,10 @@
 """Loops on rendered sequences: the same frames without and with loop closing.
 
-    python tests/benchmarks/loops_rendered.py [--sequences synthetic/loop_corridor@3] [--stride 2] [--orbslam3 5]
+    python tests/benchmarks/loops_rendered.py [--sequences synthetic/loop_corridor@3] [--stride 2] [--rivals 5]
 
 Frames are rendered, their ORB features kept, nothing else. Prints for each back end: frames that count as tracked and
 RMSE of their positions after the best rigid alignment, online and final (with `full`: all of the map refined at the
-end, which takes minutes in a large one), and every loop with the true distance between its two ends. `--orbslam3`
+end, which takes minutes in a large one), and every loop with the true distance between its two ends. `--rivals`
 gives each frame to so many ORB-SLAM3s, too, while it is there (docs/orbslam3.md).
 """
 
@@ -92,12 +92,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequences", nargs="+", default=["synthetic/loop_corridor@3"])
     parser.add_argument("--stride", type=int, default=2)
-    parser.add_argument("--orbslam3", type=int, default=0, metavar="RUNS")
+    parser.add_argument("--rivals", type=int, default=0, metavar="RUNS")
     parser.add_argument("--settings", nargs="+", choices=sorted(SETTINGS), default=list(SETTINGS))
     options = parser.parse_args()
     cv2.setNumThreads(1)
     for source in options.sequences:
-        sequence, frames, together = features_of(source, options.stride, options.orbslam3)
+        sequence, frames, together = features_of(source, options.stride, options.rivals)
         for row in together.results():
             print(f"{source}, ORB-SLAM3: {row}", flush=True)
         for name in options.settings:
