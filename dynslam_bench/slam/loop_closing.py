@@ -92,6 +92,7 @@ class LoopCloser:
         self._seed = seed
         self._way: dict[int, float] = {}
         self._walked = 0.0
+        self._short_cuts: list[tuple[float, float]] = []
         self._last_centre: Array | None = None
         self._row: list[Array] = []
         self._ties: list[Edge] = []
@@ -123,6 +124,7 @@ class LoopCloser:
         else:
             self._correct(slot, loop)
         self._fuse(slot, loop.keyframe)
+        self._short_cuts.append((self._way.get(int(self.world.kf_id[loop.keyframe]), 0.0), self._walked))
         self.closed.append(loop)
         return True
 
@@ -153,7 +155,7 @@ class LoopCloser:
         return None
 
     def _as_alike_as_neighbours(self, slot: int, elsewhere: Slots, seen: Observations) -> list[int]:
-        near = around(self.world, slot)[1:]
+        near = np.setdiff1d(around(self.world, slot)[1:], elsewhere)  # what is to be recognised is no measure of it
         score = likeness(self.world, np.concatenate([near, elsewhere]), seen)
         least = score[: len(near)].min(initial=np.inf)
         there = score[len(near) :]
@@ -192,8 +194,13 @@ class LoopCloser:
             if not here:
                 return self.islands.may_lie(there, se3.inverse(correction))
             return self.islands.may_lie(here, correction)
-        way = self._walked - self._way.get(int(self.world.kf_id[loop.keyframe]), 0.0)  # 0: of a loaded map
+        way = self._way_to(loop.keyframe)
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
+
+    def _way_to(self, slot: int) -> float:
+        """Metres along which drift can have come in since a keyframe: all that was walked, or over a closed loop."""
+        then = self._way.get(int(self.world.kf_id[slot]), 0.0)  # 0: of a loaded map
+        return min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
 
     # ------------------------------------------------------------------ correct and fuse
 

@@ -23,13 +23,12 @@ sys.path.insert(0, str(ROOT))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from synthetic_judge import SideBySide, rmse  # noqa: E402
+from synthetic_judge import SideBySide, error, trajectory  # noqa: E402
 
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
 from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
-from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
 from dynslam_bench.sequences import open_sequence  # noqa: E402
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
@@ -67,22 +66,21 @@ def drive(sequence: SyntheticSequence, frames: list[FrameBundle], settings: Back
     backend.reset(sequence.camera, 0)
     truth = sequence.ground_truth
     true = truth.T_world_cam[np.searchsorted(truth.timestamps, [frame.timestamp - 1e-6 for frame in frames])][:, :3, 3]
-    online, spent, loops = {}, 0.0, []
+    online, spent, loops = [], 0.0, []
     for number, frame in enumerate(frames):
         begin = time.process_time()
         found = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
         spent += time.process_time() - begin
         if found.state == "ok" and found.T_world_cam is not None:
-            online[frame.timestamp] = found.T_world_cam
+            online.append((frame.timestamp, found.T_world_cam))
         for loop in backend.loops.closed[len(loops) :]:
             apart = np.linalg.norm(true[number] - true[loop.frame])
             kind = "join" if loop.joins else "loop"
             loops.append(f"{kind} {number} -> {loop.frame}, {loop.inliers} points, {apart:.2f} m apart")
-    tracked = Trajectory(np.array([*online]), np.array([*online.values()]))
     final = backend.finalize()
     return (
-        f"online {rmse(tracked, truth):.3f} m on {len(tracked)}, "
-        f"final {rmse(final, truth):.3f} m on {len(final)} of {len(frames)} frames, "
+        f"online {error(trajectory(online), truth)} m on {len(online)}, "
+        f"final {error(final, truth)} m on {len(final)} of {len(frames)} frames, "
         f"{1e3 * spent / len(frames):.0f} ms a frame, {'; '.join(loops) or 'no loop'}"
     )
 
@@ -98,11 +96,11 @@ def main() -> None:
     cv2.setNumThreads(1)
     for source in options.sequences:
         sequence, frames, together = features_of(source, options.stride, options.rivals)
-        for row in together.results():
-            print(f"{source}, ORB-SLAM3: {row}", flush=True)
         for name in options.settings:
             settings = apply_overrides(BackendSettings(), SETTINGS[name])
             print(f"{source}, closing {name}: {drive(sequence, frames, settings)}", flush=True)
+        for row in together.results():
+            print(f"{source}, ORB-SLAM3: {row}", flush=True)
 
 
 if __name__ == "__main__":

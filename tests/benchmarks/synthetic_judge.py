@@ -64,6 +64,16 @@ def without(frame: Frame, hidden: np.ndarray) -> Frame:
     return Frame(frame.index, frame.timestamp, mixed, np.where(grown > 0, np.float32(0), frame.depth))
 
 
+def trajectory(poses: list[tuple[float, np.ndarray]]) -> Trajectory:
+    """Of stamps and camera-to-world poses; there may be none."""
+    return Trajectory(np.array([stamp for stamp, _ in poses]), np.reshape([pose for _, pose in poses], (-1, 4, 4)))
+
+
+def error(estimate: Trajectory, truth: Trajectory) -> float | None:
+    """`rmse` to 0.01 mm; None of fewer than three poses, which any path fits."""
+    return round(rmse(estimate, truth), 5) if len(estimate) > 2 else None
+
+
 class SideBySide:
     """Several runs of ORB-SLAM3: each frame is read once and given to one run after the other.
 
@@ -96,10 +106,8 @@ class SideBySide:
         for run, online, tracker in zip(self.runs, self._online, self._trackers, strict=True):
             final = tracker.finalize()
             tracker.close()
-            tracked = Trajectory(*(np.array(column) for column in zip(*online, strict=True)))  # some frame is
             rows.append({
-                "run": run, "final": round(rmse(final, self._truth), 5),
-                "online": round(rmse(tracked, self._truth), 5),
+                "run": run, "final": error(final, self._truth), "online": error(trajectory(online), self._truth),
                 "coverage": round(len(online) / self._frames, 4),
             })  # fmt: skip
         return rows

@@ -46,8 +46,8 @@ def test_what_is_apart_is_connected_over_no_third_and_was_made_long_before_or_af
 def test_who_shares_few_points_may_be_recognised_anew(chain, monkeypatch):
     assert not_held(chain, 5, 1).tolist() == [0, 1, 2, 3, 4], "ten points do not hold the fourth in place"
     monkeypatch.setattr(rules, "HELD", SHARED)
-    assert not_held(chain, 5, 1).tolist() == [0, 1, 2, 3]
-    assert not_held(chain, 5, 3).tolist() == [0, 1, 2], "nor who was made just before"
+    assert not_held(chain, 5, 1).tolist() == [0, 1, 2], "the fourth holds the third"
+    assert not_held(chain, 5, 4).tolist() == [0, 1], "nor who was made not long before"
 
 
 def test_without_loop_closing_everything_is_near(chain):

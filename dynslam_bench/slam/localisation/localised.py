@@ -28,7 +28,7 @@ class Localised:
         keyframes: Keyframes in the map afterwards.
         maps: Maps that they are of: beside the first one those that began after a loss and have not met it.
         loops: Loops that were closed so far.
-        timings: Seconds of ``tracking``, ``mapping`` and ``bundle_adjustment``.
+        timings: Seconds of ``tracking``, ``mapping``, ``bundle_adjustment`` and ``loop_closing``, where they worked.
     """
 
     T_world_cam: NDArray[np.float64] | None

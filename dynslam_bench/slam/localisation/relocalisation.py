@@ -59,7 +59,7 @@ def ransac_pose(
         rng: Draws the samples.
 
     Returns:
-        The world-to-camera pose with the most inliers and its inliers; None if no sample gave a pose.
+        The world-to-camera pose with the most inliers and its inliers; None if no sample gave one with four.
     """
     n = len(position)
     if n < 4:
@@ -93,14 +93,14 @@ def _triples(n: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
 
 def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
     """All poses ``[H, 4, 4]``, world to camera, that fit any of the samples ``[S, 3, 3]`` and ``[S, 3, 2]``."""
-    vectors: list[tuple[Array, Array]] = []
+    found = [np.zeros((0, 6))]
     for points, pixels in zip(position, xy, strict=True):
         try:
             _, rotations, translations = cv2.solveP3P(points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_AP3P)
         except cv2.error:  # a degenerate sample, e.g. collinear points
             continue
-        vectors += zip(rotations, translations, strict=True)
-    flat = np.reshape(vectors, (-1, 6))
+        found.append(np.hstack([np.reshape(rotations, (-1, 3)), np.reshape(translations, (-1, 3))]))
+    flat = np.concatenate(found)
     flat = flat[np.isfinite(flat).all(axis=1)]
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(flat[:, :3]).as_matrix()

@@ -80,13 +80,16 @@ def apart(world: Map, keyframe: int, away: int) -> Slots:
 
 
 def not_held(world: Map, keyframe: int, away: int) -> Slots:
-    """Slots of the keyframes made `away` before or after one, or longer, that share fewer than `HELD` points with it.
+    """Slots of the keyframes made `away` before or after one, or longer, that nothing holds in place beside it.
 
-    After a loop that was closed a little off, a second visit is connected with the first by few points, and drifts
-    beside it: who shares so few may be recognised anew. Those of other islands always may.
+    Two that share `HELD` points hold each other, and so does a third that shares as many with both. After a loop that
+    was closed a little off, a second visit is connected with the first by fewer, and drifts beside it: such a place may
+    be recognised anew. Keyframes of other islands always may.
     """
     near, shared = world.covisible(keyframe)
-    return _long_ago(world, keyframe, away, near[shared >= HELD])
+    near = near[shared >= HELD]
+    further = [other[count >= HELD] for other, count in map(world.covisible, near.tolist())]
+    return _long_ago(world, keyframe, away, np.concatenate([near, *further]))
 
 
 def _long_ago(world: Map, keyframe: int, away: int, connected: Slots) -> Slots:
