@@ -23,6 +23,8 @@ class Camera:
         distortion: Radial-tangential coefficients ``(k1, k2, p1, p2, k3)``, OpenCV's order.
         depth_factor: Raw 16-bit depth units a metre (5000 in TUM files).
         baseline_m: Baseline of the (virtual) stereo pair that turns depth into a right coordinate, in metres.
+        readout_s: Seconds from the first row's exposure to the last one's, the frame's stamp being the middle row's
+            time (rolling shutter); 0 is a global shutter, or one of which nothing is known.
     """
 
     width: int
@@ -34,6 +36,7 @@ class Camera:
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_factor: float = 5000.0
     baseline_m: float = 0.075
+    readout_s: float = 0.0
 
     @cached_property
     def matrix(self) -> NDArray[np.float64]:

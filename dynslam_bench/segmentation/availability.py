@@ -63,7 +63,7 @@ def masks_are_optional(settings: Settings) -> bool:
 
 def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequence) -> None:
     missing = RecordedSegmenter(folder).missing(sequence.timestamps)
-    if settings.schedule == "every_nth":  # the only schedule that says beforehand which frames it will ask for
+    if settings.schedule == "every_nth" and settings.crowded_share >= 1:  # else nobody knows which it will ask for
         missing = [index for index in missing if index % settings.n == 0]
     if missing:
         raise SegmentationError(

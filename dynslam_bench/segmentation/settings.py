@@ -65,6 +65,10 @@ class SegmentationSettings(Settings):
         10, low=3, high=30, limits=(1, None), unit="frames", online=True, when={"schedule": ["keyframes"]},
         meaning="frames after which the segmenter runs even without a keyframe",
     )  # fmt: skip
+    crowded_share: float = tunable(
+        1.0, low=0.3, high=1.0, limits=(0.0, 1.0), online=True, when={"schedule": ["every_nth", "keyframes"]},
+        meaning="where masks cover more than this share of the view, the segmenter runs on every frame; 1 = off",
+    )  # fmt: skip
     carry: Literal["dis", "sparse"] = tunable(
         "dis",
         when={"schedule": ["every_nth", "keyframes"]},

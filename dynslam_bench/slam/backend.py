@@ -23,6 +23,7 @@ from .localisation.localised import Localised
 from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
 from .localisation.reach import Reach
+from .localisation.rolling_shutter import Speeds, as_seen_at_once
 from .localisation.surroundings import Surroundings
 from .localisation.tracking import MapFit, Tracked, fit_to_map
 from .loop_closing import LoopCloser
@@ -98,6 +99,7 @@ class RgbdBackend:
         self._unrecognised = 0
         self._reach = Reach(anywhere=bool(start.file))
         self._last: Tracked | None = None
+        self._first: tuple[FrameBundle, Observations] | None = None
         self._motion = CameraMotion()
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
@@ -131,6 +133,7 @@ class RgbdBackend:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
         if np.count_nonzero(seen.z > 0) < MIN_INITIAL:
             return self._localised(None)
+        self._first = (frame, seen) if self._rolling else None
         return self._begin_map(frame, seen, np.eye(4))
 
     def _begin_map(self, frame: FrameBundle, seen: Observations, T_cam_world: Array) -> Localised:
@@ -143,6 +146,15 @@ class RgbdBackend:
         points = int(np.count_nonzero(tracked.point >= 0))
         return replace(self._localised(T_cam_world, spent), matches=points, inliers=points)
 
+    def _begin_again(
+        self, frame: FrameBundle, seen: Observations, first: tuple[FrameBundle, Observations], speeds: Speeds
+    ) -> Localised:
+        """The second frame tells how the camera moved in the first, whose points a rolling shutter had put askew."""
+        self.reset(self.camera, self.seed)
+        self._motion.last_speeds = speeds
+        self._begin_map(first[0], as_seen_at_once(first[1], self.camera, speeds), np.eye(4))
+        return self._localise(frame, seen)
+
     def _state(self) -> TrackingState:
         """Poses count in the world of the first map alone."""
         self._island = int(self.world.kf_island[self._reference])
@@ -151,6 +163,7 @@ class RgbdBackend:
     def _localise(self, frame: FrameBundle, seen: Observations) -> Localised:
         """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
         last = self._nowhere(frame, seen) if self._last is None else self._last
+        raw, seen = seen, self._at_once(seen, last, frame.timestamp)
         prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
         reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
@@ -161,15 +174,31 @@ class RgbdBackend:
             return self._lost(frame, seen, last, prediction)
         points = self._surroundings.points(first.keyframe, first.matches.point)
         fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, points, self.settings.tracking)
+        if seen is not raw:  # the pose tells the motion better than the frame before did
+            seen = self._at_once(raw, last, frame.timestamp, fit.estimate.T_cam_world)
+            fit = fit.again(self.world, seen)
         if self._grows:
             self.world.visible[fit.in_view] += 1
         if fit.count < self._needed_inliers() or not np.isfinite(fit.estimate.T_cam_world).all():
             found = self._lost(frame, seen, last, prediction)
         else:
             taken = self._accept(frame, seen, fit, last)
+            if self._first is not None and self._motion.last_speeds is not None:
+                return self._begin_again(frame, raw, self._first, self._motion.last_speeds)
             spent = self._keyframe_if_wanted(frame, taken, fit)
             found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
         return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)
+
+    @property
+    def _rolling(self) -> bool:
+        return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s)
+
+    def _at_once(self, seen: Observations, last: Tracked, timestamp: float, pose: Array | None = None) -> Observations:
+        """The features as a global shutter would have shown them, by the frame's pose or the motion so far."""
+        speeds = None
+        if self._rolling and self._tracked:
+            speeds = self._motion.speeds(last, timestamp, self.settings.motion, pose)
+        return seen if speeds is None else as_seen_at_once(seen, self.camera, speeds)
 
     def _needed_inliers(self) -> int:
         return self.settings.tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
@@ -192,7 +221,7 @@ class RgbdBackend:
 
     def _lost(self, frame: FrameBundle, seen: Observations, last: Tracked, prediction: Array) -> Localised:
         """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
-        self.state = "lost"
+        self.state, self._first = "lost", None
         deep = int(np.count_nonzero(seen.z > 0))
         if self._tracked:
             self._reach.lost(last, deep, MIN_INITIAL)

@@ -93,6 +93,11 @@ class TrackingSettings(Settings):
         unit="1/m",
         meaning="standard deviation of the depth over its square",
     )
+    rolling_shutter: bool = Field(
+        True,
+        description="whether features are moved to where the middle row's camera would have seen them; takes a camera "
+        "whose readout_s is known",
+    )
 
 
 class KeyframeSettings(Settings):

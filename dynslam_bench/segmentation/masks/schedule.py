@@ -13,6 +13,7 @@ from ..build_segmenter import ConfiguredSegmenter, build_segmenter
 from ..settings import SegmentationSettings
 from .carry import carry_dense, carry_sparse
 from .compensation import MissedDetections
+from .postprocess import select
 
 
 class MaskScheduler:
@@ -75,11 +76,18 @@ class MaskScheduler:
         return found
 
     def _due(self, keyframe: bool) -> bool:
-        if self._settings.schedule == "every":
+        if self._settings.schedule == "every" or self._crowded():
             return True
         if self._settings.schedule == "every_nth":
             return self._age >= self._settings.n
         return keyframe or self._age >= self._settings.max_carry
+
+    def _crowded(self) -> bool:
+        """Whether so much of the previous view was covered that carried masks would leave too little to trust."""
+        if self._settings.crowded_share >= 1:
+            return False
+        chosen = select(self._found, self._settings)
+        return len(chosen) > 0 and float(chosen.union().mean()) > self._settings.crowded_share
 
     def _forget(self) -> None:
         self._missed.reset()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -71,8 +72,8 @@ class SyntheticSequence:
 
     @property
     def camera(self) -> Camera:
-        """The camera of TUM's fr3 sequences, without distortion."""
-        return CAMERA
+        """The camera of TUM's fr3 sequences, without distortion; the fast sequences' has a rolling shutter."""
+        return replace(CAMERA, readout_s=self.scene.world.optics.readout_s)
 
     @property
     def timestamps(self) -> NDArray[np.float64]:

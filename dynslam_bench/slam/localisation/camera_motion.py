@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..settings import MotionModelSettings
 from .motion_model import MotionState, pose_covariance
+from .rolling_shutter import Speeds
 from .tracking import Tracked
 
 Array = NDArray[np.float64]
@@ -16,17 +19,28 @@ FIRST_INTERVAL_S = 1 / 30
 JITTER = 0.1
 """Share of the last interval by which a stamp may be off and still count as regular: the noise of stamping."""
 
+STAMPING = 0.25
+"""Share of the usual interval by which a stamp may be off that was given after the exposure (TUM's are off by 0.2)."""
+GAPS = 15
+"""So many intervals tell the usual one."""
+
 
 class CameraMotion:
-    """The motion model while tracking; it knows nothing at the start and after a lost frame."""
+    """The motion model while tracking; it knows nothing at the start and after a lost frame.
+
+    Attributes:
+        last_speeds: How the world moved past the camera in the last tracked frame; None where nothing is known of it.
+    """
 
     def __init__(self) -> None:
         self._state: MotionState | None = None
         self._interval = FIRST_INTERVAL_S
+        self.last_speeds: Speeds | None = None
+        self._gaps: deque[float] = deque(maxlen=GAPS)
 
     def forget(self) -> None:
         """The camera was lost: nothing is known of its motion."""
-        self._state = None
+        self._state = self.last_speeds = None
 
     def relocated(self, T_cam_world: Array) -> None:
         """The same motion at another pose, as after bundle adjustment."""
@@ -42,6 +56,25 @@ class CameraMotion:
         """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
         ahead = self._ahead(last, timestamp, settings)
         return last.T_cam_world if ahead is None else ahead.T_cam_world
+
+    def speeds(
+        self, last: Tracked, timestamp: float, settings: MotionModelSettings, pose: Array | None = None
+    ) -> Speeds | None:
+        """How the world moves past the camera during a frame; None where nothing is known of it.
+
+        Not the filter's: that takes the acceleration as constant between frames, and follows a hand by swinging about
+        the true speed from one frame to the next.
+
+        Args:
+            last: The last tracked frame.
+            timestamp: The frame's stamp, seconds.
+            settings: Of the motion model.
+            pose: The frame's world-to-camera pose, if it was found already; else it goes on as it went before.
+        """
+        dt = timestamp - last.timestamp
+        if not 0 < dt <= settings.max_gap_s:
+            return None
+        return self.last_speeds if pose is None else Speeds.between(last.T_cam_world, pose, self._exposed_apart(dt))
 
     def covariance(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> Array | None:
         """How far the motion since the last frame may be from the predicted one (`MotionState.motion_covariance`)."""
@@ -63,14 +96,22 @@ class CameraMotion:
         Returns:
             World-to-camera pose; the measured one where nothing is known of the gap, or the filter is off.
         """
+        self.last_speeds = self.speeds(last, timestamp, settings, measured)
         covariance = pose_covariance(measured, information, settings.inflation)
         dt, ahead = self._known_gap(last, timestamp, settings), self._ahead(last, timestamp, settings)
         if dt is None or ahead is None:
             self._state = MotionState.at(measured, covariance)
             return measured
         self._interval = dt
+        self._gaps.append(dt)
         self._state = ahead.updated(measured, covariance)
         return self._state.T_cam_world if settings.filter else measured
+
+    def _exposed_apart(self, dt: float) -> float:
+        """Seconds between two exposures: a camera ticks evenly, however its frames were stamped."""
+        tick = float(np.median(self._gaps)) if self._gaps else dt
+        ticks = round(dt / tick)
+        return ticks * tick if abs(dt - ticks * tick) <= STAMPING * tick and ticks else dt
 
     def _ahead(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> MotionState | None:
         dt = self._known_gap(last, timestamp, settings)

@@ -89,7 +89,7 @@ def observe(
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
     has_depth = z > 0
     bf = camera.fx * camera.baseline_m
-    right = np.where(has_depth, xy[:, 0] - bf / np.where(has_depth, z, 1.0), np.nan)
+    right = right_of(xy, z, camera)
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
     variance = scales[octave] ** 2
     info = weight[index] / variance
@@ -111,3 +111,9 @@ def observe(
         frame.rgb[row, column],
         frame.mask,
     )
+
+
+def right_of(xy: NDArray[np.float64], z: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Right coordinates ``[N]`` of pixels ``[N, 2]`` with depths ``[N]`` in metres; NaN where the depth is 0."""
+    known = z > 0
+    return np.where(known, xy[:, 0] - camera.fx * camera.baseline_m / np.where(known, z, 1.0), np.nan)

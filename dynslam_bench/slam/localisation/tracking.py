@@ -5,7 +5,7 @@ All functions are pure: they read the map and never change it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,6 +193,11 @@ class MapFit:
     def count(self) -> int:
         """Number of inliers."""
         return int(np.count_nonzero(self.inliers))
+
+    def again(self, world: Map, seen: Observations) -> MapFit:
+        """The pose fitted anew to the same matches, the features of which have moved a little."""
+        estimate = solve(world, seen, self.matches, self.estimate.T_cam_world)
+        return replace(self, estimate=estimate, inliers=estimate.inliers & (self.matches.point >= 0))
 
 
 def fit_to_map(
