@@ -23,6 +23,7 @@ import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, TWIN_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
@@ -104,10 +105,13 @@ class SideBySide:
         """Of each run its number, the RMSE of the final and the online trajectory in metres, and the coverage."""
         rows: list[dict[str, object]] = []
         for run, online, tracker in zip(self.runs, self._online, self._trackers, strict=True):
-            final = tracker.finalize()
+            try:
+                final = error(tracker.finalize(), self._truth)
+            except TrackerError:  # with no keyframe left it dies while it saves
+                final = None
             tracker.close()
             rows.append({
-                "run": run, "final": error(final, self._truth), "online": error(trajectory(online), self._truth),
+                "run": run, "final": final, "online": error(trajectory(online), self._truth),
                 "coverage": round(len(online) / self._frames, 4),
             })  # fmt: skip
         return rows
@@ -147,10 +151,13 @@ def table(rows: list[dict]) -> str:
     for row in sorted(rows, key=rank):
         groups.setdefault((row["id"], row["control"]), []).append(row)
     for (id, control), members in groups.items():
-        final = [m["final"] for m in members]
+        final, online = (sorted(m[kind] for m in members if m[kind] is not None) for kind in ("final", "online"))
+        spread = f"{final[0]:.4f} / {np.median(final):.4f} / {final[-1]:.4f}" if final else "none"
+        if len(final) < len(members):
+            spread += f" ({len(members) - len(final)} without a trajectory)"
         lines.append(
-            f"| {id} | {control} | {len(members)} | {min(final):.4f} / {np.median(final):.4f} / {max(final):.4f} "
-            f"| {np.median([m['online'] for m in members]):.4f} | {min(m['coverage'] for m in members):.3f} "
+            f"| {id} | {control} | {len(members)} | {spread} "
+            f"| {f'{np.median(online):.4f}' if online else 'none'} | {min(m['coverage'] for m in members):.3f} "
             f"| {members[0]['never']:.3f} |"
         )
     return "\n".join(lines)

@@ -82,6 +82,7 @@ class ProgramTracker:
                 "cy": camera.cy,
                 "distortion": list(camera.distortion),
                 "baseline_m": camera.baseline_m,
+                "readout_s": camera.readout_s,
                 "fps": self.context.fps,
             },
             "images": self._exchange.announce(),

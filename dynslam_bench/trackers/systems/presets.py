@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 _SECOND: dict[str, Any] = {"segmentation.schedule": "every_nth", "segmentation.n": 2}
-FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.4}}
-"""The network sees every second frame, and each while masks cover 40 % of the view; between them optical flow carries them."""
+FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.5}}
+"""The network sees every second frame, and each while masks cover half of the view; between them optical flow carries them."""
 FAST_FLOW = {"fast": _SECOND | {"flow.budget": 24}}
 """The same, and the flow searches for less than half as long: behind masks that changes no error that can be shown."""
