@@ -97,7 +97,8 @@ def test_info_tells_a_program_what_it_may_set(cli):
 
 
 def test_info_says_what_a_preset_sets(cli):
-    assert "fast (segmentation.schedule=every_nth, segmentation.n=2)" in cli("trackers", "info", "mask-rcnn")[1]
+    told = " ".join(cli("trackers", "info", "mask-rcnn")[1].split())
+    assert "segmentation.schedule=every_nth, segmentation.n=2, segmentation.crowded_share=0.5)" in told
     facts = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])
     assert facts["presets"] == {"fast": {"segmentation.schedule": "every_nth", "segmentation.n": 2, "flow.budget": 24}}
 

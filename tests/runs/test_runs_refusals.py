@@ -165,6 +165,10 @@ def test_a_schedule_excuses_only_the_masks_that_it_never_asks_for(tmp_path: Path
         ({}, "6 of 12 frames of 'toy/walk', the first is frame 1 "),
         ({"schedule": "keyframes"}, "6 of 12 frames of 'toy/walk', the first is frame 1 "),
         ({"schedule": "every_nth", "n": 3}, "2 of 12 frames of 'toy/walk', the first is frame 3 "),
+        (
+            {"schedule": "every_nth", "n": 2, "crowded_share": 0.5},
+            "6 of 12 frames of 'toy/walk', the first is frame 1 ",
+        ),
     ):
         with pytest.raises(SegmentationError, match=words):
             source(**how)

@@ -244,6 +244,16 @@ def test_every_frame_every_nth_and_keyframes():
     assert min(run(SegmentationSettings(schedule="every_nth", n=5, carry="sparse"))[1]) > 0.9
 
 
+@pytest.mark.parametrize(("schedule", "rests"), [("every_nth", [0, 4, 8]), ("keyframes", [0])])
+def test_where_masks_cover_much_of_the_view_every_frame_is_segmented(schedule, rests):
+    covered = scene(0)[1].mean()  # carried masks may cover a little less or more
+    settings = SegmentationSettings(schedule=schedule, n=4, max_carry=30)
+    less, more = (settings.model_copy(update={"crowded_share": factor * covered}) for factor in (0.5, 1.5))
+    assert run(less, keyframes=(0,))[0] == list(range(10))
+    assert run(more, keyframes=(0,))[0] == rests
+    assert run(less.model_copy(update={"confidence": 0.95}), keyframes=(0,))[0] == rests, "masks that do not count"
+
+
 def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
     segmenter = Square()
     settings = SegmentationSettings(schedule="every_nth", n=10)

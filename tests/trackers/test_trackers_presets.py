@@ -23,9 +23,11 @@ def test_each_sets_something_else_than_the_default(tracker, name):
     assert changed and changed <= set(spec.presets[name])
 
 
-def test_fast_asks_the_network_on_every_second_frame(tmp_path):
+@pytest.mark.parametrize(("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)])
+def test_fast_asks_the_network_on_every_second_frame_but_where_people_cover_the_view(tmp_path, more, asked):
     settings = {"segmentation.source": "oracle", **TRACKERS.get("mask-rcnn").presets["fast"]}
+    settings |= {f"segmentation.{name}": value for name, value in more.items()}
     spec = RunSpec(tracker="mask-rcnn", sequence="synthetic/walking_xyz?frames=7", settings=settings)
     (record,) = run_many([spec], results=tmp_path)
-    asked = pd.read_csv(RunStore(tmp_path).folder(record.run_id) / "frames.csv")["stat_segmented"]
-    assert asked.tolist() == [1, 0, 1, 0, 1, 0, 1]
+    frames = pd.read_csv(RunStore(tmp_path).folder(record.run_id) / "frames.csv")
+    assert frames["stat_segmented"].tolist() == asked

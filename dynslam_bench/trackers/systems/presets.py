@@ -6,6 +6,9 @@ from typing import Any
 
 _SECOND: dict[str, Any] = {"segmentation.schedule": "every_nth", "segmentation.n": 2}
 FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.5}}
-"""The network sees every second frame, and each while masks cover half of the view; between them optical flow carries them."""
+"""The network sees every second frame, and every one while masks cover half of the view.
+
+Between them masks are carried along by optical flow.
+"""
 FAST_FLOW = {"fast": _SECOND | {"flow.budget": 24}}
-"""The same, and the flow searches for less than half as long: behind masks that changes no error that can be shown."""
+"""Every second frame, and the flow searches for less than half as long: behind masks no error shows a change."""
