@@ -45,6 +45,7 @@ SPEC = TrackerSpec(
         "features spread by the cells of a grid, not by a quadtree",
         "relocalisation and matching without a bag of words",
         "mapping in step with tracking, in one thread",
+        "the rolling shutter of a camera whose readout is known is undone, which ORB-SLAM2 does not do",
     ),
     remarks="the identity filter on our own back end, not the ORB-SLAM2 program",
 )
