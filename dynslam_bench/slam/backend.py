@@ -100,7 +100,7 @@ class RgbdBackend:
         self._reach = Reach(anywhere=bool(start.file))
         self._last: Tracked | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
-        self._motion = CameraMotion()
+        self._motion = CameraMotion(self.camera.readout_s)
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
         self.loops = LoopCloser(self.world, self.mapper, self._islands, self.settings, self.seed)
@@ -183,8 +183,9 @@ class RgbdBackend:
             found = self._lost(frame, seen, last, prediction)
         else:
             taken = self._accept(frame, seen, fit, last)
-            if self._first is not None and self._motion.last_speeds is not None:
-                return self._begin_again(frame, raw, self._first, self._motion.last_speeds)
+            beginning, self._first = self._first, None
+            if beginning is not None and self._motion.last_speeds is not None:
+                return self._begin_again(frame, raw, beginning, self._motion.last_speeds)
             spent = self._keyframe_if_wanted(frame, taken, fit)
             found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
         return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)

@@ -143,6 +143,22 @@ def test_a_second_frame_that_shows_nothing_leaves_the_first_map_alone(shaken_fra
     assert backend.world.kf_frame[0] == frames[0].index
 
 
+def test_after_a_long_gap_the_first_map_stays_as_it_was_begun(shaken_frames):
+    room, frames = shaken_frames
+    later = [frames[0], *(replace(frame, timestamp=frame.timestamp + 5) for frame in frames[1:5])]
+    _, found, backend = drive(room, shaken, later, READOUT_S)
+    assert [each.state for each in found] == ["ok"] * 5 and len(backend.finalize()) == 5
+
+
+def test_stamps_that_nearly_coincide_tell_no_breakneck_motion(shaken_frames):
+    room, frames = shaken_frames
+    story = [
+        replace(frame, timestamp=frame.timestamp - (0.0333 if i in (1, 6) else 0)) for i, frame in enumerate(frames)
+    ]
+    _, found, _ = drive(room, shaken, story[:12], READOUT_S)
+    assert [each.state for each in found] == ["ok"] * 12
+
+
 def test_off_and_a_global_shutter_are_the_same_to_the_last_bit(shaken_frames):
     room, frames = shaken_frames
     _, plain, _ = drive(room, shaken, frames[:8], 0.0)

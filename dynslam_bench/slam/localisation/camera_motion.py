@@ -28,11 +28,15 @@ GAPS = 15
 class CameraMotion:
     """The motion model while tracking; it knows nothing at the start and after a lost frame.
 
+    Args:
+        readout_s: Seconds that the camera takes to read out a frame: no two are exposed less apart.
+
     Attributes:
         last_speeds: How the world moved past the camera in the last tracked frame; None where nothing is known of it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, readout_s: float = 0.0) -> None:
+        self._readout_s = readout_s
         self._state: MotionState | None = None
         self._interval = FIRST_INTERVAL_S
         self.last_speeds: Speeds | None = None
@@ -108,10 +112,10 @@ class CameraMotion:
         return self._state.T_cam_world if settings.filter else measured
 
     def _exposed_apart(self, dt: float) -> float:
-        """Seconds between two exposures: a camera ticks evenly, however its frames were stamped."""
+        """Seconds between two exposures: a camera ticks evenly however its frames were stamped, and reads out each."""
         tick = float(np.median(self._gaps)) if self._gaps else dt
-        ticks = round(dt / tick)
-        return ticks * tick if abs(dt - ticks * tick) <= STAMPING * tick and ticks else dt
+        ticks = round(dt / tick) * tick
+        return max(ticks if abs(dt - ticks) <= STAMPING * tick else dt, self._readout_s)
 
     def _ahead(self, last: Tracked, timestamp: float, settings: MotionModelSettings) -> MotionState | None:
         dt = self._known_gap(last, timestamp, settings)
