@@ -60,8 +60,8 @@ class KeyframeView:
     Attributes:
         T_world_cam: Camera-to-world pose ``[4, 4]``.
         keypoints: Its features (raw pixels).
-        xy: float64 ``[N, 2]`` undistorted pixels.
-        z: float32 ``[N]`` depth at the keypoints in metres, 0 missing.
+        xy: float64 ``[N, 2]`` undistorted pixels; of a rolling shutter as the middle row's camera would have seen them.
+        z: float32 ``[N]`` depth at the keypoints in metres, 0 missing; likewise.
         depth: float32 ``[H, W]`` metres, or None where the keyframe no longer keeps its image.
         timestamp: Seconds.
     """

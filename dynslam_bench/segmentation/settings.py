@@ -67,7 +67,7 @@ class SegmentationSettings(Settings):
     )  # fmt: skip
     crowded_share: float = tunable(
         1.0, low=0.3, high=1.0, limits=(0.0, 1.0), online=True, when={"schedule": ["every_nth", "keyframes"]},
-        meaning="where masks cover more than this share of the view, the segmenter runs on every frame; 1 = off",
+        meaning="where masks (not grown) cover more than this share of the view, every frame is segmented; 1 = off",
     )  # fmt: skip
     carry: Literal["dis", "sparse"] = tunable(
         "dis",

@@ -24,6 +24,7 @@ from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
 from .localisation.reach import Reach
 from .localisation.rolling_shutter import Speeds, as_seen_at_once
+from .localisation.straightening import STILL_AGREE, Straightening
 from .localisation.surroundings import Surroundings
 from .localisation.tracking import MapFit, Tracked, fit_to_map
 from .loop_closing import LoopCloser
@@ -101,6 +102,7 @@ class RgbdBackend:
         self._last: Tracked | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
         self._motion = CameraMotion(self.camera.readout_s)
+        self._straightening = Straightening(self.world, self.camera, self._motion)
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
         self.loops = LoopCloser(self.world, self.mapper, self._islands, self.settings, self.seed)
@@ -133,8 +135,9 @@ class RgbdBackend:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
         if np.count_nonzero(seen.z > 0) < MIN_INITIAL:
             return self._localised(None)
+        begun = self._begin_map(frame, seen, np.eye(4))
         self._first = (frame, seen) if self._rolling else None
-        return self._begin_map(frame, seen, np.eye(4))
+        return begun
 
     def _begin_map(self, frame: FrameBundle, seen: Observations, T_cam_world: Array) -> Localised:
         """A keyframe that shows nothing known; until its map is joined to the first one its frames count as lost."""
@@ -147,13 +150,26 @@ class RgbdBackend:
         return replace(self._localised(T_cam_world, spent), matches=points, inliers=points)
 
     def _begin_again(
-        self, frame: FrameBundle, seen: Observations, first: tuple[FrameBundle, Observations], speeds: Speeds
+        self,
+        frame: FrameBundle,
+        seen: Observations,
+        first: tuple[FrameBundle, Observations],
+        speeds: Speeds,
+        count: int,
     ) -> Localised:
-        """The second frame tells how the camera moved in the first, whose points a rolling shutter had put askew."""
-        self.reset(self.camera, self.seed)
-        self._motion.last_speeds = speeds
-        self._begin_map(first[0], as_seen_at_once(first[1], self.camera, speeds), np.eye(4))
-        return self._localise(frame, seen)
+        """The second frame tells how the camera moved in the first, whose points a rolling shutter had put askew.
+
+        Where fewer points agree then than the `count` before, the first frame stays as it was.
+        """
+        for moving in (speeds, None):
+            self.reset(self.camera, self.seed)
+            self._motion.last_speeds = moving
+            straight = first[1] if moving is None else as_seen_at_once(first[1], self.camera, moving)
+            self._begin_map(first[0], straight, np.eye(4))
+            found = self._localise(frame, seen)
+            if found.state == "ok" and found.inliers >= STILL_AGREE * count:
+                break
+        return found
 
     def _state(self) -> TrackingState:
         """Poses count in the world of the first map alone."""
@@ -163,7 +179,9 @@ class RgbdBackend:
     def _localise(self, frame: FrameBundle, seen: Observations) -> Localised:
         """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
         last = self._nowhere(frame, seen) if self._last is None else self._last
-        raw, seen = seen, self._at_once(seen, last, frame.timestamp)
+        raw = seen
+        if self._rolling:
+            seen = self._straightening.foreseen(raw, last, frame.timestamp, self.settings.motion)
         prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
         reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
@@ -171,35 +189,31 @@ class RgbdBackend:
         before = Before(last, prediction, self._reference, around, island, reach, close, self.seed, frame.index)
         first = first_pose(self.world, self._islands, seen, before, self.settings)
         if first is None:
-            return self._lost(frame, seen, last, prediction)
+            return self._lost(frame, raw, last, prediction)
         points = self._surroundings.points(first.keyframe, first.matches.point)
         fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, points, self.settings.tracking)
-        if seen is not raw:  # the pose tells the motion better than the frame before did
-            seen = self._at_once(raw, last, frame.timestamp, fit.estimate.T_cam_world)
-            fit = fit.again(self.world, seen)
+        speeds = None
+        if self._rolling:
+            at, motion, second = frame.timestamp, self.settings.motion, self._first is not None
+            seen, fit, speeds = self._straightening.refitted(raw, seen, fit, last, at, motion, anyhow=second)
         if self._grows:
             self.world.visible[fit.in_view] += 1
         if fit.count < self._needed_inliers() or not np.isfinite(fit.estimate.T_cam_world).all():
-            found = self._lost(frame, seen, last, prediction)
+            found = self._lost(frame, raw, last, prediction)
         else:
             taken = self._accept(frame, seen, fit, last)
+            self._motion.last_speeds = speeds
             beginning, self._first = self._first, None
-            if beginning is not None and self._motion.last_speeds is not None:
-                return self._begin_again(frame, raw, beginning, self._motion.last_speeds)
+            if beginning is not None and speeds is not None:
+                return self._begin_again(frame, raw, beginning, speeds, fit.count)
             spent = self._keyframe_if_wanted(frame, taken, fit)
             found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
         return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)
 
     @property
     def _rolling(self) -> bool:
-        return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s)
-
-    def _at_once(self, seen: Observations, last: Tracked, timestamp: float, pose: Array | None = None) -> Observations:
-        """The features as a global shutter would have shown them, by the frame's pose or the motion so far."""
-        speeds = None
-        if self._rolling and self._tracked:
-            speeds = self._motion.speeds(last, timestamp, self.settings.motion, pose)
-        return seen if speeds is None else as_seen_at_once(seen, self.camera, speeds)
+        """Whether the frame that comes can be straightened."""
+        return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked)
 
     def _needed_inliers(self) -> int:
         return self.settings.tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers

@@ -67,7 +67,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     finally:
         program.kill()
     assert program.returncode == 128 + number and "the same command goes on from there" in err, err
-    assert took < 2 + 10 * (_load() > 4), f"{took:.1f} s"
+    assert took < 2 + 10 * _crowded(), f"{took:.1f} s"
     assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
     assert not list(tmp_path.glob("results/runs/*")), "what was interrupted is no outcome"
 
@@ -88,9 +88,9 @@ def test_ctrl_c_while_everything_still_loads_is_one_line_and_stores_nothing(walk
         assert not list(tmp_path.glob("results/runs/*/run.json"))
 
 
-def _load():
-    """Processes that wait for a processor; on a crowded machine two seconds are no measure."""
-    return float(Path("/proc/loadavg").read_text().split()[0])
+def _crowded():
+    """Whether many processes wait for a processor: two seconds are no measure then."""
+    return float(Path("/proc/loadavg").read_text().split()[0]) > 1.5 * (os.cpu_count() or 1)
 
 
 @pytest.mark.parametrize("error", [ValueError("schema: KeyboardInterrupt"), RunError("cannot load")])

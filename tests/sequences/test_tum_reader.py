@@ -1,5 +1,7 @@
 """TUM-layout folders: what is read, and one clear line for everything that is wrong with them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sequence_folders import SHARED, make_folder, needs_shared, rewrite
@@ -42,6 +44,18 @@ def test_digest_tells_contents_apart_and_survives_moving(tmp_path):
     assert open_sequence(moved).digest() == before
     rewrite(moved / "groundtruth.txt", lambda lines: lines[:-1])
     assert open_sequence(moved).digest() != before
+
+
+def test_a_rolling_shutter_counts_in_the_digest_and_a_global_one_leaves_it_as_it_was(tmp_path, monkeypatch):
+    from dynslam_bench.sequences.readers import recorded
+
+    hashed = []
+    monkeypatch.setattr(recorded, "digest", lambda parts: hashed.append(parts[0]) or str(len(hashed)))
+    folder, *_ = make_folder(tmp_path / "a", frames=3)
+    plain = open_sequence(folder).camera
+    for readout_s in (0.0, 0.02):
+        open_sequence(folder, camera=replace(plain, readout_s=readout_s)).digest()
+    assert hashed[0].endswith("baseline_m=0.075)") and hashed[1].endswith("baseline_m=0.075, readout_s=0.02)")
 
 
 def test_frames_and_stride(tmp_path):

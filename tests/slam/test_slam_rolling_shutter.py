@@ -167,10 +167,51 @@ def test_off_and_a_global_shutter_are_the_same_to_the_last_bit(shaken_frames):
         np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
 
 
-def test_a_motion_that_cannot_be_leaves_the_features_where_they_are(room):
+@pytest.mark.parametrize(
+    "after", [[0, 0, 0, 0, 0.3, 0], [0, 0, 0, 0, 0.5, 0], [0.3, 0, 0, 0, 0, 0], [0.75, 0, 0, 0, 0, 0]]
+)
+def test_a_cut_is_no_motion(shaken_frames, after):
+    """From one frame to the next the camera is elsewhere: what holds without the rolling shutter holds with it."""
+    room, frames = shaken_frames
+
+    def cut(t):
+        return shaken(t) @ (se3.exp(np.array(after, float)) if t > 14.5 / 30 else np.eye(4))
+
+    story = [*frames[:12], *(rolling(room, cut, index, depthless=0.0, limit=500)[0] for index in range(15, 20))]
+    off, found_off, _ = drive(room, cut, story, READOUT_S, tracking__rolling_shutter=False)
+    on, found, _ = drive(room, cut, story, READOUT_S)
+    assert [each.state for each in found] == [each.state for each in found_off] == ["ok"] * len(story)
+    assert on < 0.8 * off, (on, off)
+
+
+def test_nothing_is_told_of_the_time_before_a_loss(shaken_frames):
+    room, frames = shaken_frames
+    backend = drive(room, shaken, frames[:8], READOUT_S)[2]
+    assert backend._motion.last_speeds is not None  # private: what the next frame is straightened by
+    backend.track(room.blind(11), np.zeros(0, bool), np.zeros(0, np.float32))
+    assert backend._motion.last_speeds is None
+    found = backend.track(frames[9], np.ones(len(frames[9]), bool), np.ones(len(frames[9]), np.float32))
+    assert found.state == "ok" and backend._motion.last_speeds is None
+
+
+def test_global_shutters_ask_for_no_speeds_however_frames_are_stamped(shaken_frames):
+    room, frames = shaken_frames
+    close = [
+        replace(frame, timestamp=frame.timestamp - (0.0313 if i == 6 else 0)) for i, frame in enumerate(frames[:9])
+    ]
+    with np.errstate(all="raise"):
+        _, found, backend = drive(room, shaken, close, 0.0)
+    assert [each.state for each in found] == ["ok"] * 9 and backend._motion.last_speeds is None  # private: as above
+
+
+def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
     frame = room.see(np.eye(4), 0)
     camera = replace(room.camera, readout_s=READOUT_S)
     seen = observed(frame, camera)
-    wild = Speeds(np.array([0.0, 0.0, 1e4]), np.zeros(3))
-    assert as_seen_at_once(seen, camera, wild) is seen
-    assert len(as_seen_at_once(observed(room.blind(1), camera), camera, wild)) == 0
+    wild = as_seen_at_once(seen, camera, Speeds(np.array([0.0, 0.0, 400.0]), np.zeros(3)))
+    gone = (frame.keypoints.xy[:, 1] > 420) & (seen.z > 0) & (seen.z < 3)
+    assert gone.any() and np.isfinite(wild.xy).all()
+    np.testing.assert_array_equal(wild.xy[gone], seen.xy[gone])
+    np.testing.assert_array_equal(wild.z[gone], seen.z[gone])
+    blind = observed(room.blind(1), camera)
+    assert len(as_seen_at_once(blind, camera, Speeds(np.ones(3), np.ones(3)))) == 0

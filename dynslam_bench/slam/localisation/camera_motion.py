@@ -32,7 +32,7 @@ class CameraMotion:
         readout_s: Seconds that the camera takes to read out a frame: no two are exposed less apart.
 
     Attributes:
-        last_speeds: How the world moved past the camera in the last tracked frame; None where nothing is known of it.
+        last_speeds: How the world moved past a rolling shutter in the last tracked frame; None where it is not known.
     """
 
     def __init__(self, readout_s: float = 0.0) -> None:
@@ -64,7 +64,7 @@ class CameraMotion:
     def speeds(
         self, last: Tracked, timestamp: float, settings: MotionModelSettings, pose: Array | None = None
     ) -> Speeds | None:
-        """How the world moves past the camera during a frame; None where nothing is known of it.
+        """How the world moves past the camera during a frame; None where nothing is known of it, or need be.
 
         Not the filter's: that takes the acceleration as constant between frames, and follows a hand by swinging about
         the true speed from one frame to the next.
@@ -76,7 +76,7 @@ class CameraMotion:
             pose: The frame's world-to-camera pose, if it was found already; else it goes on as it went before.
         """
         dt = timestamp - last.timestamp
-        if not 0 < dt <= settings.max_gap_s:
+        if not (self._readout_s and 0 < dt <= settings.max_gap_s):
             return None
         return self.last_speeds if pose is None else Speeds.between(last.T_cam_world, pose, self._exposed_apart(dt))
 
@@ -100,7 +100,6 @@ class CameraMotion:
         Returns:
             World-to-camera pose; the measured one where nothing is known of the gap, or the filter is off.
         """
-        self.last_speeds = self.speeds(last, timestamp, settings, measured)
         covariance = pose_covariance(measured, information, settings.inflation)
         dt, ahead = self._known_gap(last, timestamp, settings), self._ahead(last, timestamp, settings)
         if dt is None or ahead is None:

@@ -53,7 +53,7 @@ def as_seen_at_once(seen: Observations, camera: Camera, speeds: Speeds) -> Obser
         speeds: The motion during the frame.
 
     Returns:
-        New observations; the same object where such a motion would put a feature behind the camera.
+        New observations; a feature that such a motion would put behind the camera stays where it is.
     """
     if not len(seen):
         return seen
@@ -63,8 +63,8 @@ def as_seen_at_once(seen: Observations, camera: Camera, speeds: Speeds) -> Obser
     points = camera.unproject(seen.xy, np.where(deep, seen.z, 1.0))
     points = points - np.where(deep[:, None], late, 0.0) * speeds.velocity
     points = Rotation.from_rotvec(-late * speeds.turning).apply(points)
-    if (points[:, 2] <= 0).any():
-        return seen
-    xy, z = camera.project(points), np.where(deep, points[:, 2], 0.0)
+    ahead = points[:, 2] > 0
+    xy = np.where(ahead[:, None], camera.project(points), seen.xy)
+    z = np.where(ahead & deep, points[:, 2], seen.z)
     grid = CellGrid.of(xy, camera.width, camera.height)
     return replace(seen, xy=xy, z=z, right=right_of(xy, z, camera), grid=grid)
