@@ -101,8 +101,8 @@ class RgbdBackend:
         self._reach = Reach(anywhere=bool(start.file))
         self._last: Tracked | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
-        self._motion = CameraMotion(self.camera.readout_s)
-        self._straightening = Straightening(self.world, self.camera, self._motion)
+        self.motion = CameraMotion(self.camera.readout_s)
+        self._straightening = Straightening(self.world, self.camera, self.motion)
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
         self.loops = LoopCloser(self.world, self.mapper, self._islands, self.settings, self.seed)
@@ -163,7 +163,7 @@ class RgbdBackend:
         """
         for moving in (speeds, None):
             self.reset(self.camera, self.seed)
-            self._motion.last_speeds = moving
+            self.motion.last_speeds = moving
             straight = first[1] if moving is None else as_seen_at_once(first[1], self.camera, moving)
             self._begin_map(first[0], straight, np.eye(4))
             found = self._localise(frame, seen)
@@ -182,7 +182,7 @@ class RgbdBackend:
         raw = seen
         if self._rolling:
             seen = self._straightening.foreseen(raw, last, frame.timestamp, self.settings.motion)
-        prediction = self._motion.predicted(last, frame.timestamp, self.settings.motion)
+        prediction = self.motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
         reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
         close, island = self.mapper.close_m, None if self._tracked else self._island
@@ -202,7 +202,7 @@ class RgbdBackend:
             found = self._lost(frame, raw, last, prediction)
         else:
             taken = self._accept(frame, seen, fit, last)
-            self._motion.last_speeds = speeds
+            self.motion.last_speeds = speeds
             beginning, self._first = self._first, None
             if beginning is not None and speeds is not None:
                 return self._begin_again(frame, raw, beginning, speeds, fit.count)
@@ -241,7 +241,7 @@ class RgbdBackend:
         if self._tracked:
             self._reach.lost(last, deep, MIN_INITIAL)
         self._tracked = False
-        self._motion.forget()
+        self.motion.forget()
         self._unrecognised = self._unrecognised + 1 if deep >= MIN_INITIAL else 0
         begins = self._grows and self.settings.loop_closing.enabled
         if not begins or self._unrecognised < self.settings.relocalisation.new_map_after:
@@ -260,7 +260,7 @@ class RgbdBackend:
         point = np.full(len(seen), -1, np.int64)
         point[fit.matches.feature[fit.inliers]] = points
         measured = fit.estimate.T_cam_world, fit.estimate.information
-        pose = self._motion.filtered(last, frame.timestamp, *measured, self.settings.motion)
+        pose = self.motion.filtered(last, frame.timestamp, *measured, self.settings.motion)
         self._tracked, self._unrecognised = True, 0
         self._last = tracked = Tracked(seen, point, pose, frame.timestamp)
         near, _ = self.world.covisible_of(points)
@@ -279,7 +279,7 @@ class RgbdBackend:
             spent = self._make_keyframe(frame, tracked)
             if self.settings.bundle_adjustment.enabled or self.settings.loop_closing.enabled:
                 pose = tracked.T_cam_world
-                self._motion.relocated(pose)
+                self.motion.relocated(pose)
         relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
         self.history.append(frame.timestamp, self._reference, relative, fit.estimate.information)
         self.state = self._state()
@@ -332,8 +332,8 @@ class RgbdBackend:
         """
         if self._last is None:
             return None
-        regular = self._motion.regular(self._last, timestamp)
-        return se3.inverse(self._motion.predicted(self._last, regular, self.settings.motion))
+        regular = self.motion.regular(self._last, timestamp)
+        return se3.inverse(self.motion.predicted(self._last, regular, self.settings.motion))
 
     def motion_covariance(self, timestamp: float) -> Array | None:
         """How far the camera's motion since the last frame may be from the predicted one.
@@ -347,8 +347,8 @@ class RgbdBackend:
         """
         if self._last is None:
             return None
-        regular = self._motion.regular(self._last, timestamp)
-        return self._motion.covariance(self._last, regular, self.settings.motion)
+        regular = self.motion.regular(self._last, timestamp)
+        return self.motion.covariance(self._last, regular, self.settings.motion)
 
     def keyframe_views(self, limit: int) -> tuple[KeyframeView, ...]:
         """The newest keyframes, newest first, at most `limit`."""

@@ -187,11 +187,11 @@ def test_a_cut_is_no_motion(shaken_frames, after):
 def test_nothing_is_told_of_the_time_before_a_loss(shaken_frames):
     room, frames = shaken_frames
     backend = drive(room, shaken, frames[:8], READOUT_S)[2]
-    assert backend._motion.last_speeds is not None  # private: what the next frame is straightened by
+    assert backend.motion.last_speeds is not None
     backend.track(room.blind(11), np.zeros(0, bool), np.zeros(0, np.float32))
-    assert backend._motion.last_speeds is None
+    assert backend.motion.last_speeds is None
     found = backend.track(frames[9], np.ones(len(frames[9]), bool), np.ones(len(frames[9]), np.float32))
-    assert found.state == "ok" and backend._motion.last_speeds is None
+    assert found.state == "ok" and backend.motion.last_speeds is None
 
 
 def test_global_shutters_ask_for_no_speeds_however_frames_are_stamped(shaken_frames):
@@ -201,7 +201,7 @@ def test_global_shutters_ask_for_no_speeds_however_frames_are_stamped(shaken_fra
     ]
     with np.errstate(all="raise"):
         _, found, backend = drive(room, shaken, close, 0.0)
-    assert [each.state for each in found] == ["ok"] * 9 and backend._motion.last_speeds is None  # private: as above
+    assert [each.state for each in found] == ["ok"] * 9 and backend.motion.last_speeds is None
 
 
 def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
