@@ -9,13 +9,12 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.two_views import match_views, reconstruct
+from dynslam_bench.slam.localisation.two_views import VIEWS, Later, match_views, reconstruct
+from dynslam_bench.slam.mapping.first_map import FEWEST, FirstViews, View
 from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings, TwoViewSettings
 
 SIDEWAYS = se3.exp(np.array([0.25, 0.05, 0.02, 0.0, 0.03, 0.01]))
-BELIEVED = 4
-"""Frames at 30 Hz that must tell the same shape."""
 
 
 def without_depth(frame):
@@ -51,13 +50,21 @@ def test_two_views_tell_the_motion_up_to_scale(room, flat):
     world = flattened(room) if flat else room
     first, second = views(world, np.eye(4), SIDEWAYS, wrong=60)
     pair = match_views(first, second, first.xy, 200.0)
-    found = reconstruct(first, second, pair, world.camera, TwoViewSettings())
+    found = reconstruct(first, [Later(second, pair)], world.camera, TwoViewSettings())
     assert found is not None
     true = se3.inverse(SIDEWAYS)
     assert np.degrees(se3.rotation_angle(found.T_second_first @ se3.inverse(true))) < 0.5
     way, expected = (pose[:3, 3] / np.linalg.norm(pose[:3, 3]) for pose in (found.T_second_first, true))
     assert np.degrees(np.arccos(way @ expected)) < 4.0
     assert len(found.pair) > 120 and (found.points[:, 2] > 0).all() and found.parallax_deg > 1.0
+
+
+def test_a_camera_that_waits_for_parallax_keeps_few_views(room):
+    waiting = FirstViews()
+    frames = [without_depth(room.see(np.eye(4), i)) for i in range(40)]
+    for frame, seen in zip(frames, views(room, *[np.eye(4)] * 40), strict=True):
+        assert waiting.take(View(frame, seen), room.camera, TwoViewSettings()) is None
+        assert len(waiting._later) <= 2 * VIEWS
 
 
 def test_turning_alone_makes_no_map_and_says_so(room, tracked):
@@ -71,9 +78,9 @@ def test_turning_alone_makes_no_map_and_says_so(room, tracked):
 
 def test_the_first_map_has_a_median_depth_of_one(room, tracked):
     backend = make(room)
-    poses = [np.eye(4), *[SIDEWAYS] * BELIEVED]
+    poses = [np.eye(4), *[SIDEWAYS] * FEWEST]
     states = [r.state for r in tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate(poses)])]
-    assert states == ["initialising"] * BELIEVED + ["ok"]
+    assert states == ["initialising"] * FEWEST + ["ok"]
     assert backend.state == "ok" and backend.world.keyframe_count == 2
     assert np.median(backend.world.position[backend.world.points, 2]) == pytest.approx(1.0)
 
@@ -81,10 +88,10 @@ def test_the_first_map_has_a_median_depth_of_one(room, tracked):
 def test_a_newer_frame_becomes_the_first_view_where_nothing_is_in_common(room, tracked):
     away = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 2.6, 0.0]))
     backend = make(room)
-    poses = [away, np.eye(4), *[SIDEWAYS] * BELIEVED]
+    poses = [away, np.eye(4), *[SIDEWAYS] * FEWEST]
     results = tracked(backend, [without_depth(room.see(pose, i)) for i, pose in enumerate(poses)])
-    assert [r.state for r in results] == ["initialising"] * (BELIEVED + 1) + ["ok"]
-    assert backend.world.kf_frame[backend.world.keyframes].tolist() == [1, 1 + BELIEVED]
+    assert [r.state for r in results] == ["initialising"] * (FEWEST + 1) + ["ok"]
+    assert backend.world.kf_frame[backend.world.keyframes].tolist() == [1, 1 + FEWEST]
 
 
 def test_follows_a_smooth_path_to_millimetres_up_to_scale(room, tracked):

@@ -5,11 +5,13 @@ same matches, so that flat and deep scenes both give a motion, and a motion coun
 cameras, no other explains them as well, and the rays meet at a wide enough angle. Which one explains them best is not
 read off the two models' scores as there, but off what is left after bundle adjustment of each motion: on a scene with
 one large wall the essential matrix of most matches is a wrong one, while a homography's motion is right, and the points
-beside the wall tell which of them. All functions are pure.
+beside the wall tell which of them. Two views a hand's breadth apart do not tell a step from a turn; all the views
+between them do, so that those are adjusted together. All functions are pure.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,10 +40,10 @@ SURE_SHARE = 0.8
 """Share of the matches that fit either model which must lie before both cameras and project back."""
 RIVAL_SHARE = 0.75
 """A motion that explains a smaller share of what the best one does is no rival."""
-RIVAL_COST, RIVAL_FACTOR = 20.0, 1.2
-"""So much more chi-square, on top of so many times the best motion's, must be left to every rival."""
-SAME_SHAPE = 0.1
-"""Two pairs of views tell the same shape if depths differ by less, as a share and in the median, after scaling."""
+RIVAL_COST, RIVAL_FACTOR = 50.0, 1.1
+"""So much more chi-square, and so many times as much, as to the best motion must be left to every rival."""
+VIEWS = 7
+"""So many views beside the first, at most, are adjusted together: the newest, and others spread evenly before it."""
 SAME_DEG = 1.0, 5.0
 """Motions whose rotations and whose directions differ by less are one."""
 WIDE_POINTS = 50
@@ -66,6 +68,18 @@ class Pair:
     def __len__(self) -> int:
         return len(self.first)
 
+    def select(self, index: Slots | NDArray[np.bool_]) -> Pair:
+        """Some of the matches, by row or by mask."""
+        return Pair(self.first[index], self.second[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Later:
+    """A view after the first, and its matches with that one."""
+
+    seen: Observations
+    pair: Pair
+
 
 @dataclass(frozen=True, eq=False)
 class TwoViews:
@@ -75,13 +89,15 @@ class TwoViews:
         T_second_first: Pose ``[4, 4]`` from the first camera's frame to the second's.
         pair: The matches that became points.
         points: ``[M, 3]`` in the first camera's frame.
-        cost: Chi-square that is left, of all matches that were to be explained.
+        cost: Chi-square that is left to an observation, in all views and in the mean.
+        count: How many observations that are.
     """
 
     T_second_first: Array
     pair: Pair
     points: Array
     cost: float
+    count: int
 
     @property
     def parallax_deg(self) -> float:
@@ -91,20 +107,17 @@ class TwoViews:
         cosine = np.sort((self.points * to_second).sum(axis=1) / np.maximum(lengths, 1e-12))
         return float(np.degrees(np.arccos(np.clip(cosine[min(WIDE_POINTS, len(cosine)) - 1], -1.0, 1.0))))
 
-    def has_shape_of(self, other: TwoViews) -> bool:
-        """Whether features of the first view have the same depths as in another pair with it, up to scale."""
-        _, ours, theirs = np.intersect1d(self.pair.first, other.pair.first, return_indices=True)
-        if len(ours) < WIDE_POINTS:
-            return False
-        ratio = np.log(self.points[ours, 2] / other.points[theirs, 2])
-        return bool(np.median(np.abs(ratio - np.median(ratio))) < SAME_SHAPE)
-
     def is_as(self, other: TwoViews) -> bool:
         """Whether it is the same motion as another."""
         turned = se3.rotation_angle(self.T_second_first @ se3.inverse(other.T_second_first))
         one, two = (each.T_second_first[:3, 3] / np.linalg.norm(each.T_second_first[:3, 3]) for each in (self, other))
         apart = np.arccos(np.clip(one @ two, -1.0, 1.0))
         return bool(np.degrees(turned) < SAME_DEG[0] and np.degrees(apart) < SAME_DEG[1])
+
+    def beats(self, other: TwoViews) -> bool:
+        """Whether it explains what all views show so much better than another motion that this one is out."""
+        more = (other.cost - self.cost) * self.count
+        return self.is_as(other) or bool(more > RIVAL_COST and other.cost > RIVAL_FACTOR * self.cost)
 
 
 def match_views(first: Observations, second: Observations, expected: Array, radius_px: float) -> Pair:
@@ -129,17 +142,17 @@ def match_views(first: Observations, second: Observations, expected: Array, radi
 
 
 def reconstruct(
-    first: Observations, second: Observations, pair: Pair, camera: Camera, settings: TwoViewSettings
+    first: Observations, later: Sequence[Later], camera: Camera, settings: TwoViewSettings
 ) -> TwoViews | None:
-    """The camera's motion between two views; None where they do not tell it.
+    """The camera's motion from the first view to the newest; None where all views together do not tell it.
 
     Args:
         first: The first view.
-        second: The second.
-        pair: Their matches.
+        later: Views since then, oldest first; the newest is the second of the two views.
         camera: Intrinsics, without distortion.
         settings: Parallax and number of points that it needs.
     """
+    second, pair = later[-1].seen, later[-1].pair
     one, other = first.xy[pair.first], second.xy[pair.second]
     info = np.minimum(first.info[pair.first], second.info[pair.second])
     flat, on_plane = _homography(one, other, info, camera)
@@ -150,16 +163,13 @@ def reconstruct(
     if most < max(settings.min_points, SURE_SHARE * len(rows)):
         return None
     rivals = [each for each in tried if np.count_nonzero(each[2]) >= RIVAL_SHARE * most]
-    fitting = Pair(pair.first[rows], pair.second[rows])
-    refined = [_refined(first, second, fitting, *each, camera) for each in rivals]
-    refined = sorted((each for each in refined if len(each.pair)), key=lambda each: each.cost)
-    if not refined or len(refined[0].pair) < settings.min_points:
+    refined = [
+        _refined(first, later, pair.select(rows[good]), motion, points[good], camera) for motion, points, good in rivals
+    ]
+    refined = sorted((each for each in refined if len(each.pair) >= settings.min_points), key=lambda each: each.cost)
+    if not refined or not all(refined[0].beats(other) for other in refined[1:]):
         return None
-    best = refined[0]
-    enough = RIVAL_FACTOR * best.cost + RIVAL_COST
-    if any(other.cost < enough and not other.is_as(best) for other in refined[1:]):
-        return None
-    return best if best.parallax_deg >= settings.min_parallax_deg else None
+    return refined[0] if refined[0].parallax_deg >= settings.min_parallax_deg else None
 
 
 def _homography(one: Array, other: Array, info: Array, camera: Camera) -> tuple[list[Array], NDArray[np.bool_]]:
@@ -233,23 +243,44 @@ def _triangulated(
 
 
 def _refined(
-    first: Observations, second: Observations, pair: Pair, motion: Array, points: Array, good: NDArray[np.bool_],
-    camera: Camera,
-) -> TwoViews:  # fmt: skip
-    """Motion and points adjusted together; a match without a good point costs the most that one can."""
-    count = int(np.count_nonzero(good))
-    pair, missing = Pair(pair.first[good], pair.second[good]), len(pair) - count
+    first: Observations, later: Sequence[Later], pair: Pair, motion: Array, points: Array, camera: Camera
+) -> TwoViews:
+    """Motion and points adjusted together: by the two views alone, then by those between them, too."""
+    found = _adjusted(first, later[-1:], motion[None], pair, points, camera)
+    if len(later) == 1 or not len(found.pair):
+        return found
+    chosen = np.unique(np.linspace(0, len(later) - 1, VIEWS).round().astype(int))
+    on_the_way = se3.exp((chosen[:, None] + 1) / len(later) * se3.log(found.T_second_first))
+    return _adjusted(first, [later[at] for at in chosen], on_the_way, found.pair, found.points, camera)
 
-    def by_turns(name: str) -> Array:
-        """Of the first view, then of the second, point by point."""
-        columns = getattr(first, name)[pair.first], getattr(second, name)[pair.second]
-        return np.stack(columns, axis=1).reshape(2 * count, *columns[0].shape[1:])
 
-    pose, point = np.tile([1, 0], count), np.repeat(np.arange(count), 2)
-    measured = by_turns("xy"), by_turns("right"), by_turns("info"), by_turns("info_right")
-    problem = BundleProblem(np.array([motion, np.eye(4)]), 1, points[good], pose, point, *measured, camera)
+def _adjusted(
+    first: Observations, later: Sequence[Later], poses: Array, pair: Pair, points: Array, camera: Camera
+) -> TwoViews:
+    """The later views' poses ``[V, 4, 4]`` and the points of the last one's `pair`, by all that the views show."""
+    row = np.full(len(first), -1, np.int64)
+    row[pair.first] = np.arange(len(pair))
+    views = [first, *(each.seen for each in later)]
+    point = [row[pair.first], *(row[each.pair.first] for each in later)]
+    feature = [pair.first, *(each.pair.second for each in later)]
+    known = [each >= 0 for each in point]
+    view = np.concatenate([np.full(np.count_nonzero(each), at) for at, each in enumerate(known)])
+    xy, info = (
+        np.concatenate([getattr(seen, name)[f[k]] for seen, f, k in zip(views, feature, known, strict=True)])
+        for name in ("xy", "info")
+    )
+    point_of = np.concatenate([p[k] for p, k in zip(point, known, strict=True)])
+    order = np.lexsort((view, point_of))
+    view, point_of, xy, info = view[order], point_of[order], xy[order], info[order]
+    none = np.full(len(xy), np.nan), np.zeros(len(xy))
+    count = len(later)
+    problem = BundleProblem(
+        np.concatenate([poses, np.eye(4)[None]]), count, points, (view - 1) % (count + 1), point_of,
+        xy, none[0], info, none[1], camera,
+    )  # fmt: skip
     result = adjust_bundle(problem, BUNDLE_ITERATIONS)
     _, chi2 = reprojection_chi2(problem, result.poses, result.points)
-    left = float(np.minimum(chi2, CHI2_POINT).sum()) + 2 * CHI2_POINT * missing
-    kept = result.inliers.reshape(-1, 2).all(axis=1) & np.isfinite(result.points).all(axis=1)
-    return TwoViews(result.poses[0], Pair(pair.first[kept], pair.second[kept]), result.points[kept], left)
+    kept = np.isfinite(result.points).all(axis=1)
+    kept[point_of[~result.inliers & ((view == 0) | (view == count))]] = False
+    cost = float(np.minimum(chi2, CHI2_POINT).mean()) if len(chi2) else np.inf
+    return TwoViews(result.poses[count - 1], pair.select(kept), result.points[kept], cost, len(chi2))

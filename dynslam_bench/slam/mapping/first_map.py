@@ -11,15 +11,14 @@ from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.geometry.camera import Camera
 
 from ..localisation.observation import Observations
-from ..localisation.two_views import Pair, TwoViews, match_views, reconstruct
+from ..localisation.two_views import VIEWS, Later, Pair, TwoViews, match_views, reconstruct
 from ..monocular_settings import TwoViewSettings
 from .map import Map
 
 Array = NDArray[np.float64]
 
-
-STEADY_S = 0.09
-"""Seconds: so long a hand shakes one way."""
+FEWEST = 3
+"""So many views beside the first are needed at least: two alone take a turn for a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +49,12 @@ class FirstMap:
 
 
 class FirstViews:
-    """Keeps a first view until later ones tell, together with it, how the camera moved.
-
-    The shutter rolls, people walk, and a turn looks like a step: one frame may tell a wrong motion with a good fit. The
-    next ones then tell another shape of the scene, so that a motion is believed when all that was told for `STEADY_S`
-    is the same.
-    """
+    """Keeps a first view and what came after, until all of it together tells how the camera moved."""
 
     def __init__(self) -> None:
         self._first: View | None = None
         self._expected: Array = np.zeros((0, 2))
-        self._told: TwoViews | None = None
-        self._since = 0.0
+        self._later: list[Later] = []
 
     def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
         """Try the next frame with the first view; it takes that one's place where they have too little in common.
@@ -80,19 +73,18 @@ class FirstViews:
             self._begin(view, settings)
             return None
         self._expected[pair.first] = view.seen.xy[pair.second]
-        found = reconstruct(first.seen, view.seen, pair, camera, settings)
-        if found is None:
+        if len(self._later) >= 2 * VIEWS:  # a camera that hardly moves may wait for long
+            del self._later[::2]
+        self._later.append(Later(view.seen, pair))
+        if len(self._later) < FEWEST:
             return None
-        before, self._told = self._told, found
-        if before is None or not found.has_shape_of(before):
-            self._since = view.frame.timestamp
-            return None
-        return _scaled(first, view, found) if view.frame.timestamp - self._since >= STEADY_S else None
+        found = reconstruct(first.seen, self._later, camera, settings)
+        return None if found is None else _scaled(first, view, found)
 
     def _begin(self, view: View, settings: TwoViewSettings) -> None:
         self._first = view if len(view.seen) >= settings.min_matches else None
         self._expected = view.seen.xy.copy()
-        self._told = None
+        self._later = []
 
 
 def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
