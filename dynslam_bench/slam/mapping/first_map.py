@@ -49,12 +49,16 @@ class FirstMap:
 
 
 class FirstViews:
-    """Keeps a first view and what came after, until all of it together tells how the camera moved."""
+    """Keeps a first view and what came after, until all of it together tells how the camera moved.
+
+    Attributes:
+        later: Views since the first one, oldest first; thinned out where a camera that hardly moves waits for long.
+    """
 
     def __init__(self) -> None:
         self._first: View | None = None
         self._expected: Array = np.zeros((0, 2))
-        self._later: list[Later] = []
+        self.later: list[Later] = []
 
     def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
         """Try the next frame with the first view; it takes that one's place where they have too little in common.
@@ -73,18 +77,18 @@ class FirstViews:
             self._begin(view, settings)
             return None
         self._expected[pair.first] = view.seen.xy[pair.second]
-        if len(self._later) >= 2 * VIEWS:  # a camera that hardly moves may wait for long
-            del self._later[::2]
-        self._later.append(Later(view.seen, pair))
-        if len(self._later) < FEWEST:
+        if len(self.later) >= 2 * VIEWS:
+            del self.later[::2]
+        self.later.append(Later(view.seen, pair))
+        if len(self.later) < FEWEST:
             return None
-        found = reconstruct(first.seen, self._later, camera, settings)
+        found = reconstruct(first.seen, self.later, camera, settings)
         return None if found is None else _scaled(first, view, found)
 
     def _begin(self, view: View, settings: TwoViewSettings) -> None:
         self._first = view if len(view.seen) >= settings.min_matches else None
         self._expected = view.seen.xy.copy()
-        self._later = []
+        self.later = []
 
 
 def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
