@@ -40,6 +40,8 @@ STRONG = 100
 """Keyframes that share so many points are tied in the pose graph (ORB-SLAM2's number)."""
 SLACK_M, SLACK_DEG = 0.1, 3.0
 """Correction that is believed however short the way."""
+TURN_M = 3.0
+"""Metres of way that a turn by one radian counts as: it renews the view as much as walking past a wall 3 m away."""
 AGREE_M, AGREE_DEG = 0.1, 2.0
 """So far the corrections of keyframes in a row may differ."""
 NEGLIGIBLE_M, NEGLIGIBLE_DEG = 0.01, 0.3
@@ -93,7 +95,7 @@ class LoopCloser:
         self._way: dict[int, float] = {}
         self._walked = 0.0
         self._short_cuts: list[tuple[float, float]] = []
-        self._last_centre: Array | None = None
+        self._last_pose: Array | None = None
         self._row: list[Array] = []
         self._ties: list[Edge] = []
 
@@ -131,10 +133,11 @@ class LoopCloser:
     # ------------------------------------------------------------------ detect and verify
 
     def _note_way(self, slot: int) -> None:
-        centre = self.world.kf_centre[slot]
-        if self._last_centre is not None:
-            self._walked += float(np.linalg.norm(centre - self._last_centre))
-        self._last_centre = centre.copy()
+        pose = self.world.kf_pose[slot].copy()
+        if self._last_pose is not None:
+            step = pose @ se3.inverse(self._last_pose)
+            self._walked += float(np.linalg.norm(step[:3, 3]) + TURN_M * se3.rotation_angle(step))
+        self._last_pose = pose
         self._way[int(self.world.kf_id[slot])] = self._walked
 
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
@@ -198,7 +201,7 @@ class LoopCloser:
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 
     def _way_to(self, slot: int) -> float:
-        """Metres along which drift can have come in since a keyframe: all that was walked, or over a closed loop."""
+        """Metres along which drift can have come in since a keyframe: walked and turned, or over a closed loop."""
         then = self._way.get(int(self.world.kf_id[slot]), 0.0)  # 0: of a loaded map
         return min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
 
