@@ -26,7 +26,7 @@ from dynslam_bench.geometry.camera import Camera
 from ..bundle.schur import BundleProblem, adjust_bundle, reprojection_chi2
 from ..monocular_settings import TwoViewSettings
 from .observation import Observations
-from .pose import NEAR_M
+from .pose import NEAR_M, optimise_pose
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
@@ -40,7 +40,7 @@ SURE_SHARE = 0.8
 """Share of the matches that fit either model which must lie before both cameras and project back."""
 RIVAL_SHARE = 0.75
 """A motion that explains a smaller share of what the best one does is no rival."""
-RIVAL_COST, RIVAL_FACTOR = 50.0, 1.1
+RIVAL_COST, RIVAL_FACTOR = 30.0, 1.1
 """So much more chi-square, and so many times as much, as to the best motion must be left to every rival."""
 VIEWS = 7
 """So many views beside the first, at most, are adjusted together: the newest, and others spread evenly before it."""
@@ -107,6 +107,13 @@ class TwoViews:
         cosine = np.sort((self.points * to_second).sum(axis=1) / np.maximum(lengths, 1e-12))
         return float(np.degrees(np.arccos(np.clip(cosine[min(WIDE_POINTS, len(cosine)) - 1], -1.0, 1.0))))
 
+    def gone_on(self, newer: Observations, pair: Pair, camera: Camera) -> Array:
+        """Pose ``[4, 4]`` from the first camera's frame to that of a newer view, in which `pair` shows some points."""
+        _, ours, theirs = np.intersect1d(self.pair.first, pair.first, return_indices=True)
+        rows = pair.second[theirs]
+        measured = newer.xy[rows], newer.right[rows], newer.info[rows], newer.info_right[rows]
+        return optimise_pose(self.T_second_first, self.points[ours], *measured, camera).T_cam_world
+
     def is_as(self, other: TwoViews) -> bool:
         """Whether it is the same motion as another."""
         turned = se3.rotation_angle(self.T_second_first @ se3.inverse(other.T_second_first))
@@ -141,35 +148,59 @@ def match_views(first: Observations, second: Observations, expected: Array, radi
     return Pair(rows[steady], found[rows[steady]])
 
 
-def reconstruct(
-    first: Observations, later: Sequence[Later], camera: Camera, settings: TwoViewSettings
-) -> TwoViews | None:
-    """The camera's motion from the first view to the newest; None where all views together do not tell it.
+def possible_motions(
+    first: Observations,
+    later: Sequence[Later],
+    camera: Camera,
+    settings: TwoViewSettings,
+    before: Sequence[TwoViews] = (),
+) -> list[TwoViews]:
+    """Motions of the camera from the first view to the newest that explain nearly as much as any other.
 
     Args:
         first: The first view.
         later: Views since then, oldest first; the newest is the second of the two views.
         camera: Intrinsics, without distortion.
-        settings: Parallax and number of points that it needs.
+        settings: Number of points that a motion needs.
+        before: What this gave for the view before: the right one may be missing among what the newest view tells.
+
+    Returns:
+        Each refined with its points, the one that explains the views best first; none where they are too unsure.
     """
     second, pair = later[-1].seen, later[-1].pair
     one, other = first.xy[pair.first], second.xy[pair.second]
     info = np.minimum(first.info[pair.first], second.info[pair.second])
     flat, on_plane = _homography(one, other, info, camera)
     deep, on_lines = _essential(one, other, info, camera)
+    further = [motion.gone_on(second, pair, camera) for motion in before]
     rows = np.flatnonzero(on_plane | on_lines)
-    tried = [(motion, *_triangulated(motion, one[rows], other[rows], info[rows], camera)) for motion in [*flat, *deep]]
+    motions = [motion for motion in (*flat, *deep, *further) if np.isfinite(motion).all()]
+    tried = [(motion, *_triangulated(motion, one[rows], other[rows], info[rows], camera)) for motion in motions]
     most = max((np.count_nonzero(good) for _, _, good in tried), default=0)
     if most < max(settings.min_points, SURE_SHARE * len(rows)):
-        return None
-    rivals = [each for each in tried if np.count_nonzero(each[2]) >= RIVAL_SHARE * most]
+        return []
     refined = [
-        _refined(first, later, pair.select(rows[good]), motion, points[good], camera) for motion, points, good in rivals
+        _refined(first, later, pair.select(rows[good]), motion, points[good], camera)
+        for motion, points, good in tried
+        if np.count_nonzero(good) >= RIVAL_SHARE * most
     ]
-    refined = sorted((each for each in refined if len(each.pair) >= settings.min_points), key=lambda each: each.cost)
-    if not refined or not all(refined[0].beats(other) for other in refined[1:]):
+    return sorted((each for each in refined if len(each.pair) >= settings.min_points), key=lambda each: each.cost)
+
+
+def believed(motions: Sequence[TwoViews], settings: TwoViewSettings) -> TwoViews | None:
+    """The first of the motions, if it leaves no doubt about any other, and shows enough parallax."""
+    if not motions or not all(motions[0].beats(other) for other in motions[1:]):
         return None
-    return refined[0] if refined[0].parallax_deg >= settings.min_parallax_deg else None
+    return motions[0] if motions[0].parallax_deg >= settings.min_parallax_deg else None
+
+
+def distinct(motions: Sequence[TwoViews]) -> list[TwoViews]:
+    """The motions without those that are as an earlier one."""
+    kept: list[TwoViews] = []
+    for motion in motions:
+        if not any(motion.is_as(other) for other in kept):
+            kept.append(motion)
+    return kept
 
 
 def _homography(one: Array, other: Array, info: Array, camera: Camera) -> tuple[list[Array], NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.geometry.camera import Camera
 
 from ..localisation.observation import Observations
-from ..localisation.two_views import VIEWS, Later, Pair, TwoViews, match_views, reconstruct
+from ..localisation.two_views import VIEWS, Later, Pair, TwoViews, believed, distinct, match_views, possible_motions
 from ..monocular_settings import TwoViewSettings
 from .map import Map
 
@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 FEWEST = 3
 """So many views beside the first are needed at least: two alone take a turn for a step."""
+CARRIED = 2
+"""So many of the motions that one frame tells are asked about the next one, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ class FirstViews:
         self._first: View | None = None
         self._expected: Array = np.zeros((0, 2))
         self.later: list[Later] = []
+        self._motions: list[TwoViews] = []
 
     def take(self, view: View, camera: Camera, settings: TwoViewSettings) -> FirstMap | None:
         """Try the next frame with the first view; it takes that one's place where they have too little in common.
@@ -82,13 +85,15 @@ class FirstViews:
         self.later.append(Later(view.seen, pair))
         if len(self.later) < FEWEST:
             return None
-        found = reconstruct(first.seen, self.later, camera, settings)
+        motions = possible_motions(first.seen, self.later, camera, settings, self._motions)
+        self._motions = distinct(motions)[:CARRIED]
+        found = believed(motions, settings)
         return None if found is None else _scaled(first, view, found)
 
     def _begin(self, view: View, settings: TwoViewSettings) -> None:
         self._first = view if len(view.seen) >= settings.min_matches else None
         self._expected = view.seen.xy.copy()
-        self.later = []
+        self.later, self._motions = [], []
 
 
 def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
