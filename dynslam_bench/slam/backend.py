@@ -105,7 +105,8 @@ class RgbdBackend:
         self._straightening = Straightening(self.world, self.camera, self.motion)
         self._reference = -1
         self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
-        self.loops = LoopCloser(self.world, self.mapper, self._islands, self.settings, self.seed)
+        parts = self.world, self.mapper, self._islands, self.settings, self.seed
+        self.loops = LoopCloser(*parts, scale_is_known=self.uses_depth)
         self._surroundings = Surroundings(self.world, self.settings)
         self._views = MapViews(self.world)
         self._ready = True
@@ -289,13 +290,15 @@ class RgbdBackend:
         pose, at = tracked.T_cam_world, (frame.index, frame.timestamp, self._island)
         slot, spent = self.mapper.insert(tracked.seen, tracked.point, pose, *at)
         self._reference = slot
+        for dropped, heir, relative in self.mapper.dropped:
+            self.history.inherit(dropped, heir, relative)
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             self.loops.close(slot, tracked.seen)
+            for at, factor in self.loops.rescaled:
+                self.history.rescale(at, factor)
             spent["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
-        for dropped, heir, relative in self.mapper.dropped:
-            self.history.inherit(dropped, heir, relative)
         gone = [dropped for dropped, _, _ in self.mapper.dropped]
         self._views.renew(slot, frame.depth, gone, self.settings.keyframes.depth_images)
         tracked.point = self.world.kf_point[slot, : len(tracked.seen)].astype(np.int64)

@@ -6,8 +6,9 @@
 2. *Verify*: a pose by RANSAC, then by all points around the candidate, in metres since depth is known. It must explain
    most of what should be in view, agree with the keyframes before, and ask for no more correction than the way since
    the candidate may have drifted. The last condition is ours: rooms that look the same pass all others.
-3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loops. A map of its own,
-   begun after the camera was lost where nothing was recognised, is moved to where it belongs instead, as it is.
+3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loops. Without depth the
+   scale drifts as well: each keyframe's scale is found first, then the poses. A map of its own, begun after the camera
+   was lost where nothing was recognised, is moved to where it belongs instead, as it is.
 4. *Fuse*: points of both visits that are one thing in the world are merged, and the surroundings are adjusted.
 """
 
@@ -21,9 +22,9 @@ from numpy.typing import NDArray
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 
-from .bundle.pose_graph import Edge, optimise_poses
+from .bundle.pose_graph import Edge, optimise_poses, spread_scale
 from .localisation.observation import Observations
-from .localisation.recognition import around, points_around, recognise
+from .localisation.recognition import Recognised, around, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
 from .localisation.surroundings import not_held
 from .localisation.tracking import Matches
@@ -44,8 +45,12 @@ TURN_M = 3.0
 """Metres of way that a turn by one radian counts as: it renews the view as much as walking past a wall 3 m away."""
 AGREE_M, AGREE_DEG = 0.1, 2.0
 """So far the corrections of keyframes in a row may differ."""
-NEGLIGIBLE_M, NEGLIGIBLE_DEG = 0.01, 0.3
-"""A smaller correction is left to fusion and bundle adjustment."""
+NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
+"""A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
+MOST_SCALE = 3.0
+"""Factor by which scale may have drifted, at most, where it is free."""
+SCALE_POINTS = 20
+"""So many features with a point of both visits are needed to tell the scale."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class Loop:
         joins: Whether the place lies on another island of the map.
         moved_m: How far the newest keyframe is from where it was believed to be, metres.
         turned_deg: By how much it is turned, degrees.
+        scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
     """
 
     keyframe: int
@@ -71,6 +77,7 @@ class Loop:
     joins: bool
     moved_m: float
     turned_deg: float
+    scale: float
 
 
 class LoopCloser:
@@ -82,16 +89,29 @@ class LoopCloser:
         islands: Where parts of the map may lie that are connected with the first one by nothing.
         settings: Of the back end.
         seed: Founds RANSAC's draws.
+        scale_is_known: Whether lengths are metres everywhere, as with depth.
     """
 
-    def __init__(self, world: Map, mapper: LocalMapper, islands: Islands, settings: BackendSettings, seed: int) -> None:
+    def __init__(
+        self,
+        world: Map,
+        mapper: LocalMapper,
+        islands: Islands,
+        settings: BackendSettings,
+        seed: int,
+        *,
+        scale_is_known: bool = True,
+    ) -> None:
         self.world = world
         self.mapper = mapper
         self.islands = islands
         self.settings = settings
         self.closed: list[Loop] = []
         """All loops that were closed."""
+        self.rescaled: list[tuple[int, float]] = []
+        """Slots of keyframes whose surroundings the last loop rescaled, and by what."""
         self._seed = seed
+        self._scale_is_known = scale_is_known
         self._way: dict[int, float] = {}
         self._walked = 0.0
         self._short_cuts: list[tuple[float, float]] = []
@@ -109,6 +129,7 @@ class LoopCloser:
         Returns:
             Whether a loop was closed; every pose and point may have changed then.
         """
+        self.rescaled = []
         self._note_way(slot)
         loop = self._verified(slot, seen)
         if loop is None:
@@ -179,12 +200,27 @@ class LoopCloser:
         place = recognise(world, candidate, seen, matches.select(inliers), pose, self.settings.tracking)
         if len(place.matches) < s.min_inliers or place.share < s.min_share:
             return None
+        scale = 1.0 if self._scale_is_known else self._scale(slot, place)
+        if scale is None:
+            return None
         T_cam_world = place.T_cam_world
         moved = float(np.linalg.norm(se3.inverse(T_cam_world)[:3, 3] - world.kf_centre[slot]))
         turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
         back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
-        loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned)
+        loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned, scale)
         return loop if self._believable(slot, loop) else None
+
+    def _scale(self, slot: int, place: Recognised) -> float | None:
+        """How many times as deep points lie by the first visit as by this one; None where too few tell."""
+        world, theirs = self.world, place.matches
+        own = world.kf_point[slot, theirs.feature].astype(np.int64)
+        both = (own >= 0) & (own != theirs.point)
+        if np.count_nonzero(both) < SCALE_POINTS:
+            return None
+        then = se3.transform(place.T_cam_world, world.position[theirs.point[both]])[:, 2]
+        now = se3.transform(world.kf_pose[slot], world.position[own[both]])[:, 2]
+        ahead = (then > 0) & (now > 0)
+        return float(np.exp(np.median(np.log(then[ahead] / now[ahead])))) if ahead.sum() >= SCALE_POINTS else None
 
     def _believable(self, slot: int, loop: Loop) -> bool:
         """Whether drift explains the correction; where islands meet, whether the camera can have got from one there."""
@@ -198,6 +234,8 @@ class LoopCloser:
                 return self.islands.may_lie(there, se3.inverse(correction))
             return self.islands.may_lie(here, correction)
         way = self._way_to(loop.keyframe)
+        if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
+            return False
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 
     def _way_to(self, slot: int) -> float:
@@ -211,18 +249,27 @@ class LoopCloser:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
         world = self.world
         tie = self._edge(loop.keyframe, slot, loop.T_cam_world)
-        self._ties = [edge for edge in self._ties if self._alive(edge)] + [tie]
-        if loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG:
+        older = [edge for edge in self._ties if self._alive(edge)]
+        self._ties = [*older, tie]
+        small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG
+        if small and abs(np.log(loop.scale)) < NEGLIGIBLE_SCALE:
             return
         slots = world.island(int(world.kf_island[slot]))
-        before = world.kf_pose.copy()
-        after = optimise_poses(world.kf_id[slots], before[slots], [*self._edges(slots), *self._ties])
+        before, ids = world.kf_pose.copy(), world.kf_id[slots]
+        edges, scales = self._edges(slots), np.ones(world.kf_alive.size)
+        if not self._scale_is_known:
+            scales[slots] = spread_scale(ids, [*edges, *older], tie, loop.scale)
+            by_id = dict(zip(ids.tolist(), scales[slots].tolist(), strict=True))
+            edges, self._ties = ([edge.scaled(by_id[edge.one]) for edge in row] for row in (edges, self._ties))
+            self.rescaled = [(int(at), float(scales[at])) for at in slots]
+        after = optimise_poses(ids, before[slots], [*edges, *self._ties])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
         seen = np.unique(world.kf_point[slots])
         points = seen[seen >= 0].astype(np.int64)
         reference = world.obs_kf[points, 0]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
+        local *= scales[reference, None]
         now = se3.inverse(world.kf_pose[reference])
         world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
         world.refresh(points)

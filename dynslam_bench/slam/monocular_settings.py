@@ -11,6 +11,7 @@ from dynslam_bench.core.settings import Settings, tunable
 from .settings import (
     BackendSettings,
     KeyframeSettings,
+    LoopClosingSettings,
     MappingSettings,
     TrackingSettings,
 )
@@ -70,6 +71,18 @@ class MonocularMappingSettings(MappingSettings):
     )
 
 
+class MonocularLoopClosingSettings(LoopClosingSettings):
+    """Recognising a place that was left, where scale drifts as well."""
+
+    drift_share: float = Field(
+        0.1,
+        gt=0,
+        le=1,
+        description="largest correction that is believed, as a share of the way since; more than with depth, since "
+        "scale drifts",
+    )
+
+
 class MonocularBackendSettings(BackendSettings):
     """All settings of the back end without depth; its unit of length is the median depth of the first map."""
 
@@ -77,3 +90,4 @@ class MonocularBackendSettings(BackendSettings):
     tracking: MonocularTrackingSettings = MonocularTrackingSettings()
     keyframes: MonocularKeyframeSettings = MonocularKeyframeSettings()
     mapping: MonocularMappingSettings = MonocularMappingSettings()
+    loop_closing: MonocularLoopClosingSettings = MonocularLoopClosingSettings()

@@ -1,13 +1,19 @@
 """Loops: drift goes where a place is recognised, and nothing moves where places only look the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ring_world import RingWorld
 
+from dynslam_bench.core.settings import apply_overrides
+from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, optimise_poses
+from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, optimise_poses, spread_scale
 from dynslam_bench.slam.localisation.surroundings import not_held
+from dynslam_bench.slam.monocular import MonocularBackend
+from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
 from dynslam_bench.slam.settings import BackendSettings, LoopClosingSettings
 
 NOISE = dict(noise_px=1.2, depth_noise=0.01, limit=500)
@@ -26,6 +32,21 @@ def drive(world, frames, *, closing):
         assert found.state == "ok" and found.loops == len(backend.loops.closed)
         errors.append(np.linalg.norm(found.T_world_cam[:3, 3] - (se3.inverse(poses[0]) @ pose)[:3, 3]))
     return backend, poses, np.array(errors)
+
+
+def drive_without_depth(world, frames, step, *, closing):
+    """A monocular back end that has driven around, and the RMSE of its final path, scaled and aligned, metres."""
+    settings = apply_overrides(MonocularBackendSettings(), {"loop_closing.enabled": closing})
+    backend, poses = MonocularBackend(settings), world.lap(frames, step)
+    backend.reset(world.camera, 0)
+    for index, pose in enumerate(poses):
+        frame = world.see(pose, index, noise_px=0.8, limit=700)
+        frame = replace(frame, z=np.zeros_like(frame.z))
+        backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
+    final = backend.finalize()
+    true = poses[np.rint(final.timestamps * 30).astype(int)]
+    found = align(final.T_world_cam, true, "sim3").apply(final.T_world_cam)
+    return backend, np.sqrt(np.square(found[:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean())
 
 
 def farthest(backend, poses):
@@ -48,6 +69,16 @@ def test_a_lap_comes_back_to_where_it_began():
     assert farthest(backend, poses) < 0.8 * farthest(without, poses), "the whole path is corrected, not its end alone"
     index = backend.world.points
     assert (backend.world.n_obs[index] > 0).all() and np.isfinite(backend.world.position[index]).all()
+
+
+def test_without_depth_a_lap_gets_its_scale_back():
+    world = RingWorld(side=9.0)
+    frames = int(np.ceil((4 * (world.side - 2) + 2 * np.pi) / 0.07)) + 40
+    _, without = drive_without_depth(world, frames, 0.07, closing=False)
+    backend, closed = drive_without_depth(world, frames, 0.07, closing=True)
+    loop = backend.loops.closed[0]
+    assert loop.frame < 20 and abs(np.log(loop.scale)) > 0.03, "to the lap's beginning, where lengths were others"
+    assert closed < 0.6 * without
 
 
 def test_corridors_that_look_the_same_are_not_taken_for_one():
@@ -74,6 +105,16 @@ def test_a_pose_graph_spreads_what_one_tie_contradicts():
     found = optimise_poses(ids, drifted, [*steps, ring])
     np.testing.assert_allclose(found[:, 0, 3], np.arange(5) * 1.02, atol=1e-6, err_msg="five ties share 0.4 m equally")
     np.testing.assert_allclose(optimise_poses(ids, drifted, steps), drifted, atol=1e-9)
+
+
+def test_a_scale_is_spread_over_the_ties_it_drifted_along():
+    ids = np.arange(5) * 10
+    steps = [Edge(int(a), int(a + 10), np.eye(4)) for a in ids[:-1]]
+    found = spread_scale(ids, steps, Edge(0, 40, np.eye(4)), 2.0)
+    np.testing.assert_allclose(found, 2.0 ** (np.arange(5) / 5), err_msg="five ties share a factor of two equally")
+    np.testing.assert_allclose(spread_scale(ids, steps, Edge(0, 40, np.eye(4)), 1.0), 1.0)
+    beyond = spread_scale(ids, steps, Edge(10, 30, np.eye(4)), 2.0)
+    assert beyond[0] == beyond[1] and beyond[3] == pytest.approx(beyond[4]), "outside of the loop nothing is bent"
 
 
 def test_a_pose_graph_is_gtsams_to_a_tenth_of_a_millimetre():

@@ -7,10 +7,9 @@ import pytest
 from steering_scene import SmallScene, construct, difference, play
 
 from dynslam_bench.contracts.checks import check_sensors
-from dynslam_bench.core.errors import EvaluationError, SettingsError, TrackerError
+from dynslam_bench.core.errors import EvaluationError, TrackerError
 from dynslam_bench.evaluation.protocol import MONOCULAR, PROTOCOLS
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.trackers.specs import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 
@@ -47,13 +46,6 @@ def test_depth_is_never_read(scene, tracker):
     else:
         assert sum(result.stats["culled"] for result in true) > 100
     assert difference(true, play(construct(spec, wild, **few), wild)) == ""
-
-
-@pytest.mark.parametrize("tracker", OURS)
-def test_loops_are_refused_in_one_line(tracker):
-    with pytest.raises(SettingsError, match=r"closes no loops, but backend\.loop_closing\.enabled") as refused:
-        resolve_settings(TRACKERS.get(tracker), {"backend.loop_closing.enabled": True})
-    assert "\n" not in str(refused.value)
 
 
 def test_sequences_without_depth_are_for_monocular_trackers_alone(scene):

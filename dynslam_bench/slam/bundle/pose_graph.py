@@ -37,6 +37,44 @@ class Edge:
     other: int
     T_other_one: Array
 
+    def scaled(self, factor: float) -> Edge:
+        """The same tie where lengths are multiplied by a factor."""
+        pose = self.T_other_one.copy()
+        pose[:3, 3] *= factor
+        return Edge(self.one, self.other, pose)
+
+
+def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale: float) -> Array:
+    """What lengths at each keyframe are to be multiplied by, so that a tie that asks for a scale is content.
+
+    Logarithms of scales are to be equal at both ends of an edge and to differ by that of `scale` at the tie's; the
+    squares of what is left are least in sum (Strasdat, Montiel and Davison, Scale Drift-Aware Large Scale Monocular
+    SLAM, RSS 2010, solve for scales and poses together).
+
+    Args:
+        ids: Of the keyframes, ``[N]``, ascending; the first one's scale stays.
+        edges: Ties between them over which scale was kept; with them the graph must be connected.
+        tie: From the keyframe that was seen again to the one that sees it.
+        scale: What lengths at the second are to be multiplied by beside those at the first.
+
+    Returns:
+        Factors ``[N]``.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.linalg import spsolve
+
+    all_edges = [*edges, tie]
+    one = np.searchsorted(ids, [edge.one for edge in all_edges])
+    other = np.searchsorted(ids, [edge.other for edge in all_edges])
+    wanted = np.zeros(len(all_edges))
+    wanted[-1] = np.log(scale)
+    row = np.arange(len(all_edges))
+    ends = np.r_[row, row], np.r_[one, other]
+    values = np.r_[-np.ones(len(row)), np.ones(len(row))]
+    jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, 1:]
+    logarithms = spsolve((jacobian.T @ jacobian).tocsc(), jacobian.T @ wanted)
+    return np.exp(np.r_[0.0, np.atleast_1d(logarithms)])
+
 
 def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) -> Array:
     """The poses that fit the ties best; the first one stays.

@@ -40,6 +40,11 @@ class History:
         self._relative[rows] = self._relative[rows] @ T_dropped_heir
         self._reference[rows] = heir
 
+    def rescale(self, reference: int, factor: float) -> None:
+        """Lengths around a keyframe were multiplied by a factor: so are the ways of its frames from it."""
+        rows = np.flatnonzero(self._reference[: self.count] == reference)
+        self._relative[rows, :3, 3] *= factor
+
     def poses(self, world: Map) -> tuple[Array, Array, Array]:
         """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``.
 
