@@ -5,7 +5,8 @@
 Frames are rendered, their ORB features kept, nothing else. Prints for each back end: frames that count as tracked and
 RMSE of their positions after the best rigid alignment, online and final (with `full`: all of the map refined at the
 end, which takes minutes in a large one), and every loop with the true distance between its two ends. `--rivals`
-gives each frame to so many ORB-SLAM3s, too, while it is there (docs/orbslam3.md).
+gives each frame to so many ORB-SLAM3s, too, while it is there (docs/orbslam3.md). With `--without-depth` the monocular
+back end drives, and the alignment has a scale.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -27,11 +29,15 @@ from synthetic_judge import SideBySide, error, trajectory  # noqa: E402
 
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
+from dynslam_bench.evaluation.alignment import align  # noqa: E402
 from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
+from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
 from dynslam_bench.sequences import open_sequence  # noqa: E402
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
+from dynslam_bench.slam.monocular import MonocularBackend  # noqa: E402
+from dynslam_bench.slam.monocular_settings import MonocularBackendSettings  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
 SETTINGS = {
@@ -60,9 +66,8 @@ def features_of(source: str, stride: int, rivals: int) -> tuple[SyntheticSequenc
     return sequence, frames, together
 
 
-def drive(sequence: SyntheticSequence, frames: list[FrameBundle], settings: BackendSettings) -> str:
+def drive(sequence: SyntheticSequence, frames: list[FrameBundle], backend: RgbdBackend) -> str:
     """One run, in words."""
-    backend = RgbdBackend(settings)
     backend.reset(sequence.camera, 0)
     truth = sequence.ground_truth
     true = truth.T_world_cam[np.searchsorted(truth.timestamps, [frame.timestamp - 1e-6 for frame in frames])][:, :3, 3]
@@ -76,13 +81,27 @@ def drive(sequence: SyntheticSequence, frames: list[FrameBundle], settings: Back
         for loop in backend.loops.closed[len(loops) :]:
             apart = np.linalg.norm(true[number] - true[loop.frame])
             kind = "join" if loop.joins else "loop"
-            loops.append(f"{kind} {number} -> {loop.frame}, {loop.inliers} points, {apart:.2f} m apart")
+            scale = "" if backend.uses_depth else f", scale x {loop.scale:.2f}"
+            loops.append(f"{kind} {number} -> {loop.frame}, {loop.inliers} points, {apart:.2f} m apart{scale}")
     final = backend.finalize()
+
+    def measured(found: Trajectory) -> float | None:
+        return error(found, truth) if backend.uses_depth else scaled_error(found, truth)
+
     return (
-        f"online {error(trajectory(online), truth)} m on {len(online)}, "
-        f"final {error(final, truth)} m on {len(final)} of {len(frames)} frames, "
+        f"online {measured(trajectory(online))} m on {len(online)}, "
+        f"final {measured(final)} m on {len(final)} of {len(frames)} frames, "
         f"{1e3 * spent / len(frames):.0f} ms a frame, {'; '.join(loops) or 'no loop'}"
     )
+
+
+def scaled_error(found: Trajectory, truth: Trajectory) -> float | None:
+    """RMSE of positions after the best similarity, metres; None for fewer than three poses."""
+    if len(found) < 3:
+        return None
+    true = truth.T_world_cam[np.searchsorted(truth.timestamps, found.timestamps - 1e-6)]
+    moved = align(found.T_world_cam, true, "sim3").apply(found.T_world_cam)
+    return round(float(np.sqrt(np.square(moved[:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean())), 5)
 
 
 def main() -> None:
@@ -92,13 +111,19 @@ def main() -> None:
     parser.add_argument("--stride", type=int, default=2)
     parser.add_argument("--rivals", type=int, default=0, metavar="RUNS")
     parser.add_argument("--settings", nargs="+", choices=sorted(SETTINGS), default=list(SETTINGS))
+    parser.add_argument("--without-depth", action="store_true", help="with the monocular back end")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     for source in options.sequences:
         sequence, frames, together = features_of(source, options.stride, options.rivals)
+        if options.without_depth:
+            frames = [replace(frame, z=np.zeros_like(frame.z)) for frame in frames]
         for name in options.settings:
-            settings = apply_overrides(BackendSettings(), SETTINGS[name])
-            print(f"{source}, closing {name}: {drive(sequence, frames, settings)}", flush=True)
+            if options.without_depth:
+                backend: RgbdBackend = MonocularBackend(apply_overrides(MonocularBackendSettings(), SETTINGS[name]))
+            else:
+                backend = RgbdBackend(apply_overrides(BackendSettings(), SETTINGS[name]))
+            print(f"{source}, closing {name}: {drive(sequence, frames, backend)}", flush=True)
         for row in together.results():
             print(f"{source}, ORB-SLAM3: {row}", flush=True)
 
