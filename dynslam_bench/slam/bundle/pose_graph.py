@@ -73,7 +73,7 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
     values = np.r_[-np.ones(len(row)), np.ones(len(row))]
     jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, 1:]
     logarithms = spsolve((jacobian.T @ jacobian).tocsc(), jacobian.T @ wanted)
-    return np.exp(np.r_[0.0, np.atleast_1d(logarithms)])
+    return np.asarray(np.exp(np.r_[0.0, np.atleast_1d(logarithms)]))
 
 
 def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) -> Array:

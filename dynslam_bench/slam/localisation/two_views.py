@@ -117,7 +117,8 @@ class TwoViews:
     def is_as(self, other: TwoViews) -> bool:
         """Whether it is the same motion as another."""
         turned = se3.rotation_angle(self.T_second_first @ se3.inverse(other.T_second_first))
-        one, two = (each.T_second_first[:3, 3] / np.linalg.norm(each.T_second_first[:3, 3]) for each in (self, other))
+        ways = self.T_second_first[:3, 3], other.T_second_first[:3, 3]
+        one, two = (way / max(float(np.linalg.norm(way)), 1e-12) for way in ways)
         apart = np.arccos(np.clip(one @ two, -1.0, 1.0))
         return bool(np.degrees(turned) < SAME_DEG[0] and np.degrees(apart) < SAME_DEG[1])
 
@@ -311,7 +312,7 @@ def _adjusted(
     )  # fmt: skip
     result = adjust_bundle(problem, BUNDLE_ITERATIONS)
     _, chi2 = reprojection_chi2(problem, result.poses, result.points)
-    kept = np.isfinite(result.points).all(axis=1)
+    kept = np.asarray(np.isfinite(result.points).all(axis=1))
     kept[point_of[~result.inliers & ((view == 0) | (view == count))]] = False
     cost = float(np.minimum(chi2, CHI2_POINT).mean()) if len(chi2) else np.inf
     return TwoViews(result.poses[count - 1], pair.select(kept), result.points[kept], cost, len(chi2))
