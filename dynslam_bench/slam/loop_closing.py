@@ -260,7 +260,7 @@ class LoopCloser:
         if not self._scale_is_known:
             scales[slots] = spread_scale(ids, [*edges, *older], tie, loop.scale)
             by_id = dict(zip(ids.tolist(), scales[slots].tolist(), strict=True))
-            edges, self._ties = ([edge.scaled(by_id[edge.one]) for edge in row] for row in (edges, self._ties))
+            edges, self._ties = ([edge.scaled(by_id.get(edge.one, 1.0)) for edge in row] for row in (edges, self._ties))
             self.rescaled = [(int(at), float(scales[at])) for at in slots]
         after = optimise_poses(ids, before[slots], [*edges, *self._ties])
         for at, pose in zip(slots.tolist(), after, strict=True):

@@ -111,10 +111,16 @@ def test_a_scale_is_spread_over_the_ties_it_drifted_along():
     ids = np.arange(5) * 10
     steps = [Edge(int(a), int(a + 10), np.eye(4)) for a in ids[:-1]]
     found = spread_scale(ids, steps, Edge(0, 40, np.eye(4)), 2.0)
-    np.testing.assert_allclose(found, 2.0 ** (np.arange(5) / 5), err_msg="five ties share a factor of two equally")
+    np.testing.assert_allclose(
+        found, 2.0 ** (np.arange(5) / 5), rtol=1e-6, err_msg="five ties share a factor of two equally"
+    )
     np.testing.assert_allclose(spread_scale(ids, steps, Edge(0, 40, np.eye(4)), 1.0), 1.0)
+    untied = spread_scale(np.r_[ids, 50], steps, Edge(0, 40, np.eye(4)), 2.0)
+    np.testing.assert_allclose(untied, [*found, 1.0], rtol=1e-6, err_msg="what nothing ties stays")
     beyond = spread_scale(ids, steps, Edge(10, 30, np.eye(4)), 2.0)
-    assert beyond[0] == beyond[1] and beyond[3] == pytest.approx(beyond[4]), "outside of the loop nothing is bent"
+    assert beyond[1] == pytest.approx(beyond[0]) and beyond[3] == pytest.approx(beyond[4]), (
+        "outside of the loop nothing is bent"
+    )
 
 
 def test_a_pose_graph_is_gtsams_to_a_tenth_of_a_millimetre():

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
 """Of a tie: metres, then radians. Only their ratio matters, all ties weigh the same."""
 ITERATIONS = 20
+ALONE = 1e-9
+"""Weight with which each keyframe's scale stays, beside that of a tie: it tells those that nothing ties."""
 ENOUGH = 1e-9
 """The search ends when a step lowers the cost by a smaller share."""
 
@@ -53,14 +55,14 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
 
     Args:
         ids: Of the keyframes, ``[N]``, ascending; the first one's scale stays.
-        edges: Ties between them over which scale was kept; with them the graph must be connected.
+        edges: Ties between them over which scale was kept; what they do not connect with the first one stays.
         tie: From the keyframe that was seen again to the one that sees it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
     Returns:
         Factors ``[N]``.
     """
-    from scipy.sparse import coo_array
+    from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import spsolve
 
     all_edges = [*edges, tie]
@@ -72,7 +74,8 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
     ends = np.r_[row, row], np.r_[one, other]
     values = np.r_[-np.ones(len(row)), np.ones(len(row))]
     jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, 1:]
-    logarithms = spsolve((jacobian.T @ jacobian).tocsc(), jacobian.T @ wanted)
+    normal = jacobian.T @ jacobian + diags_array(np.full(len(ids) - 1, ALONE))
+    logarithms = spsolve(normal.tocsc(), jacobian.T @ wanted)
     return np.asarray(np.exp(np.r_[0.0, np.atleast_1d(logarithms)]))
 
 
