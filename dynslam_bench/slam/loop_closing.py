@@ -14,7 +14,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,8 @@ NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
 """A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
 MOST_SCALE = 3.0
 """Factor by which scale may have drifted, at most, where it is free."""
+FIRM = 100.0
+"""Weight of a loop's tie where scale is free: what is left open between two visits would bend both."""
 SCALE_POINTS = 20
 """So many features with a point of both visits are needed to tell the scale."""
 
@@ -248,7 +250,8 @@ class LoopCloser:
     def _correct(self, slot: int, loop: Loop) -> None:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
         world = self.world
-        tie = self._edge(loop.keyframe, slot, loop.T_cam_world)
+        weight = 1.0 if self._scale_is_known else FIRM
+        tie = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=weight)
         older = [edge for edge in self._ties if self._alive(edge)]
         self._ties = [*older, tie]
         small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG

@@ -33,17 +33,19 @@ class Edge:
         one: Id of the first.
         other: Id of the second.
         T_other_one: Pose ``[4, 4]`` from the first one's camera frame to the other's.
+        weight: How much more than others its error counts.
     """
 
     one: int
     other: int
     T_other_one: Array
+    weight: float = 1.0
 
     def scaled(self, factor: float) -> Edge:
         """The same tie where lengths are multiplied by a factor."""
         pose = self.T_other_one.copy()
         pose[:3, 3] *= factor
-        return Edge(self.one, self.other, pose)
+        return Edge(self.one, self.other, pose, self.weight)
 
 
 def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale: float) -> Array:
@@ -74,8 +76,9 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
     ends = np.r_[row, row], np.r_[one, other]
     values = np.r_[-np.ones(len(row)), np.ones(len(row))]
     jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, 1:]
-    normal = jacobian.T @ jacobian + diags_array(np.full(len(ids) - 1, ALONE))
-    logarithms = spsolve(normal.tocsc(), jacobian.T @ wanted)
+    weight = diags_array(np.array([edge.weight for edge in all_edges]))
+    normal = jacobian.T @ weight @ jacobian + diags_array(np.full(len(ids) - 1, ALONE))
+    logarithms = spsolve(normal.tocsc(), jacobian.T @ (weight @ wanted))
     return np.asarray(np.exp(np.r_[0.0, np.atleast_1d(logarithms)]))
 
 
@@ -93,11 +96,12 @@ def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) 
     one = np.searchsorted(ids, [edge.one for edge in edges])
     other = np.searchsorted(ids, [edge.other for edge in edges])
     back = se3.inverse(np.array([edge.T_other_one for edge in edges]))
-    error = _errors(poses, one, other, back)
+    sigmas = SIGMAS / np.sqrt([[edge.weight] for edge in edges])
+    error = _errors(poses, one, other, back, sigmas)
     cost, damping = float(np.square(error).sum()), 1e-6
     for _ in range(ITERATIONS):
-        trial = se3.exp(_step(poses, one, other, error, damping)) @ poses
-        found = _errors(trial, one, other, back)
+        trial = se3.exp(_step(poses, one, other, error, sigmas, damping)) @ poses
+        found = _errors(trial, one, other, back, sigmas)
         lower = float(np.square(found).sum())
         if not lower < cost:
             damping *= 30.0
@@ -109,18 +113,20 @@ def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) 
     return poses
 
 
-def _errors(poses: Array, one: NDArray[np.int64], other: NDArray[np.int64], back: Array) -> Array:
+def _errors(poses: Array, one: NDArray[np.int64], other: NDArray[np.int64], back: Array, sigmas: Array) -> Array:
     """What each tie contradicts ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
-    return se3.log(poses[other] @ se3.inverse(poses[one]) @ back) / SIGMAS
+    return se3.log(poses[other] @ se3.inverse(poses[one]) @ back) / sigmas
 
 
-def _step(poses: Array, one: NDArray[np.int64], other: NDArray[np.int64], error: Array, damping: float) -> Array:
+def _step(
+    poses: Array, one: NDArray[np.int64], other: NDArray[np.int64], error: Array, sigmas: Array, damping: float
+) -> Array:
     """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero."""
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import spsolve
 
-    bent = _inverse_left_jacobian(error * SIGMAS)
-    weight = 1.0 / np.array(SIGMAS)[None, :, None]
+    bent = _inverse_left_jacobian(error * sigmas)
+    weight = 1.0 / sigmas[:, :, None]
     by_other = weight * bent
     by_one = -by_other @ _adjoint(poses[other] @ se3.inverse(poses[one]))
     row = np.arange(error.size).reshape(-1, 6, 1)
