@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -70,6 +70,8 @@ class Renderer:
     def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
         self.settings = settings
         self.scene = Scene(sequence.world(), sequence.instance, settings)
+        self._view = lru_cache(maxsize=8)(partial(view_of, self.scene))
+        """How a frame sees the scene; neighbouring frames ask for the same views."""
         self.depth_sensor = _adapted(settings.depth, self.scene.world.optics.depth)
         self.color_sensor = _adapted(settings.color, self.scene.world.optics.color)
         self.threads = threads or default_threads()
@@ -92,7 +94,7 @@ class Renderer:
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
         settings = self.settings
-        now = view_of(self.scene, index)
+        now = self._view(index)
         tiles, local = self._tiles(now)
         hit, depth = self._geometry(tiles, local)
         color, cosine = self._shade(now, tiles, local, hit, depth, index / FPS)
@@ -112,7 +114,7 @@ class Renderer:
 
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in the other frame.
         """
-        now, after = view_of(self.scene, index), view_of(self.scene, other)
+        now, after = self._view(index), self._view(other)
         hit, depth = self._geometry(*self._tiles(now))
         if now.rolling:
             return rolling_flow(now, after, hit, depth)
@@ -123,7 +125,7 @@ class Renderer:
 
     def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
-        now = view_of(self.scene, index)
+        now = self._view(index)
         hit, depth = self._geometry(*self._tiles(now))
         return depth, np.append(self.scene.instance, 0).astype(np.uint8)[hit >> 3]
 
@@ -161,7 +163,7 @@ class Renderer:
     ) -> NDArray[np.float32]:
         """Motion blur; under a rolling shutter along the motion of each band's middle row."""
         flow, blurred = np.empty((*hit.shape, 2), np.float32), np.empty_like(sharp)
-        after = view_of(self.scene, index + 1)
+        after = self._view(index + 1)
 
         def work(a: int, b: int) -> None:
             row = (a + b) // 2

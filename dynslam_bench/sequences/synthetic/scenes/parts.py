@@ -110,4 +110,10 @@ def along(start: Array, end: Array, side: Array) -> tuple[Array, float]:
     z = z / length
     x = side - (side @ z) * z
     x = x / np.sqrt(x @ x)
-    return np.stack([x, np.cross(z, x), z], axis=1), length
+    return np.stack([x, _cross(z, x), z], axis=1), length
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """The cross product of two vectors, ``[3]``, numpy's to the bit, without its overhead."""
+    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
