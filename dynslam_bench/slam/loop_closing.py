@@ -270,7 +270,7 @@ class LoopCloser:
             world.set_pose(at, pose)
         seen = np.unique(world.kf_point[slots])
         points = seen[seen >= 0].astype(np.int64)
-        reference = world.obs_kf[points, 0]
+        reference = world.obs_kf[world.obs_at[points]]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
         local *= scales[reference, None]
         now = se3.inverse(world.kf_pose[reference])

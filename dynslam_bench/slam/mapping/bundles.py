@@ -66,28 +66,23 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, observatio
     poses = np.concatenate([variable, fixed])
     rank = np.full(world.kf_alive.size, -1, np.int64)
     rank[poses] = np.arange(len(poses))
-    n_obs = world.n_obs[points]
-    width = int(n_obs.max(initial=0))
-    valid = np.arange(width)[None] < n_obs[:, None]
-    keyframe = world.obs_kf[points, :width]
-    pose = np.where(valid, rank[keyframe], -1)
-    used = pose >= 0
-    support = used.sum(axis=1)
-    worth = support >= 2
-    points, pose, used, support = points[worth], pose[worth], used[worth], support[worth]
-    order = np.lexsort((world.id[points], -support))  # long tracks first
+    rows = world.observations(points)
+    of_point, pose = np.repeat(np.arange(len(points)), world.n_obs[points]), rank[world.obs_kf[rows]]
+    support = np.bincount(of_point[pose >= 0], minlength=len(points))
+    worth = np.flatnonzero(support >= 2)
+    order = worth[np.lexsort((world.id[points[worth]], -support[worth]))]  # long tracks first
     order = order[np.cumsum(support[order]) <= observations]
     order.sort()
-    points, pose, used = points[order], pose[order], used[order]
-    if not len(points):
+    if not len(order):
         return None
-    obs_point, column = np.nonzero(used)
-    obs_pose = pose[obs_point, column]
-    features = world.obs_ft[points[obs_point], column].astype(np.int64)
+    number = np.full(len(points), -1, np.int64)
+    number[order] = np.arange(len(order))
+    used = (pose >= 0) & (number[of_point] >= 0)
+    obs_point, obs_pose, points = number[of_point[used]], pose[used], points[order]
+    features = world.obs_ft[rows[used]].astype(np.int64)
     at = poses[obs_pose]
     problem = BundleProblem(
-        world.kf_pose[poses], len(variable), world.position[points], obs_pose.astype(np.int64),
-        obs_point.astype(np.int64), world.kf_xy[at, features], world.kf_right[at, features],
+        world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point, world.kf_xy[at, features], world.kf_right[at, features],
         world.kf_info[at, features], world.kf_info_right[at, features], world.camera,
     )  # fmt: skip
     return Bundle(problem, poses, points, features)

@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
 
+FEWEST_ROOM = 4
+"""Observations that find room when a point has its first one."""
+
+
 def _grown(table: NDArray[np.generic], length: int, axis: int = 0) -> NDArray[np.generic]:
     shape = list(table.shape)
     shape[axis] = length
@@ -41,8 +45,11 @@ class Map:
     Attributes (points, by slot):
         alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
         the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible, found (frames that should
-        have and did see it), born (id of the keyframe that made it), n_obs, obs_kf and obs_ft ``[M, K]`` (observing
-        keyframe slots and feature numbers, oldest first).
+        have and did see it), born (id of the keyframe that made it), n_obs, obs_at and obs_room (how many observations
+        it has, where they begin in obs_kf and obs_ft, and how many find room there).
+
+    Attributes (observations ``[O]``, those of each point in a row, oldest first):
+        obs_kf, obs_ft (observing keyframe slots and feature numbers).
     """
 
     def __init__(self, camera: Camera, scales: Array) -> None:
@@ -53,12 +60,14 @@ class Map:
         self._free_points: list[int] = []
         self._freed_points: list[int] = []
         self._top = 0
+        self._observations = 0
+        self._vacant: dict[int, list[int]] = {}
         self._features = 0
         self._words = 4
         self._allocate()
 
     def _allocate(self) -> None:
-        s, f, w, m, k = 0, self._features, self._words, 0, 8
+        s, f, w, m = 0, self._features, self._words, 0
         self.kf_alive = np.zeros(s, bool)
         self.kf_id = np.zeros(s, np.int64)
         self.kf_island = np.zeros(s, np.int64)
@@ -89,8 +98,10 @@ class Map:
         self.found = np.zeros(m, np.int32)
         self.born = np.zeros(m, np.int64)
         self.n_obs = np.zeros(m, np.int32)
-        self.obs_kf = np.zeros((m, k), np.int32)
-        self.obs_ft = np.zeros((m, k), np.int32)
+        self.obs_at = np.zeros(m, np.int64)
+        self.obs_room = np.zeros(m, np.int32)
+        self.obs_kf = np.zeros(0, np.int32)
+        self.obs_ft = np.zeros(0, np.int32)
 
     _KEYFRAME_TABLES = (
         "kf_alive", "kf_id", "kf_island", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_raw",
@@ -102,8 +113,8 @@ class Map:
         "kf_words", "kf_point",
     )  # fmt: skip
     _POINT_TABLES = (
-        "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_kf",
-        "obs_ft",
+        "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_at",
+        "obs_room",
     )  # fmt: skip
 
     # ------------------------------------------------------------------ keyframes
@@ -185,10 +196,10 @@ class Map:
 
     def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
         """Become the map of complete tables, in which every slot is in use; see `map_store`."""
-        for name in (*self._KEYFRAME_TABLES, *self._POINT_TABLES):
+        for name in (*self._KEYFRAME_TABLES, *self._POINT_TABLES, "obs_kf", "obs_ft"):
             setattr(self, name, tables[name])
         self._features, self._words = self.kf_words.shape[1:]
-        self._top = self.alive.size
+        self._top, self._observations = self.alive.size, self.obs_kf.size
         self.next_keyframe, self.next_point = next_keyframe, next_point
         for slot, pose in enumerate(self.kf_pose):
             self.set_pose(slot, pose)
@@ -199,7 +210,7 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
-        counts = kernels.covisibility(self.obs_kf, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size)
+        counts = kernels.covisibility(self.obs_kf, self.obs_at, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size)
         if exclude >= 0:
             counts[exclude] = 0
         slots = np.flatnonzero(counts)
@@ -228,9 +239,7 @@ class Map:
         n = self.kf_count[slot]
         features = np.flatnonzero(self.kf_point[slot, :n] >= 0)
         points = self.kf_point[slot, features].astype(np.int64)
-        kernels.unlink_many(
-            self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, np.full(len(features), slot, np.int64), features
-        )
+        kernels.unlink_many(*self._observed, self.kf_point, np.full(len(features), slot, np.int64), features)
         self.kf_alive[slot] = False
         self.remove_points(points[self.n_obs[points] == 0])
 
@@ -268,13 +277,13 @@ class Map:
         """Note that features of a keyframe observe points."""
         if not len(points):
             return
-        self._reserve(kernels.fullest(self.n_obs, points) + 1)
-        kernels.link(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, keyframe, features, points)
+        self._reserve(points, 1)
+        kernels.link(*self._observed, self.kf_point, keyframe, features, points)
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:
         """Forget observations; points that lose their last one are removed."""
         points = self.kf_point[keyframes, features].astype(np.int64)
-        kernels.unlink_many(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, keyframes, features)
+        kernels.unlink_many(*self._observed, self.kf_point, keyframes, features)
         points = np.unique(points[points >= 0])
         self.remove_points(points[self.n_obs[points] == 0])
 
@@ -282,7 +291,7 @@ class Map:
         """Remove points and their observations."""
         points = np.unique(points)
         points = points[self.alive[points]]
-        kernels.drop_points(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, points)
+        kernels.drop_points(*self._observed, self.kf_point, points)
         self.alive[points] = False
         self._freed_points.extend(points.tolist())
 
@@ -290,8 +299,8 @@ class Map:
         """Replace a point by another that is the same thing in the world."""
         if old == new or not self.alive[old] or not self.alive[new]:
             return
-        self._reserve(int(self.n_obs[old]) + int(self.n_obs[new]))
-        kernels.merge(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point, old, new)
+        self._reserve(np.array([new]), int(self.n_obs[old]))
+        kernels.merge(*self._observed, self.kf_point, old, new)
         self.visible[new] += self.visible[old]
         self.found[new] += self.found[old]
         self.alive[old] = False
@@ -299,19 +308,49 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
-        of_points = self.position, self.normal, self.far, self.words, self.obs_kf, self.obs_ft, self.n_obs
-        kernels.refresh(points, *of_points, self.kf_words, self.kf_octave, self.kf_centre, self.scales)
+        of_points, of_keyframes = (self.position, self.normal, self.far, self.words), (self.kf_words, self.kf_octave)
+        kernels.refresh(points, *of_points, *self._observed, *of_keyframes, self.kf_centre, self.scales)
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nobody holds them any more."""
         self._free_points.extend(sorted(self._freed_points, reverse=True))
         self._freed_points.clear()
 
-    def _reserve(self, observations: int) -> None:
-        if observations > self.obs_kf.shape[1]:
-            length = max(observations, 2 * self.obs_kf.shape[1])
-            self.obs_kf = np.asarray(_grown(self.obs_kf, length, axis=1), np.int32)
-            self.obs_ft = np.asarray(_grown(self.obs_ft, length, axis=1), np.int32)
+    @property
+    def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:
+        return self.obs_kf, self.obs_ft, self.obs_at, self.n_obs
+
+    def observations(self, points: Slots) -> Slots:
+        """Rows of `obs_kf` and `obs_ft` that belong to points, one point after the other."""
+        count = self.n_obs[points].astype(np.int64)
+        begin = self.obs_at[points] - (np.cumsum(count) - count)
+        return np.repeat(begin, count) + np.arange(count.sum())
+
+    def _reserve(self, points: Slots, more: int) -> None:
+        """Make room for so many more observations of each of the points; what they leave is used again."""
+        needed = self.n_obs[points] + more
+        short = np.unique(points[needed > self.obs_room[points]])
+        if not len(short):
+            return
+        rooms = np.maximum(2 * self.obs_room[short], FEWEST_ROOM)
+        if more > 1:
+            rooms = np.maximum(rooms, self.n_obs[short] + more)
+        for room in np.unique(rooms).tolist():
+            wanting = short[rooms == room]
+            vacant = self._vacant.get(room, [])
+            at = [vacant.pop() for _ in range(min(len(vacant), len(wanting)))]
+            fresh = self._observations + room * np.arange(len(wanting) - len(at), dtype=np.int64)
+            self._observations += room * len(fresh)
+            if self._observations > self.obs_kf.size:
+                length = max(self._observations, self.obs_kf.size + self.obs_kf.size // 2)
+                for name in ("obs_kf", "obs_ft"):
+                    setattr(self, name, _grown(getattr(self, name), length))
+            left = zip(self.obs_room[wanting].tolist(), self.obs_at[wanting].tolist(), strict=True)
+            kernels.move(*self._observed, wanting, np.concatenate([np.array(at, np.int64), fresh]))
+            self.obs_room[wanting] = room
+            for size, place in left:
+                if size:
+                    self._vacant.setdefault(size, []).append(place)
 
     # ------------------------------------------------------------------ views
 
@@ -332,6 +371,8 @@ class Map:
         All points of a keyframe without any depth count as close.
         """
         depth = self.kf_z if self.kf_z[slot].any() else np.full(self.kf_z.shape, close_m, np.float32)
-        keyframes, seen = (self.kf_point, self.kf_octave, depth), (self.obs_kf, self.obs_ft, self.n_obs)
-        total, redundant = kernels.redundancy(slot, int(self.kf_count[slot]), *keyframes, close_m, *seen, others)
+        keyframes = self.kf_point, self.kf_octave, depth
+        total, redundant = kernels.redundancy(
+            slot, int(self.kf_count[slot]), *keyframes, close_m, *self._observed, others
+        )
         return int(total), int(redundant)

@@ -12,22 +12,25 @@ from dynslam_bench.features.matching import distance
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
+Slots = NDArray[np.int64]
 Table = NDArray[np.int32]
 
 
 @kernel
-def fullest(n_obs: Ints, points: NDArray[np.int64]) -> int:
-    """Largest number of observations among the points."""
-    most = 0
+def move(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, points: Slots, to: Slots) -> None:
+    """Move the observations of the points to where there is more room."""
     for i in range(points.shape[0]):
-        most = max(most, n_obs[points[i]])
-    return most
+        p = points[i]
+        for k in range(n_obs[p]):
+            obs_kf[to[i] + k] = obs_kf[obs_at[p] + k]
+            obs_ft[to[i] + k] = obs_ft[obs_at[p] + k]
+        obs_at[p] = to[i]
 
 
 @kernel
 def link(
-    obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, keyframe: int, features: NDArray[np.int64],
-    points: NDArray[np.int64],
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, keyframe: int, features: Slots,
+    points: Slots,
 ) -> None:  # fmt: skip
     """Note that the keyframe's features observe the points; a pair that would be a second observation is skipped."""
     for i in range(points.shape[0]):
@@ -35,92 +38,91 @@ def link(
         if kf_point[keyframe, f] >= 0:
             continue
         seen = False
-        for k in range(n_obs[p]):
-            if obs_kf[p, k] == keyframe:
+        begin, end = obs_at[p], obs_at[p] + n_obs[p]
+        for o in range(begin, end):
+            if obs_kf[o] == keyframe:
                 seen = True
         if seen:
             continue
-        obs_kf[p, n_obs[p]] = keyframe
-        obs_ft[p, n_obs[p]] = f
+        obs_kf[end] = keyframe
+        obs_ft[end] = f
         n_obs[p] += 1
         kf_point[keyframe, f] = p
 
 
 @kernel
-def unlink(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, keyframe: int, feature: int) -> None:
+def unlink(
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, keyframe: int, feature: int
+) -> None:
     """Forget one observation; the order of the others is kept."""
     p = kf_point[keyframe, feature]
     if p < 0:
         return
     kf_point[keyframe, feature] = -1
-    out = 0
-    for k in range(n_obs[p]):
-        if obs_kf[p, k] == keyframe and obs_ft[p, k] == feature:
+    begin, out = obs_at[p], obs_at[p]
+    for o in range(begin, begin + n_obs[p]):
+        if obs_kf[o] == keyframe and obs_ft[o] == feature:
             continue
-        obs_kf[p, out] = obs_kf[p, k]
-        obs_ft[p, out] = obs_ft[p, k]
+        obs_kf[out] = obs_kf[o]
+        obs_ft[out] = obs_ft[o]
         out += 1
-    n_obs[p] = out
+    n_obs[p] = out - begin
 
 
 @kernel
 def unlink_many(
-    obs_kf: Table,
-    obs_ft: Table,
-    n_obs: Ints,
-    kf_point: Table,
-    keyframes: NDArray[np.int64],
-    features: NDArray[np.int64],
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, keyframes: Slots, features: Slots
 ) -> None:
     """Forget several observations."""
     for i in range(keyframes.shape[0]):
-        unlink(obs_kf, obs_ft, n_obs, kf_point, keyframes[i], features[i])
+        unlink(obs_kf, obs_ft, obs_at, n_obs, kf_point, keyframes[i], features[i])
 
 
 @kernel
-def drop_points(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, points: NDArray[np.int64]) -> None:
+def drop_points(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, points: Slots) -> None:
     """Remove all observations of the points."""
     for i in range(points.shape[0]):
         p = points[i]
-        for k in range(n_obs[p]):
-            kf_point[obs_kf[p, k], obs_ft[p, k]] = -1
+        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+            kf_point[obs_kf[o], obs_ft[o]] = -1
         n_obs[p] = 0
 
 
 @kernel
-def merge(obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_point: Table, old: int, new: int) -> None:
+def merge(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, old: int, new: int) -> None:
     """Hand the observations of `old` to `new`; where both are seen in one keyframe, `new`'s stays."""
-    for k in range(n_obs[old]):
-        kf, ft = obs_kf[old, k], obs_ft[old, k]
+    for o in range(obs_at[old], obs_at[old] + n_obs[old]):
+        kf, ft = obs_kf[o], obs_ft[o]
         kf_point[kf, ft] = -1
         seen = False
-        for m in range(n_obs[new]):
-            if obs_kf[new, m] == kf:
+        begin, end = obs_at[new], obs_at[new] + n_obs[new]
+        for known in range(begin, end):
+            if obs_kf[known] == kf:
                 seen = True
         if not seen:
-            obs_kf[new, n_obs[new]] = kf
-            obs_ft[new, n_obs[new]] = ft
+            obs_kf[end] = kf
+            obs_ft[end] = ft
             n_obs[new] += 1
             kf_point[kf, ft] = new
     n_obs[old] = 0
 
 
 @kernel
-def covisibility(obs_kf: Table, n_obs: Ints, points: Ints, slots: int) -> NDArray[np.int64]:
+def covisibility(obs_kf: Ints, obs_at: Slots, n_obs: Ints, points: Ints, slots: int) -> Slots:
     """How many of the points each keyframe slot observes."""
     counts = np.zeros(slots, np.int64)
     for i in range(points.shape[0]):
         p = points[i]
         if p >= 0:
-            for k in range(n_obs[p]):
-                counts[obs_kf[p, k]] += 1
+            for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+                counts[obs_kf[o]] += 1
     return counts
 
 
 @kernel
 def refresh(
-    points: NDArray[np.int64], position: Array, normal: Array, far: Array, words: Any,
-    obs_kf: Table, obs_ft: Table, n_obs: Ints, kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
+    points: Slots, position: Array, normal: Array, far: Array, words: Any, obs_kf: Ints, obs_ft: Ints, obs_at: Slots,
+    n_obs: Ints, kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
 ) -> None:  # fmt: skip
     """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
     for i in range(points.shape[0]):
@@ -128,29 +130,30 @@ def refresh(
         n = n_obs[p]
         if n == 0:
             continue
+        begin, end = obs_at[p], obs_at[p] + n
         m = min(n, 12)  # the newest observations stand for all
-        best = n - 1
+        best = end - 1
         if m > 2:
             best_score = 1 << 40
-            for a in range(n - m, n):
+            for a in range(end - m, end):
                 score = 0
-                for b in range(n - m, n):
-                    score += distance(kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]])
+                for b in range(end - m, end):
+                    score += distance(kf_words[obs_kf[a], obs_ft[a]], kf_words[obs_kf[b], obs_ft[b]])
                 if score < best_score:
                     best, best_score = a, score
         for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
-            words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
+            words[p, w] = kf_words[obs_kf[best], obs_ft[best], w]
         sx, sy, sz = 0.0, 0.0, 0.0
         reach = 0.0
-        for k in range(n):
-            c = kf_centre[obs_kf[p, k]]
+        for o in range(begin, end):
+            c = kf_centre[obs_kf[o]]
             x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
             d = np.sqrt(x * x + y * y + z * z) + 1e-12
             sx += x / d
             sy += y / d
             sz += z / d
-            if k == 0:
-                reach = d * scales[kf_octave[obs_kf[p, k], obs_ft[p, k]]]
+            if o == begin:
+                reach = d * scales[kf_octave[obs_kf[o], obs_ft[o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
         normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
         far[p] = reach
@@ -210,7 +213,7 @@ def project(
 @kernel
 def redundancy(
     keyframe: int, count: int, kf_point: Table, kf_octave: Any, kf_z: Any, close: float,
-    obs_kf: Table, obs_ft: Table, n_obs: Ints, others: int,
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, others: int,
 ) -> tuple[int, int]:  # fmt: skip
     """How many close points the keyframe observes, and how many of them `others` keyframes see as well or finer."""
     total, redundant = 0, 0
@@ -222,8 +225,8 @@ def redundancy(
         if n_obs[p] <= others:
             continue
         fine = 0
-        for k in range(n_obs[p]):
-            if obs_kf[p, k] != keyframe and kf_octave[obs_kf[p, k], obs_ft[p, k]] <= kf_octave[keyframe, f] + 1:
+        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+            if obs_kf[o] != keyframe and kf_octave[obs_kf[o], obs_ft[o]] <= kf_octave[keyframe, f] + 1:
                 fine += 1
         redundant += fine >= others
     return total, redundant

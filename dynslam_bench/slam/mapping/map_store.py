@@ -15,6 +15,7 @@ from .map import Map
 from .saved_map import (
     FEATURE_ARRAYS,
     KEYFRAME_ARRAYS,
+    OBSERVATION_ARRAYS,
     POINT_ARRAYS,
     MapFeatures,
     MapHeader,
@@ -78,7 +79,7 @@ def packed(world: Map, islands: Islands) -> dict[str, NDArray[Any]]:
     slots, points = world.keyframes, world.points
     points = points[np.argsort(world.id[points], kind="stable")]
     features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
-    observations = np.arange(world.obs_kf.shape[1]) < world.n_obs[points][:, None]
+    observations = world.observations(points)
     found = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
     found |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
     found |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
@@ -87,8 +88,8 @@ def packed(world: Map, islands: Islands) -> dict[str, NDArray[Any]]:
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
     found["kf_point"] = row_of_point[found["kf_point"]]
-    found["obs_kf"] = row_of_keyframe[world.obs_kf[points][observations]]
-    found["obs_ft"] = world.obs_ft[points][observations]
+    found["obs_kf"] = row_of_keyframe[world.obs_kf[observations]]
+    found["obs_ft"] = world.obs_ft[observations]
     every = islands.all()
     found["island_start"] = np.array([each.start for each in every]).reshape(-1, 3)
     found["island_anchor"] = np.array([each.anchor for each in every]).reshape(-1, 3)
@@ -108,7 +109,8 @@ def restored(saved: SavedMap, camera: Camera, scales: Array) -> tuple[Map, Islan
     count, n_obs = arrays["kf_count"], arrays["n_obs"]
     tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
     tables |= {name: _table(arrays[name], count) for name in FEATURE_ARRAYS}
-    tables |= {name: _table(arrays[name], n_obs, least=8) for name in ("obs_kf", "obs_ft")}
+    tables |= {name: arrays[name].copy() for name in OBSERVATION_ARRAYS}
+    tables["obs_at"], tables["obs_room"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
     tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)
@@ -118,9 +120,9 @@ def restored(saved: SavedMap, camera: Camera, scales: Array) -> tuple[Map, Islan
     return world, Islands(_islands(arrays))
 
 
-def _table(rows: NDArray[Any], counts: NDArray[Any], least: int = 0) -> NDArray[Any]:
+def _table(rows: NDArray[Any], counts: NDArray[Any]) -> NDArray[Any]:
     """Rows that follow each other, so many for each line of a table, as that table; the rest is zero."""
-    width = max(int(counts.max(initial=0)), least)
+    width = int(counts.max(initial=0))
     table = np.zeros((len(counts), width, *rows.shape[1:]), rows.dtype)
     table[np.arange(width) < counts[:, None]] = rows
     return table
