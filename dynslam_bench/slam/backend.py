@@ -295,8 +295,8 @@ class RgbdBackend:
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             self.loops.close(slot, tracked.seen)
-            for rescaled, factor in self.loops.rescaled:
-                self.history.rescale(rescaled, factor)
+            self.history.rescale(self.loops.rescaled)
+            self.motion.rescale(self.loops.rescaled.get(slot, 1.0))
             spent["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
         gone = [dropped for dropped, _, _ in self.mapper.dropped]

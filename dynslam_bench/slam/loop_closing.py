@@ -3,13 +3,15 @@
 1. *Detect*: keyframes that share few points with the newest one, and are old, are ranked by how much they look like
    it (`places`: nothing is trained or downloaded). Those that do so no less than its neighbours do, the best few of
    them, are matched feature by feature.
-2. *Verify*: a pose by RANSAC, then by all points around the candidate, in metres since depth is known. It must explain
+2. *Verify*: a pose by RANSAC, then by all points around the candidate, and without depth the scale. It must explain
    most of what should be in view, agree with the keyframes before, and ask for no more correction than the way since
    the candidate may have drifted. The last condition is ours: rooms that look the same pass all others.
 3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loops. Without depth the
    scale drifts as well: each keyframe's scale is found first, then the poses. A map of its own, begun after the camera
    was lost where nothing was recognised, is moved to where it belongs instead, as it is.
 4. *Fuse*: points of both visits that are one thing in the world are merged, and the surroundings are adjusted.
+
+Lengths are metres; without depth they are in units of the first map's median depth.
 """
 
 from __future__ import annotations
@@ -43,8 +45,10 @@ SLACK_M, SLACK_DEG = 0.1, 3.0
 """Correction that is believed however short the way."""
 TURN_M = 3.0
 """Metres of way that a turn by one radian counts as: it renews the view as much as walking past a wall 3 m away."""
-AGREE_M, AGREE_DEG = 0.1, 2.0
-"""So far the corrections of keyframes in a row may differ."""
+TURN_DEPTHS = 1.0
+"""The same without depth: the wall is as far away as what the first map showed."""
+AGREE_M, AGREE_DEG, AGREE_SCALE = 0.1, 2.0, 0.1
+"""So far the corrections of keyframes in a row may differ; of a scale, its logarithm."""
 NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
 """A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
 MOST_SCALE = 3.0
@@ -66,7 +70,7 @@ class Loop:
         inliers: Points that fit it.
         share: How many of the keyframe's own points in view are among them, of one.
         joins: Whether the place lies on another island of the map.
-        moved_m: How far the newest keyframe is from where it was believed to be, metres.
+        moved_m: How far the newest keyframe is from where it was believed to be.
         turned_deg: By how much it is turned, degrees.
         scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
     """
@@ -110,15 +114,15 @@ class LoopCloser:
         self.settings = settings
         self.closed: list[Loop] = []
         """All loops that were closed."""
-        self.rescaled: list[tuple[int, float]] = []
-        """Slots of keyframes whose surroundings the last loop rescaled, and by what."""
+        self.rescaled: dict[int, float] = {}
+        """By what the last call of `close` rescaled the surroundings of keyframes, by their slots."""
         self._seed = seed
         self._scale_is_known = scale_is_known
         self._way: dict[int, float] = {}
         self._walked = 0.0
         self._short_cuts: list[tuple[float, float]] = []
         self._last_pose: Array | None = None
-        self._row: list[Array] = []
+        self._row: list[Correction] = []
         self._ties: list[Edge] = []
 
     def close(self, slot: int, seen: Observations) -> bool:
@@ -131,26 +135,28 @@ class LoopCloser:
         Returns:
             Whether a loop was closed; every pose and point may have changed then.
         """
-        self.rescaled = []
+        self.rescaled = {}
         self._note_way(slot)
         loop = self._verified(slot, seen)
         if loop is None:
             self._row.clear()
             return False
-        correction = se3.inverse(loop.T_cam_world) @ self.world.kf_pose[slot]
-        if self._row and not _near(self._row[-1], correction, self.world.kf_centre[slot]):
+        correction = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
+        if self._row and not correction.agrees(self._row[-1], self.world.kf_centre[slot]):
             self._row.clear()
         self._row.append(correction)
         if len(self._row) < self.settings.loop_closing.confirmations:
             return False
+        loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
         self._row.clear()
         if loop.joins:
-            self._join(slot, loop, correction)
+            self._join(slot, loop, correction.T_now_before)
         else:
             self._correct(slot, loop)
         self._fuse(slot, loop.keyframe)
         self._short_cuts.append((self._way.get(int(self.world.kf_id[loop.keyframe]), 0.0), self._walked))
         self.closed.append(loop)
+        self._last_pose = self.world.kf_pose[slot].copy()  # a correction is no way
         return True
 
     # ------------------------------------------------------------------ detect and verify
@@ -159,7 +165,8 @@ class LoopCloser:
         pose = self.world.kf_pose[slot].copy()
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
-            self._walked += float(np.linalg.norm(step[:3, 3]) + TURN_M * se3.rotation_angle(step))
+            turn = TURN_M if self._scale_is_known else TURN_DEPTHS
+            self._walked += float(np.linalg.norm(step[:3, 3]) + turn * se3.rotation_angle(step))
         self._last_pose = pose
         self._way[int(self.world.kf_id[slot])] = self._walked
 
@@ -241,7 +248,7 @@ class LoopCloser:
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 
     def _way_to(self, slot: int) -> float:
-        """Metres along which drift can have come in since a keyframe: walked and turned, or over a closed loop."""
+        """The way along which drift can have come in since a keyframe: walked and turned, or over a closed loop."""
         then = self._way.get(int(self.world.kf_id[slot]), 0.0)  # 0: of a loaded map
         return min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
 
@@ -252,7 +259,7 @@ class LoopCloser:
         world = self.world
         weight = 1.0 if self._scale_is_known else FIRM
         tie = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=weight)
-        older = [edge for edge in self._ties if self._alive(edge)]
+        older = _within(world.kf_id[world.keyframes], self._ties)
         self._ties = [*older, tie]
         small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG
         if small and abs(np.log(loop.scale)) < NEGLIGIBLE_SCALE:
@@ -261,11 +268,11 @@ class LoopCloser:
         before, ids = world.kf_pose.copy(), world.kf_id[slots]
         edges, scales = self._edges(slots), np.ones(world.kf_alive.size)
         if not self._scale_is_known:
-            scales[slots] = spread_scale(ids, [*edges, *older], tie, loop.scale)
+            scales[slots] = spread_scale(ids, [*edges, *_within(ids, older)], tie, loop.scale)
             by_id = dict(zip(ids.tolist(), scales[slots].tolist(), strict=True))
             edges, self._ties = ([edge.scaled(by_id.get(edge.one, 1.0)) for edge in row] for row in (edges, self._ties))
-            self.rescaled = [(int(at), float(scales[at])) for at in slots]
-        after = optimise_poses(ids, before[slots], [*edges, *self._ties])
+            self.rescaled = dict(zip(slots.tolist(), scales[slots].tolist(), strict=True))
+        after = optimise_poses(ids, before[slots], [*edges, *_within(ids, self._ties)])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
         seen = np.unique(world.kf_point[slots])
@@ -292,10 +299,6 @@ class LoopCloser:
         relative = pose_of_other @ se3.inverse(world.kf_pose[one])
         return Edge(int(world.kf_id[one]), int(world.kf_id[other]), relative)
 
-    def _alive(self, edge: Edge) -> bool:
-        ids = self.world.kf_id[self.world.keyframes]
-        return bool(np.isin([edge.one, edge.other], ids).all())
-
     def _edges(self, slots: Slots) -> list[Edge]:
         """Ties between keyframes as the map is now: each with the older ones that share many points, and the most.
 
@@ -318,7 +321,38 @@ class LoopCloser:
             self.mapper.adjust(slot)
 
 
-def _near(one: Array, other: Array, at: Array) -> bool:
-    """Whether two corrections of the world agree at a place."""
-    apart = np.linalg.norm(se3.transform(one, at[None]) - se3.transform(other, at[None]))
-    return bool(apart < AGREE_M and np.degrees(se3.rotation_angle(one @ se3.inverse(other))) < AGREE_DEG)
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What a keyframe asks for.
+
+    Attributes:
+        T_cam_before: Its pose ``[4, 4]`` as the map has it, world to camera.
+        T_cam_now: Its pose by the place that it sees again.
+        scale: What lengths around it are to be multiplied by.
+    """
+
+    T_cam_before: Array
+    T_cam_now: Array
+    scale: float
+
+    @property
+    def T_now_before(self) -> Array:
+        """From the world as the keyframe has it to the world as the place has it, ``[4, 4]``, lengths as they are."""
+        return se3.inverse(self.T_cam_now) @ self.T_cam_before
+
+    def moved(self, at: Array) -> Array:
+        """Where a place ``[3]`` near the keyframe belongs, ``[3]``."""
+        local = self.scale * se3.transform(self.T_cam_before, at[None])
+        return se3.transform(se3.inverse(self.T_cam_now), local)[0]
+
+    def agrees(self, other: Correction, at: Array) -> bool:
+        """Whether another correction moves a place nearly as this one does."""
+        apart = np.linalg.norm(self.moved(at) - other.moved(at))
+        turned = se3.rotation_angle(self.T_now_before @ se3.inverse(other.T_now_before))
+        scaled = abs(np.log(self.scale / other.scale))
+        return bool(apart < AGREE_M and np.degrees(turned) < AGREE_DEG and scaled < AGREE_SCALE)
+
+
+def _within(ids: NDArray[np.int64], edges: list[Edge]) -> list[Edge]:
+    """The ties of which both ends are among keyframes."""
+    return [edge for edge in edges if np.isin([edge.one, edge.other], ids).all()]

@@ -13,10 +13,12 @@ from .settings import (
     KeyframeSettings,
     LoopClosingSettings,
     MappingSettings,
+    RelocalisationSettings,
     TrackingSettings,
 )
 
 NO_DEPTH = "no effect: there is no depth"
+NO_MAPS = "no effect: without depth no second map begins"
 
 
 class TwoViewSettings(Settings):
@@ -66,6 +68,13 @@ class MonocularMappingSettings(MappingSettings):
     neighbours: int = tunable(
         20, low=3, high=40, limits=(1, 100), meaning="covisible keyframes that new points are sought in and fused with"
     )
+    min_parallax_sigmas: float = Field(
+        6.0,
+        ge=0,
+        le=100,
+        description="smallest parallax of a new point, in standard deviations of a feature's place, which grow with "
+        "its octave: coarse features that hardly moved are believed too near, and lengths shrink with them",
+    )
     triangulate_below: float = Field(
         1.0, ge=1, le=1, description="no effect: whatever has no point yet is triangulated"
     )
@@ -78,9 +87,20 @@ class MonocularLoopClosingSettings(LoopClosingSettings):
         0.1,
         gt=0,
         le=1,
-        description="largest correction that is believed, as a share of the way since; more than with depth, since "
-        "scale drifts",
+        description="largest correction that is believed, as a share of the way since, of which a turn by a radian is "
+        "one unit of length; more than with depth, since scale drifts",
     )
+    drift_deg: float = Field(
+        0.5, gt=0, le=90, description="largest rotation that is believed, degrees a unit of length of that way"
+    )
+    join_inliers: int = Field(100, description=NO_MAPS)
+    join_share: float = Field(0.5, description=NO_MAPS)
+
+
+class MonocularRelocalisationSettings(RelocalisationSettings):
+    """Finding the camera again after a loss."""
+
+    new_map_after: int = Field(5, description=NO_MAPS)
 
 
 class MonocularBackendSettings(BackendSettings):
@@ -90,4 +110,5 @@ class MonocularBackendSettings(BackendSettings):
     tracking: MonocularTrackingSettings = MonocularTrackingSettings()
     keyframes: MonocularKeyframeSettings = MonocularKeyframeSettings()
     mapping: MonocularMappingSettings = MonocularMappingSettings()
+    relocalisation: MonocularRelocalisationSettings = MonocularRelocalisationSettings()
     loop_closing: MonocularLoopClosingSettings = MonocularLoopClosingSettings()

@@ -175,6 +175,13 @@ class MappingSettings(Settings):
     min_parallax_deg: float = tunable(
         1.0, low=0.2, high=3.0, limits=(0.01, 30.0), unit="deg", meaning="smallest parallax of a triangulated point"
     )
+    min_parallax_sigmas: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="the same in standard deviations of a feature's place, which grow with its octave: with six "
+        "depth is known to a sixth",
+    )
     min_found_ratio: float = tunable(
         0.25,
         low=0.1,
@@ -304,10 +311,12 @@ class LoopClosingSettings(Settings):
         0.03,
         gt=0,
         le=1,
-        description="largest correction that is believed, as a share of the way since: places that only look the same "
-        "are farther away than drift explains",
+        description="largest correction that is believed, as a share of the way since, of which a turn by a radian is "
+        "three metres: places that only look the same are farther away than drift explains",
     )
-    drift_deg: float = Field(0.5, gt=0, le=90, description="largest rotation that is believed, degrees a metre")
+    drift_deg: float = Field(
+        0.5, gt=0, le=90, description="largest rotation that is believed, degrees a metre of that way"
+    )
 
 
 class MotionModelSettings(Settings):

@@ -12,6 +12,8 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, optimise_poses, spread_scale
 from dynslam_bench.slam.localisation.surroundings import not_held
+from dynslam_bench.slam.loop_closing import FIRM, Correction
+from dynslam_bench.slam.mapping.history import History
 from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
 from dynslam_bench.slam.settings import BackendSettings, LoopClosingSettings
@@ -36,7 +38,8 @@ def drive(world, frames, *, closing):
 
 def drive_without_depth(world, frames, step, *, closing):
     """A monocular back end that has driven around, and the RMSE of its final path, scaled and aligned, metres."""
-    settings = apply_overrides(MonocularBackendSettings(), {"loop_closing.enabled": closing})
+    drifting = {"mapping.min_parallax_sigmas": 0.0}  # with the default there is hardly a scale to give back
+    settings = apply_overrides(MonocularBackendSettings(), {"loop_closing.enabled": closing, **drifting})
     backend, poses = MonocularBackend(settings), world.lap(frames, step)
     backend.reset(world.camera, 0)
     for index, pose in enumerate(poses):
@@ -71,14 +74,68 @@ def test_a_lap_comes_back_to_where_it_began():
     assert (backend.world.n_obs[index] > 0).all() and np.isfinite(backend.world.position[index]).all()
 
 
-def test_without_depth_a_lap_gets_its_scale_back():
-    world = RingWorld(side=9.0)
+@pytest.fixture(scope="module")
+def lap_without_depth():
+    """A ring, and a monocular back end that has closed it: frames, back end, and its RMSE."""
+    world = RingWorld(side=9.0, seed=3)
     frames = int(np.ceil((4 * (world.side - 2) + 2 * np.pi) / 0.07)) + 40
+    return world, frames, *drive_without_depth(world, frames, 0.07, closing=True)
+
+
+def test_without_depth_a_lap_gets_its_scale_back(lap_without_depth):
+    world, frames, backend, closed = lap_without_depth
     _, without = drive_without_depth(world, frames, 0.07, closing=False)
-    backend, closed = drive_without_depth(world, frames, 0.07, closing=True)
     loop = backend.loops.closed[0]
     assert loop.frame < 20 and abs(np.log(loop.scale)) > 0.03, "to the lap's beginning, where lengths were others"
     assert closed < 0.6 * without
+
+
+def test_a_map_without_depth_goes_on_after_its_loop_was_closed_and_it_was_saved(lap_without_depth, tmp_path):
+    world, _, made, _ = lap_without_depth
+    made.save_map(tmp_path / "lap.npz")
+    settings = {"loop_closing.enabled": True, "map.file": str(tmp_path / "lap.npz")}
+    again, poses = MonocularBackend(apply_overrides(MonocularBackendSettings(), settings)), world.lap(60, 0.07)
+    again.reset(world.camera, 1)
+    found = []
+    for index, pose in enumerate(poses):
+        frame = world.see(pose, 1000 + index, noise_px=0.8, limit=700)
+        frame = replace(frame, z=np.zeros_like(frame.z))
+        found.append(again.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32)))
+    assert [each.state for each in found] == ["ok"] * 60 and not again.loops.closed
+    path = np.array([each.T_world_cam for each in found])
+    aligned = align(path, poses, "sim3")
+    assert np.linalg.norm(aligned.apply(path)[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.05
+    metre = made.history.poses(made.world)[1]  # in the unit of the saved map
+    walked = np.linalg.norm(np.diff(se3.inverse(metre)[:60, :3, 3], axis=0), axis=1).sum()
+    assert np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1).sum() == pytest.approx(walked, rel=0.1)
+
+
+@pytest.mark.parametrize(("scale", "told", "agree"), [(1.6, 1.6, True), (2.5, 2.4, True), (1.05, 2.5, False)])
+def test_keyframes_in_a_row_agree_on_a_similarity(scale, told, agree):
+    """Two keyframes 0.2 apart; lengths where they are should be `scale` times as large, and the second tells `told`."""
+    asked = []
+    for at, factor in ((5.0, scale), (5.2, told)):
+        before, now = np.eye(4), np.eye(4)
+        before[0, 3], now[0, 3] = -at, -scale * (at - 5.0)
+        asked.append(Correction(before, now, factor))
+    assert asked[1].agrees(asked[0], np.array([5.2, 0.0, 0.0])) is agree
+
+
+def test_frames_of_a_rescaled_keyframe_move_with_it(lap_without_depth):
+    _, _, backend, _ = lap_without_depth
+    world, history = backend.world, History()
+    one, other = (int(slot) for slot in world.keyframes[:2])
+    information = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0])
+    for stamp, slot in ((0.0, one), (1.0, other), (2.0, one)):
+        history.append(stamp, slot, se3.exp(np.array([0.3, 0.0, 0.1, 0.0, 0.2, 0.0])), information)
+    _, before, _ = history.poses(world)
+    history.rescale({one: 2.0})
+    stamps, after, told = history.poses(world)
+    relative = [poses @ se3.inverse(world.kf_pose[[one, other, one]]) for poses in (before, after)]
+    assert stamps.tolist() == [0.0, 1.0, 2.0]
+    np.testing.assert_allclose(relative[1][:, :3, 3], relative[0][:, :3, 3] * np.array([[2.0], [1.0], [2.0]]))
+    np.testing.assert_allclose(relative[1][:, :3, :3], relative[0][:, :3, :3])
+    np.testing.assert_allclose(np.diagonal(told, axis1=1, axis2=2)[:, [0, 5]], [[1.0, 1.0], [4.0, 1.0], [1.0, 1.0]])
 
 
 def test_corridors_that_look_the_same_are_not_taken_for_one():
@@ -117,13 +174,18 @@ def test_a_scale_is_spread_over_the_ties_it_drifted_along():
     np.testing.assert_allclose(spread_scale(ids, steps, Edge(0, 40, np.eye(4)), 1.0), 1.0)
     untied = spread_scale(np.r_[ids, 50], steps, Edge(0, 40, np.eye(4)), 2.0)
     np.testing.assert_allclose(untied, [*found, 1.0], rtol=1e-6, err_msg="what nothing ties stays")
+    apart = spread_scale(np.r_[-1, ids], steps, Edge(0, 40, np.eye(4)), 2.0)
+    np.testing.assert_allclose(apart, [1.0, *found], rtol=1e-6, err_msg="the oldest of what is connected stays")
+    firm = spread_scale(ids, steps, Edge(0, 40, np.eye(4), FIRM), 2.0)
+    assert firm[4] == pytest.approx(2.0, rel=0.01), "nothing is left open where two visits meet"
     beyond = spread_scale(ids, steps, Edge(10, 30, np.eye(4)), 2.0)
     assert beyond[1] == pytest.approx(beyond[0]) and beyond[3] == pytest.approx(beyond[4]), (
         "outside of the loop nothing is bent"
     )
 
 
-def test_a_pose_graph_is_gtsams_to_a_tenth_of_a_millimetre():
+@pytest.mark.parametrize("weight", [1.0, FIRM])
+def test_a_pose_graph_is_gtsams_to_a_tenth_of_a_millimetre(weight):
     gtsam = pytest.importorskip("gtsam", reason="the reference is an extra")
     rng = np.random.default_rng(0)
     count, ids = 60, np.arange(60) * 3
@@ -135,13 +197,14 @@ def test_a_pose_graph_is_gtsams_to_a_tenth_of_a_millimetre():
         drifted.append(slip @ step @ drifted[-1])
     pairs = [(i, j) for i in range(count) for j in (i + 1, i + 2) if j < count]
     edges = [Edge(int(ids[i]), int(ids[j]), drifted[j] @ se3.inverse(drifted[i])) for i, j in pairs]
-    edges.append(Edge(0, int(ids[-1]), true[-1]))
+    edges.append(Edge(0, int(ids[-1]), true[-1], weight))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for key, pose in zip(ids.tolist(), se3.inverse(np.array(drifted)), strict=True):
         values.insert(key, gtsam.Pose3(pose))
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-    model = gtsam.noiseModel.Diagonal.Sigmas(np.array([*SIGMAS[3:], *SIGMAS[:3]]))
     for edge in edges:
+        sigmas = np.array([*SIGMAS[3:], *SIGMAS[:3]]) / np.sqrt(edge.weight)
+        model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         T_one_other = gtsam.Pose3(se3.inverse(edge.T_other_one))
         graph.add(gtsam.BetweenFactorPose3(edge.one, edge.other, T_one_other, model))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()

@@ -66,6 +66,57 @@ def test_two_views_tell_the_motion_up_to_scale(room, flat):
     assert len(found.pair) > 120 and (found.points[:, 2] > 0).all() and found.parallax_deg > 1.0
 
 
+def before_a_wall(room, seed):
+    """400 points on a wall, and 100 on things before it that are found less exactly; gives the frames of a step."""
+    rng = np.random.default_rng(seed)
+    depth = np.where(np.arange(500) < 400, 3.0, rng.uniform(1.2, 2.2, 500))
+    rays = (rng.uniform([60, 60], [580, 420], (500, 2)) - [319.5, 239.5]) / 525.0
+    room.points = np.column_stack([rays, np.ones(500)]) * depth[:, None]
+    room.descriptors = rng.integers(0, 256, (500, 32), dtype=np.uint8)
+    frames = []
+    for index in range(12):
+        pose = se3.exp(np.array([0.1, 0.0, 0.04, 0.0, 0.0, 0.0]) * index)
+        frame = without_depth(room.see(pose, index, limit=500))
+        uv = room.camera.project(se3.transform(se3.inverse(pose), room.points))
+        row = np.linalg.norm(uv[None] - frame.xy[:, None], axis=2).argmin(axis=1)
+        noise = np.where(row[:, None] >= 400, rng.normal(0, 0.8, (len(row), 2)), 0.0)
+        frames.append(replace(frame, xy=frame.xy + noise))
+    return frames
+
+
+def test_a_motion_that_leaves_out_what_tells_against_it_is_not_believed(room):
+    """The homography's other motion fits the wall, and drops the things before it: it was believed, 72 degrees off."""
+    off, settings = [], MonocularBackendSettings().tracking
+    for seed in range(6):
+        first_views, begun = FirstViews(), None
+        for frame in before_a_wall(room, seed):
+            keep, weight = np.ones(len(frame), bool), np.ones(len(frame), np.float32)
+            seen = observe(frame, keep, weight, room.camera, 1.2 ** np.arange(8), settings)
+            begun = begun or first_views.take(View(frame, seen), room.camera, TwoViewSettings())
+        if begun is not None:
+            way = begun.T_cam_world[:3, 3] / np.linalg.norm(begun.T_cam_world[:3, 3])
+            off.append(np.degrees(np.arccos(way @ (np.array([-0.1, 0.0, -0.04]) / np.hypot(0.1, 0.04)))))
+    assert off and max(off) < 10.0
+
+
+def test_the_right_motion_is_carried_on_where_the_newest_view_does_not_tell_it(room, monkeypatch):
+    steps = [np.zeros(6), *(np.array([0.006, 0.001, 0.0, 0.0, 0.0, 0.0]) * k for k in (1, 2, 3, 60))]
+    frames = [without_depth(room.see(se3.exp(step), i, noise_px=0.1)) for i, step in enumerate(steps)]
+    settings, waiting, far = MonocularBackendSettings().tracking, FirstViews(), TwoViewSettings(radius_px=300.0)
+    upwards = np.array([[0.0], [1.0], [0.0]])
+    for frame in frames:
+        keep, weight = np.ones(len(frame), bool), np.ones(len(frame), np.float32)
+        seen = observe(frame, keep, weight, room.camera, 1.2 ** np.arange(8), settings)
+        begun = waiting.take(View(frame, seen), room.camera, far)
+        assert frame is frames[-1] or begun is None
+        if frame is frames[-2]:
+            monkeypatch.setattr(cv2, "decomposeEssentialMat", lambda model: (np.eye(3), np.eye(3), upwards))
+            monkeypatch.setattr(cv2, "decomposeHomographyMat", lambda *_: (1, [np.eye(3)], [upwards], None))
+    assert begun is not None
+    way = begun.T_cam_world[:3, 3] / np.linalg.norm(begun.T_cam_world[:3, 3])
+    assert way @ np.array([-0.006, -0.001, 0.0]) / np.hypot(0.006, 0.001) > np.cos(np.radians(5.0))
+
+
 def test_a_camera_that_waits_for_parallax_keeps_few_views(room):
     waiting, kept = FirstViews(), []
     frames = [without_depth(room.see(np.eye(4), i)) for i in range(40)]

@@ -17,10 +17,8 @@ from dynslam_bench.geometry import se3
 Array = NDArray[np.float64]
 
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
-"""Of a tie: metres, then radians. Only their ratio matters, all ties weigh the same."""
+"""Of a tie of weight 1: metres, or units of length without depth, then radians; only their ratio matters."""
 ITERATIONS = 20
-ALONE = 1e-9
-"""Weight with which each keyframe's scale stays, beside that of a tie: it tells those that nothing ties."""
 ENOUGH = 1e-9
 """The search ends when a step lowers the cost by a smaller share."""
 
@@ -56,8 +54,8 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
     SLAM, RSS 2010, solve for scales and poses together).
 
     Args:
-        ids: Of the keyframes, ``[N]``, ascending; the first one's scale stays.
-        edges: Ties between them over which scale was kept; what they do not connect with the first one stays.
+        ids: Of the keyframes, ``[N]``, ascending.
+        edges: Ties between them over which scale was kept. Of all that they and the tie connect the oldest stays.
         tie: From the keyframe that was seen again to the one that sees it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
@@ -65,6 +63,7 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
         Factors ``[N]``.
     """
     from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.csgraph import connected_components
     from scipy.sparse.linalg import spsolve
 
     all_edges = [*edges, tie]
@@ -75,11 +74,14 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
     row = np.arange(len(all_edges))
     ends = np.r_[row, row], np.r_[one, other]
     values = np.r_[-np.ones(len(row)), np.ones(len(row))]
-    jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, 1:]
+    _, part = connected_components(coo_array((np.ones(len(row)), (one, other)), shape=(len(ids), len(ids))), False)
+    _, oldest = np.unique(part, return_index=True)
+    free = np.setdiff1d(np.arange(len(ids)), oldest)
+    jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, free]
     weight = diags_array(np.array([edge.weight for edge in all_edges]))
-    normal = jacobian.T @ weight @ jacobian + diags_array(np.full(len(ids) - 1, ALONE))
-    logarithms = spsolve(normal.tocsc(), jacobian.T @ (weight @ wanted))
-    return np.asarray(np.exp(np.r_[0.0, np.atleast_1d(logarithms)]))
+    logarithms = np.zeros(len(ids))
+    logarithms[free] = spsolve((jacobian.T @ weight @ jacobian).tocsc(), jacobian.T @ (weight @ wanted))
+    return np.asarray(np.exp(logarithms))
 
 
 def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) -> Array:

@@ -51,6 +51,11 @@ class CameraMotion:
         if self._state is not None:
             self._state = self._state.relocated(T_cam_world)
 
+    def rescale(self, factor: float) -> None:
+        """Lengths around the camera were multiplied by a factor, as where a loop corrects the scale."""
+        if self._state is not None and factor != 1.0:
+            self._state = self._state.rescaled(factor)
+
     def regular(self, last: Tracked, timestamp: float) -> float:
         """The stamp, or where it is within `JITTER` of a regular one, the regular one."""
         due = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval

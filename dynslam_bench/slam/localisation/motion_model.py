@@ -103,6 +103,13 @@ class MotionState:
         rotation = apply_twist(pose, twist)[:3, :3]  # keeps it orthonormal
         return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
+    def rescaled(self, factor: float) -> MotionState:
+        """The same motion where lengths are multiplied by a factor."""
+        by = np.tile(np.repeat([factor, 1.0], 3), 2)
+        return MotionState(
+            self.position * factor, self.rotation, self.speed * by[6:], self.covariance * by[:, None] * by
+        )
+
     def relocated(self, T_cam_world: Array) -> MotionState:
         """The same motion at another pose, e.g. after bundle adjustment."""
         r = T_cam_world[:3, :3]

@@ -175,22 +175,36 @@ def possible_motions(
     deep, on_lines = _essential(one, other, info, camera)
     further = [motion.gone_on(second, pair, camera) for motion in before]
     rows = np.flatnonzero(on_plane | on_lines)
+    if not len(rows):
+        return []
     motions = [motion for motion in (*flat, *deep, *further) if np.isfinite(motion).all()]
     tried = [(motion, *_triangulated(motion, one[rows], other[rows], info[rows], camera)) for motion in motions]
     most = max((np.count_nonzero(good) for _, _, good in tried), default=0)
     if most < max(settings.min_points, SURE_SHARE * len(rows)):
         return []
-    refined = [
-        _refined(first, later, pair.select(rows[good]), motion, points[good], camera)
+    by_two = [
+        _adjusted(first, later[-1:], motion[None], pair.select(rows[good]), points[good], camera)
         for motion, points, good in tried
         if np.count_nonzero(good) >= RIVAL_SHARE * most
     ]
+    enough = [each for each in by_two if len(each.pair) >= settings.min_points]
+    rivals = distinct(sorted(enough, key=lambda each: each.cost))
+    refined = [_by_all_between(first, later, each, camera) for each in rivals]
     return sorted((each for each in refined if len(each.pair) >= settings.min_points), key=lambda each: each.cost)
 
 
 def believed(motions: Sequence[TwoViews], settings: TwoViewSettings) -> TwoViews | None:
-    """The first of the motions, if it leaves no doubt about any other, and shows enough parallax."""
+    """The first of the motions, if it leaves no doubt about any other, and shows enough parallax.
+
+    Each one's cost is that of the matches which it made points of. A wrong motion may fit those it kept better for what
+    it left out, such as all that stands before a wall: a match that others explain and it does not counts against it
+    in both views, and the same motion has to be the best either way.
+    """
     if not motions or not all(motions[0].beats(other) for other in motions[1:]):
+        return None
+    most = max(len(each.pair) for each in motions)
+    left = [each.cost * each.count + 2 * CHI2_POINT * (most - len(each.pair)) for each in motions]
+    if not motions[int(np.argmin(left))].is_as(motions[0]):
         return None
     return motions[0] if motions[0].parallax_deg >= settings.min_parallax_deg else None
 
@@ -274,12 +288,9 @@ def _triangulated(
     return points, np.asarray(good)
 
 
-def _refined(
-    first: Observations, later: Sequence[Later], pair: Pair, motion: Array, points: Array, camera: Camera
-) -> TwoViews:
-    """Motion and points adjusted together: by the two views alone, then by those between them, too."""
-    found = _adjusted(first, later[-1:], motion[None], pair, points, camera)
-    if len(later) == 1 or not len(found.pair):
+def _by_all_between(first: Observations, later: Sequence[Later], found: TwoViews, camera: Camera) -> TwoViews:
+    """Motion and points adjusted by the views between the two, too."""
+    if len(later) == 1:
         return found
     chosen = np.unique(np.linspace(0, len(later) - 1, VIEWS).round().astype(int))
     on_the_way = se3.exp((chosen[:, None] + 1) / len(later) * se3.log(found.T_second_first))

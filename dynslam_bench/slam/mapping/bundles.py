@@ -82,7 +82,8 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, observatio
     features = world.obs_ft[rows[used]].astype(np.int64)
     at = poses[obs_pose]
     problem = BundleProblem(
-        world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point, world.kf_xy[at, features], world.kf_right[at, features],
-        world.kf_info[at, features], world.kf_info_right[at, features], world.camera,
+        world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point,
+        world.kf_xy[at, features], world.kf_right[at, features], world.kf_info[at, features],
+        world.kf_info_right[at, features], world.camera,
     )  # fmt: skip
     return Bundle(problem, poses, points, features)

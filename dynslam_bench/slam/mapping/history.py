@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,10 +42,17 @@ class History:
         self._relative[rows] = self._relative[rows] @ T_dropped_heir
         self._reference[rows] = heir
 
-    def rescale(self, reference: int, factor: float) -> None:
-        """Lengths around a keyframe were multiplied by a factor: so are the ways of its frames from it."""
-        rows = np.flatnonzero(self._reference[: self.count] == reference)
-        self._relative[rows, :3, 3] *= factor
+    def rescale(self, factors: Mapping[int, float]) -> None:
+        """Lengths around keyframes were multiplied by factors: so are the ways of their frames from them.
+
+        Args:
+            factors: Of each keyframe's slot; keyframes that are not named keep their lengths.
+        """
+        for reference, factor in factors.items():
+            rows = np.flatnonzero(self._reference[: self.count] == reference)
+            self._relative[rows, :3, 3] *= factor
+            self._information[rows, :3] /= factor
+            self._information[rows, :, :3] /= factor
 
     def poses(self, world: Map) -> tuple[Array, Array, Array]:
         """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``.

@@ -113,7 +113,7 @@ class LocalMapper:
         """Points for features that have no point yet, by triangulation with the neighbours."""
         world = self.world
         for other in neighbours.tolist():
-            ours, theirs, position = triangulate(world, slot, other, self.settings.mapping.min_parallax_deg)
+            ours, theirs, position = triangulate(world, slot, other, self.settings.mapping)
             if len(ours):
                 created = world.add_points(position, seen.rgb[ours], slot, ours)
                 world.observe(other, theirs, created)

@@ -154,9 +154,10 @@ class Map:
             self._allocate()
         n = len(seen)
         if n > self._features:
-            self._features = n
             for name in self._FEATURE_TABLES:
                 setattr(self, name, _grown(getattr(self, name), n, axis=1))
+            self.kf_point[:, self._features :] = -1
+            self._features = n
         free = np.flatnonzero(~self.kf_alive)
         if not len(free):
             length = max(16, self.kf_alive.size + self.kf_alive.size // 2)
@@ -210,7 +211,9 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
-        counts = kernels.covisibility(self.obs_kf, self.obs_at, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size)
+        counts = kernels.covisibility(
+            self.obs_kf, self.obs_at, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size
+        )
         if exclude >= 0:
             counts[exclude] = 0
         slots = np.flatnonzero(counts)

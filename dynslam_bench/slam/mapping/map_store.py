@@ -109,6 +109,7 @@ def restored(saved: SavedMap, camera: Camera, scales: Array) -> tuple[Map, Islan
     count, n_obs = arrays["kf_count"], arrays["n_obs"]
     tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
     tables |= {name: _table(arrays[name], count) for name in FEATURE_ARRAYS}
+    tables["kf_point"][np.arange(tables["kf_point"].shape[1]) >= count[:, None]] = -1
     tables |= {name: arrays[name].copy() for name in OBSERVATION_ARRAYS}
     tables["obs_at"], tables["obs_room"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
     tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)

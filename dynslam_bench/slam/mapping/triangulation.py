@@ -9,6 +9,7 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import FAR, Words, distance
 from dynslam_bench.geometry.camera import Camera
 
+from ..settings import MappingSettings
 from .map import Map
 
 Array = NDArray[np.float64]
@@ -22,7 +23,7 @@ MAX_DISTANCE = 50
 def _triangulate(
     pose_a: Array, pose_b: Array, rows_a: Slots, rows_b: Slots, xy_a: Array, xy_b: Array, z_b: Array,
     octave_a: Slots, octave_b: Slots, words_a: Words, words_b: Words, scales: Array,
-    fx: float, fy: float, cx: float, cy: float, min_parallax: float, max_distance: int,
+    fx: float, fy: float, cx: float, cy: float, min_parallax: float, sigmas: float, max_distance: int,
 ) -> tuple[Slots, Slots, Array]:  # fmt: skip
     """Pairs of rows that fit one point, and its depth along the ray of camera `a`."""
     # x_b = r x_a + t
@@ -71,7 +72,8 @@ def _triangulate(
             p0, p1 = d0 - bx[j] * d2, d1 - by[j] * d2
             q0, q1 = bx[j] * t[2] - t[0], by[j] * t[2] - t[1]
             cosine = (d0 * bx[j] + d1 * by[j] + d2) / (length * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0))
-            if cosine < cosine_limit:
+            least = sigmas * max(scales[octave_a[a]], scales[octave_b[b]]) / focal
+            if cosine < cosine_limit and cosine < 1.0 - 0.5 * least * least:
                 s = (p0 * q0 + p1 * q1) / (p0 * p0 + p1 * p1)
             elif z_b[b] > 0.0 and abs(d2) > 1e-6:
                 s = (z_b[b] - t[2]) / d2  # too little parallax, but the other keyframe has depth
@@ -107,7 +109,7 @@ def _triangulate(
     return out_a[:count].copy(), out_b[:count].copy(), out_z[:count].copy()
 
 
-def triangulate(world: Map, slot: int, other: int, min_parallax_deg: float) -> tuple[Slots, Slots, Array]:
+def triangulate(world: Map, slot: int, other: int, settings: MappingSettings) -> tuple[Slots, Slots, Array]:
     """Features of two keyframes that observe no point yet and show one point along an epipolar line.
 
     Where the parallax is too small for a depth of its own, the other keyframe's measured depth is taken; where it is
@@ -117,7 +119,7 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_deg: float) -> t
         world: The map.
         slot: The new keyframe.
         other: One that sees the same part of the world.
-        min_parallax_deg: Smallest angle between the rays of a triangulated point.
+        settings: Smallest angle between the rays of a triangulated point, and how far above their noise it must be.
 
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
@@ -130,7 +132,8 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_deg: float) -> t
         world.kf_xy[slot], world.kf_xy[other], world.kf_z[other].astype(np.float64),
         world.kf_octave[slot].astype(np.int64), world.kf_octave[other].astype(np.int64),
         world.kf_words[slot], world.kf_words[other], world.scales,
-        camera.fx, camera.fy, camera.cx, camera.cy, float(np.deg2rad(min_parallax_deg)), MAX_DISTANCE,
+        camera.fx, camera.fy, camera.cx, camera.cy, float(np.deg2rad(settings.min_parallax_deg)),
+        float(settings.min_parallax_sigmas), MAX_DISTANCE,
     )  # fmt: skip
     pose = world.T_world_cam(slot)
     local = camera.unproject(world.kf_xy[slot, ours], depth)
