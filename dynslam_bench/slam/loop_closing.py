@@ -343,7 +343,7 @@ class Correction:
     def moved(self, at: Array) -> Array:
         """Where a place ``[3]`` near the keyframe belongs, ``[3]``."""
         local = self.scale * se3.transform(self.T_cam_before, at[None])
-        return se3.transform(se3.inverse(self.T_cam_now), local)[0]
+        return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])
 
     def agrees(self, other: Correction, at: Array) -> bool:
         """Whether another correction moves a place nearly as this one does."""

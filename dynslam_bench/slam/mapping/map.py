@@ -374,8 +374,6 @@ class Map:
         All points of a keyframe without any depth count as close.
         """
         depth = self.kf_z if self.kf_z[slot].any() else np.full(self.kf_z.shape, close_m, np.float32)
-        keyframes = self.kf_point, self.kf_octave, depth
-        total, redundant = kernels.redundancy(
-            slot, int(self.kf_count[slot]), *keyframes, close_m, *self._observed, others
-        )
+        keyframe = slot, int(self.kf_count[slot]), self.kf_point, self.kf_octave, depth, close_m
+        total, redundant = kernels.redundancy(*keyframe, *self._observed, others)
         return int(total), int(redundant)
