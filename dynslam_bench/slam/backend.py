@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FrameBundle, KeyframeView
 from dynslam_bench.contracts.map_outputs import MapOutputs
 from dynslam_bench.contracts.result import TrackingState
-from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -20,7 +19,6 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from .localisation.camera_motion import CameraMotion
 from .localisation.first_pose import Before, first_pose
 from .localisation.localised import Localised
-from .localisation.motion_model import pose_covariance, smooth
 from .localisation.observation import Observations, observe
 from .localisation.reach import Reach
 from .localisation.rolling_shutter import Speeds, as_seen_at_once
@@ -31,12 +29,13 @@ from .loop_closing import LoopCloser
 from .mapping.history import History
 from .mapping.keyframes import KeyframeRule
 from .mapping.local_mapping import LocalMapper
-from .mapping.map_store import begin_map, save
+from .mapping.map_store import begin_map, check_descriptors, save
 from .mapping.saved_map import MapFeatures
 from .settings import BackendSettings
 from .views import MapViews
 
 Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
@@ -184,7 +183,7 @@ class RgbdBackend:
         if self._rolling:
             seen = self._straightening.foreseen(raw, last, frame.timestamp, self.settings.motion)
         prediction = self.motion.predicted(last, frame.timestamp, self.settings.motion)
-        around = self._surroundings.keyframes(self._reference) if self._tracked else self.world.keyframes
+        around = self._surroundings.keyframes(self._reference) if self._tracked else self._anywhere()
         reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
         close, island = self.mapper.close_m, None if self._tracked else self._island
         before = Before(last, prediction, self._reference, around, island, reach, close, self.seed, frame.index)
@@ -220,38 +219,47 @@ class RgbdBackend:
         return self.settings.tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
 
     def _nowhere(self, frame: FrameBundle, seen: Observations) -> Tracked:
-        """What stands for the last tracked frame before the camera is found in a loaded map: it shows nothing.
+        """What stands for the last tracked frame before the camera is found in a loaded map: it shows nothing."""
+        check_descriptors(self.world, seen, frame.index)
+        return self._showing_nothing(frame, np.eye(4))
 
-        Raises:
-            TrackerError: The features' descriptors are not those of the map.
-        """
-        if len(seen) and 8 * seen.words.shape[1] != self.world.descriptor_bytes:
-            raise TrackerError(
-                f"the map's descriptors have {self.world.descriptor_bytes} bytes, frame {frame.index}'s "
-                f"{8 * seen.words.shape[1]}",
-                "make the map with the same features",
-            )
+    def _showing_nothing(self, frame: FrameBundle, T_cam_world: Array) -> Tracked:
         none, unsure = np.zeros(len(frame), bool), np.zeros(len(frame), np.float32)
         nothing = observe(frame, none, unsure, self.camera, self._scales, self.settings.tracking)
-        return Tracked(nothing, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
+        return Tracked(nothing, np.zeros(0, np.int64), T_cam_world, frame.timestamp)
 
     def _lost(self, frame: FrameBundle, seen: Observations, last: Tracked, prediction: Array) -> Localised:
         """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
         self.state, self._first = "lost", None
-        deep = int(np.count_nonzero(seen.z > 0))
+        shown = self._usable(seen)
         if self._tracked:
-            self._reach.lost(last, deep, MIN_INITIAL)
+            self._reach.lost(last, shown, MIN_INITIAL)
         self._tracked = False
         self.motion.forget()
-        self._unrecognised = self._unrecognised + 1 if deep >= MIN_INITIAL else 0
-        begins = self._grows and self.settings.loop_closing.enabled
-        if not begins or self._unrecognised < self.settings.relocalisation.new_map_after:
-            return self._localised(None if self._last is None else prediction)
+        self._unrecognised = self._unrecognised + 1 if shown >= MIN_INITIAL else 0
+        enough = self._unrecognised >= self.settings.relocalisation.new_map_after
+        begins = enough and self._grows and self.settings.loop_closing.enabled
+        begun = self._begin_island(frame, seen, last) if begins else None
+        return begun or self._localised(None if self._last is None else prediction)
+
+    def _anywhere(self) -> Slots:
+        """Slots of the keyframes where a lost camera may be."""
+        return self.world.keyframes
+
+    def _usable(self, seen: Observations) -> int:
+        """How many features a map could begin with."""
+        return int(np.count_nonzero(seen.z > 0))
+
+    def _begin_island(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised | None:
+        """Begin a map of its own, which takes the last tracked pose for that of its first frame; None if not yet."""
+        self._note_island(last, frame.timestamp)
+        return self._begin_map(frame, seen, last.T_cam_world)
+
+    def _note_island(self, last: Tracked, timestamp: float) -> None:
+        """An island begins with the frame of this stamp."""
+        reach = self._reach.metres(last, timestamp, self.settings.relocalisation)
         self._unrecognised = 0
-        reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
-        start = last.T_cam_world
-        self._island = self._islands.begin(self._island, se3.inverse(start)[:3, 3], reach)
-        return self._begin_map(frame, seen, start)
+        self._island = self._islands.begin(self._island, se3.inverse(last.T_cam_world)[:3, 3], reach)
 
     def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: Tracked) -> Tracked:
         """The frame is tracked: what it sees counts as found, and its pose is weighed against the motion model."""
@@ -294,9 +302,10 @@ class RgbdBackend:
             self.history.inherit(dropped, heir, relative)
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
-            self.loops.close(slot, tracked.seen)
-            self.history.rescale(self.loops.rescaled)
-            self.motion.rescale(self.loops.rescaled.get(slot, 1.0))
+            before = self.world.kf_pose[slot].copy()
+            if self.loops.close(slot, tracked.seen):
+                self.history.rescale(self.loops.rescaled)
+                self.motion.carried(before, self.world.kf_pose[slot], self.loops.rescaled.get(slot, 1.0))
             spent["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
         gone = [dropped for dropped, _, _ in self.mapper.dropped]
@@ -376,8 +385,6 @@ class RgbdBackend:
             TrackerError: There is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        if not self.world.next_keyframe:
-            raise TrackerError("there is no map to save: no frame has begun one")
         save(path, self.world, self._islands, self._made_of, depth=self.uses_depth, made_by=made_by)
 
     def finalize(self) -> Trajectory:
@@ -387,13 +394,4 @@ class RgbdBackend:
         """
         if self._grows and self.settings.bundle_adjustment.full:
             self.mapper.adjust_all()
-        stamps, poses, information = self.history.poses(self.world)
-        order = np.argsort(stamps, kind="stable")
-        fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
-        rows = order[fresh]
-        stamps, poses = stamps[rows], poses[rows]
-        motion = self.settings.motion
-        if motion.smooth and len(stamps) > 2:
-            spread = [pose_covariance(*pair, motion.inflation) for pair in zip(poses, information[rows], strict=True)]
-            poses = smooth(stamps, poses, np.array(spread), motion)
-        return Trajectory(stamps, se3.inverse(poses))
+        return self.history.trajectory(self.world, self.settings.motion)

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 
-from .bundle.pose_graph import Edge, optimise_poses, spread_scale
+from .bundle.pose_graph import Edge, optimise_poses, rescaled, spread_scale, within
+from .corrections import Correction
 from .localisation.observation import Observations
 from .localisation.recognition import Recognised, around, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
@@ -47,8 +48,6 @@ TURN_M = 3.0
 """Metres of way that a turn by one radian counts as: it renews the view as much as walking past a wall 3 m away."""
 TURN_DEPTHS = 1.0
 """The same without depth: the wall is as far away as what the first map showed."""
-AGREE_M, AGREE_DEG, AGREE_SCALE = 0.1, 2.0, 0.1
-"""So far the corrections of keyframes in a row may differ; of a scale, its logarithm."""
 NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
 """A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
 MOST_SCALE = 3.0
@@ -73,6 +72,7 @@ class Loop:
         moved_m: How far the newest keyframe is from where it was believed to be.
         turned_deg: By how much it is turned, degrees.
         scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
+        fits: Whether the island could come to lie so; without depth its lengths may have drifted apart on the way.
     """
 
     keyframe: int
@@ -84,6 +84,7 @@ class Loop:
     moved_m: float
     turned_deg: float
     scale: float
+    fits: bool = True
 
 
 class LoopCloser:
@@ -116,6 +117,8 @@ class LoopCloser:
         """All loops that were closed."""
         self.rescaled: dict[int, float] = {}
         """By what the last call of `close` rescaled the surroundings of keyframes, by their slots."""
+        self.misfit = False
+        """Whether the last call of `close` found an island's camera in an older map, which the island cannot join."""
         self._seed = seed
         self._scale_is_known = scale_is_known
         self._way: dict[int, float] = {}
@@ -135,7 +138,7 @@ class LoopCloser:
         Returns:
             Whether a loop was closed; every pose and point may have changed then.
         """
-        self.rescaled = {}
+        self.rescaled, self.misfit = {}, False
         self._note_way(slot)
         loop = self._verified(slot, seen)
         if loop is None:
@@ -149,12 +152,15 @@ class LoopCloser:
             return False
         loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
         self._row.clear()
+        if not loop.fits:
+            self.misfit = True
+            return False
         if loop.joins:
-            self._join(slot, loop, correction.T_now_before)
+            self._join(slot, loop)
         else:
             self._correct(slot, loop)
         self._fuse(slot, loop.keyframe)
-        self._short_cuts.append((self._way.get(int(self.world.kf_id[loop.keyframe]), 0.0), self._walked))
+        self._short_cuts.append((self._way_at(loop.keyframe), self._walked))
         self.closed.append(loop)
         self._last_pose = self.world.kf_pose[slot].copy()  # a correction is no way
         return True
@@ -162,13 +168,15 @@ class LoopCloser:
     # ------------------------------------------------------------------ detect and verify
 
     def _note_way(self, slot: int) -> None:
-        pose = self.world.kf_pose[slot].copy()
+        pose, number = self.world.kf_pose[slot].copy(), int(self.world.kf_id[slot])
+        for begun in range(max(self._way, default=number - 1) + 1, number):  # the first two views of an island
+            self._way[begun] = self._walked
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
             turn = TURN_M if self._scale_is_known else TURN_DEPTHS
             self._walked += float(np.linalg.norm(step[:3, 3]) + turn * se3.rotation_angle(step))
         self._last_pose = pose
-        self._way[int(self.world.kf_id[slot])] = self._walked
+        self._way[number] = self._walked
 
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
         s = self.settings.loop_closing
@@ -217,6 +225,8 @@ class LoopCloser:
         turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
         back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
         loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned, scale)
+        if joins:
+            loop = replace(loop, fits=self._fits(slot, loop))
         return loop if self._believable(slot, loop) else None
 
     def _scale(self, slot: int, place: Recognised) -> float | None:
@@ -233,24 +243,44 @@ class LoopCloser:
 
     def _believable(self, slot: int, loop: Loop) -> bool:
         """Whether drift explains the correction; where islands meet, whether the camera can have got from one there."""
-        s, world = self.settings.loop_closing, self.world
+        s = self.settings.loop_closing
         if loop.joins and (loop.inliers < s.join_inliers or loop.share < s.join_share):
             return False
         if loop.joins:
-            here, there = int(world.kf_island[slot]), int(world.kf_island[loop.keyframe])
-            correction = se3.inverse(loop.T_cam_world) @ world.kf_pose[slot]
-            if not here:
-                return self.islands.may_lie(there, se3.inverse(correction))
-            return self.islands.may_lie(here, correction)
+            return loop.fits or (not self._scale_is_known and self._may_be_there(slot, loop))
         way = self._way_to(loop.keyframe)
         if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
             return False
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 
+    def _fits(self, slot: int, loop: Loop) -> bool:
+        """Whether the younger of two islands can have begun where the older one would have it."""
+        younger, _, move = self._moves(slot, loop)
+        share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
+        return self.islands.may_lie(younger, move.moved, share * self._way_around(slot, loop))
+
+    def _may_be_there(self, slot: int, loop: Loop) -> bool:
+        """Whether the camera can have got from the island to a place of the first map, as where it is lost."""
+        here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
+        now = se3.inverse(loop.T_cam_world)[:3, 3]
+        return not there and self.islands.within(here, there, self.world.kf_centre[slot], now, 0.0)
+
     def _way_to(self, slot: int) -> float:
         """The way along which drift can have come in since a keyframe: walked and turned, or over a closed loop."""
-        then = self._way.get(int(self.world.kf_id[slot]), 0.0)  # 0: of a loaded map
+        then = self._way_at(slot)
         return min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
+
+    def _way_around(self, slot: int, loop: Loop) -> float:
+        """The way from where one island meets another back to where it left it, in the older one's unit of length."""
+        younger, _, move = self._moves(slot, loop)
+        left = self._way_at(int(self.world.island(younger)[0]))
+        ends = (slot, loop.keyframe) if self.world.kf_island[slot] == younger else (loop.keyframe, slot)
+        on_younger, on_older = (abs(self._way_at(each) - left) for each in ends)
+        return move.scale * on_younger + on_older
+
+    def _way_at(self, slot: int) -> float:
+        """The way up to a keyframe; none up to those of a loaded map."""
+        return self._way.get(int(self.world.kf_id[slot]), 0.0)
 
     # ------------------------------------------------------------------ correct and fuse
 
@@ -259,7 +289,7 @@ class LoopCloser:
         world = self.world
         weight = 1.0 if self._scale_is_known else FIRM
         tie = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=weight)
-        older = _within(world.kf_id[world.keyframes], self._ties)
+        older = within(world.kf_id[world.keyframes], self._ties)
         self._ties = [*older, tie]
         small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG
         if small and abs(np.log(loop.scale)) < NEGLIGIBLE_SCALE:
@@ -268,11 +298,10 @@ class LoopCloser:
         before, ids = world.kf_pose.copy(), world.kf_id[slots]
         edges, scales = self._edges(slots), np.ones(world.kf_alive.size)
         if not self._scale_is_known:
-            scales[slots] = spread_scale(ids, [*edges, *_within(ids, older)], tie, loop.scale)
-            by_id = dict(zip(ids.tolist(), scales[slots].tolist(), strict=True))
-            edges, self._ties = ([edge.scaled(by_id.get(edge.one, 1.0)) for edge in row] for row in (edges, self._ties))
-            self.rescaled = dict(zip(slots.tolist(), scales[slots].tolist(), strict=True))
-        after = optimise_poses(ids, before[slots], [*edges, *_within(ids, self._ties)])
+            scales[slots] = spread_scale(ids, [*edges, *within(ids, older)], tie, loop.scale)
+            edges = rescaled(edges, ids, scales[slots])
+            self._note_scales(slots, scales[slots])
+        after = optimise_poses(ids, before[slots], [*edges, *within(ids, self._ties)])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
         seen = np.unique(world.kf_point[slots])
@@ -284,15 +313,25 @@ class LoopCloser:
         world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
         world.refresh(points)
 
-    def _join(self, slot: int, loop: Loop, correction: Array) -> None:
+    def _moves(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
+        """The younger of two islands that meet, the older one, and how the younger is to be moved."""
+        here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
+        move = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
+        return (here, there, move) if here > there else (there, here, move.inverse)
+
+    def _join(self, slot: int, loop: Loop) -> None:
         """Move the younger of two islands as a whole to where the older one has the place."""
         world = self.world
-        here, there = int(world.kf_island[slot]), int(world.kf_island[loop.keyframe])
-        if here > there:
-            world.move_island(here, correction, there)
-        else:
-            world.move_island(there, se3.inverse(correction), here)
+        younger, older, move = self._moves(slot, loop)
+        slots = world.island(younger)
+        world.move_island(younger, move.T_now_before, older, move.scale)
+        self._note_scales(slots, np.full(len(slots), move.scale))
         self._ties.append(self._edge(loop.keyframe, slot, world.kf_pose[slot]))
+
+    def _note_scales(self, slots: Slots, scales: Array) -> None:
+        """Lengths around keyframes were multiplied."""
+        self._ties = rescaled(self._ties, self.world.kf_id[slots], scales)
+        self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array) -> Edge:
         world = self.world
@@ -319,40 +358,3 @@ class LoopCloser:
         self.world.refresh(theirs[self.world.alive[theirs]])
         if self.settings.bundle_adjustment.enabled:
             self.mapper.adjust(slot)
-
-
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """What a keyframe asks for.
-
-    Attributes:
-        T_cam_before: Its pose ``[4, 4]`` as the map has it, world to camera.
-        T_cam_now: Its pose by the place that it sees again.
-        scale: What lengths around it are to be multiplied by.
-    """
-
-    T_cam_before: Array
-    T_cam_now: Array
-    scale: float
-
-    @property
-    def T_now_before(self) -> Array:
-        """From the world as the keyframe has it to the world as the place has it, ``[4, 4]``, lengths as they are."""
-        return se3.inverse(self.T_cam_now) @ self.T_cam_before
-
-    def moved(self, at: Array) -> Array:
-        """Where a place ``[3]`` near the keyframe belongs, ``[3]``."""
-        local = self.scale * se3.transform(self.T_cam_before, at[None])
-        return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])
-
-    def agrees(self, other: Correction, at: Array) -> bool:
-        """Whether another correction moves a place nearly as this one does."""
-        apart = np.linalg.norm(self.moved(at) - other.moved(at))
-        turned = se3.rotation_angle(self.T_now_before @ se3.inverse(other.T_now_before))
-        scaled = abs(np.log(self.scale / other.scale))
-        return bool(apart < AGREE_M and np.degrees(turned) < AGREE_DEG and scaled < AGREE_SCALE)
-
-
-def _within(ids: NDArray[np.int64], edges: list[Edge]) -> list[Edge]:
-    """The ties of which both ends are among keyframes."""
-    return [edge for edge in edges if np.isin([edge.one, edge.other], ids).all()]

@@ -6,6 +6,7 @@ from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.geometry.camera import Camera
@@ -16,6 +17,9 @@ from .localisation.observation import Observations
 from .localisation.tracking import Tracked
 from .mapping.first_map import FirstMap, FirstViews, View, put
 from .monocular_settings import MonocularBackendSettings
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
 
 
 class MonocularBackend(RgbdBackend):
@@ -47,6 +51,7 @@ class MonocularBackend(RgbdBackend):
     def reset(self, camera: Camera, seed: int) -> None:
         """Forget everything: a new sequence begins."""
         super().reset(camera, seed)
+        self._misfits: set[int] = set()
         self._views_so_far = FirstViews()
 
     def _initialise(self, frame: FrameBundle, seen: Observations) -> Localised:
@@ -56,15 +61,46 @@ class MonocularBackend(RgbdBackend):
         if start is None:
             return self._localised(None)
         spent = {"mapping": perf_counter() - begin}
-        return self._begin_from_two(start, spent)
+        return self._begin_from_two(start, np.eye(4), spent)
 
-    def _begin_from_two(self, start: FirstMap, spent: dict[str, float]) -> Localised:
+    def _usable(self, seen: Observations) -> int:
+        """How many features a map could begin with: depth is none's."""
+        return len(seen)
+
+    def _begin_island(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised | None:
+        """A map of its own begins as the first one did; its unit of length is the median depth of its own views."""
+        begin = perf_counter()
+        if self._unrecognised == self.settings.relocalisation.new_map_after:
+            self._views_so_far = FirstViews()
+        start = self._views_so_far.take(View(frame, seen), self.camera, self.settings.two_views)
+        if start is None:
+            return None
+        spent = {"mapping": perf_counter() - begin}
+        self._note_island(last, start.first.frame.timestamp)
+        return self._begin_from_two(start, last.T_cam_world, spent)
+
+    def _anywhere(self) -> Slots:
+        """Not on an island whose lengths have drifted apart."""
+        slots = super()._anywhere()
+        return slots[~np.isin(self.world.kf_island[slots], list(self._misfits))]
+
+    def _make_keyframe(self, frame: FrameBundle, tracked: Tracked) -> dict[str, float]:
+        """Where the keyframe shows a place of the first map, but the island cannot join it, the camera leaves it."""
+        spent = super()._make_keyframe(frame, tracked)
+        if self.loops.misfit:
+            self._misfits.add(self._island)
+            self._tracked, self._last = False, self._showing_nothing(frame, tracked.T_cam_world)
+            self.motion.forget()
+        return spent
+
+    def _begin_from_two(self, start: FirstMap, T_first_world: Array, spent: dict[str, float]) -> Localised:
         """The two views become keyframes; the second, which is the frame at hand, is tracked."""
-        first, second = put(self.world, start)
-        frame, seen = start.second.frame, start.second.seen
+        first, second = put(self.world, start, T_first_world, self._island)
+        frame, seen, pose = start.second.frame, start.second.seen, self.world.kf_pose[second].copy()
+        self._views_so_far = FirstViews()
         self._tracked = True
         point = self.world.kf_point[second, : len(seen)].astype(np.int64)
-        self._last = Tracked(seen, point, start.T_cam_world, frame.timestamp)
+        self._last = Tracked(seen, point, pose, frame.timestamp)
         self._reference = second
         self._keyframes.made(frame.index)
         for slot, view in ((first, start.first), (second, start.second)):
@@ -72,4 +108,4 @@ class MonocularBackend(RgbdBackend):
         self.state = self._state()
         self.history.append(frame.timestamp, second, np.eye(4), 1e6 * np.eye(6))
         count = len(start.points)
-        return replace(self._localised(start.T_cam_world, spent), matches=count, inliers=count)
+        return replace(self._localised(pose, spent), matches=count, inliers=count)

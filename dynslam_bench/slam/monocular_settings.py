@@ -13,12 +13,10 @@ from .settings import (
     KeyframeSettings,
     LoopClosingSettings,
     MappingSettings,
-    RelocalisationSettings,
     TrackingSettings,
 )
 
 NO_DEPTH = "no effect: there is no depth"
-NO_MAPS = "no effect: without depth no second map begins"
 
 
 class TwoViewSettings(Settings):
@@ -93,14 +91,6 @@ class MonocularLoopClosingSettings(LoopClosingSettings):
     drift_deg: float = Field(
         0.5, gt=0, le=90, description="largest rotation that is believed, degrees a unit of length of that way"
     )
-    join_inliers: int = Field(100, description=NO_MAPS)
-    join_share: float = Field(0.5, description=NO_MAPS)
-
-
-class MonocularRelocalisationSettings(RelocalisationSettings):
-    """Finding the camera again after a loss."""
-
-    new_map_after: int = Field(5, description=NO_MAPS)
 
 
 class MonocularBackendSettings(BackendSettings):
@@ -110,5 +100,4 @@ class MonocularBackendSettings(BackendSettings):
     tracking: MonocularTrackingSettings = MonocularTrackingSettings()
     keyframes: MonocularKeyframeSettings = MonocularKeyframeSettings()
     mapping: MonocularMappingSettings = MonocularMappingSettings()
-    relocalisation: MonocularRelocalisationSettings = MonocularRelocalisationSettings()
     loop_closing: MonocularLoopClosingSettings = MonocularLoopClosingSettings()

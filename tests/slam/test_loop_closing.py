@@ -11,8 +11,9 @@ from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, optimise_poses, spread_scale
+from dynslam_bench.slam.corrections import Correction
 from dynslam_bench.slam.localisation.surroundings import not_held
-from dynslam_bench.slam.loop_closing import FIRM, Correction
+from dynslam_bench.slam.loop_closing import FIRM
 from dynslam_bench.slam.mapping.history import History
 from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings

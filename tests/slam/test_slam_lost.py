@@ -1,12 +1,19 @@
 """After the camera was lost: what is recognised, what only looks like it, and maps of their own that meet again."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
+import pytest
 from ring_world import RingWorld
 
 from dynslam_bench.core.settings import apply_overrides
+from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.mapping.islands import Islands
+from dynslam_bench.slam.monocular import MonocularBackend
+from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
 from dynslam_bench.slam.settings import BackendSettings
 
 STEP = 0.15
@@ -69,6 +76,63 @@ def test_a_map_of_its_own_is_joined_when_the_camera_comes_round():
     assert np.linalg.norm(final.positions - true, axis=1).max() < 0.3
 
 
+def drive_without_depth(world, way, step):
+    """A monocular back end along frames of a lap, thirty a second, states, and how many loops there were by then."""
+    backend = MonocularBackend(apply_overrides(MonocularBackendSettings(), {"loop_closing.enabled": True}))
+    backend.reset(world.camera, 0)
+    lap = world.lap(max(index for index in way if index is not None) + 1, step)
+    found = []
+    for number, index in enumerate(way):
+        stamp = number / 30.0
+        if index is None:
+            frame = world.blind(number, stamp=stamp)
+        else:
+            frame = world.see(lap[index], number, stamp=stamp, noise_px=0.5, limit=700)
+        frame = replace(frame, z=np.zeros_like(frame.z))
+        found.append(backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32)))
+    return backend, lap, found
+
+
+def lap_with_a_gap(world, step):
+    """Sixty frames, twenty blind ones, and from twenty frames further on the rest of a lap and sixty frames more."""
+    lap = int(np.ceil((4 * (world.side - 2) + 2 * np.pi) / step))
+    return [*range(60), *[None] * 20, *range(100, lap + 60)], lap
+
+
+def test_without_depth_a_map_of_its_own_is_joined_with_its_unit_of_length():
+    world, step = RingWorld(side=6.0, seed=3), 0.07
+    way, lap = lap_with_a_gap(world, step)
+    backend, poses, found = drive_without_depth(world, way, step)
+    states = np.array([each.state for each in found])
+    joined = 80 + int(np.flatnonzero(states[80:] == "ok")[0])
+    assert way[joined] == pytest.approx(lap, abs=15) and (states[joined:] == "ok").all()
+    assert [each.maps for each in found[100:joined]] == [2] * (joined - 100) and found[-1].maps == 1
+    (loop,) = backend.loops.closed
+    assert loop.joins and loop.fits and loop.frame < 20 and abs(np.log(loop.scale)) > 0.1
+    final = backend.finalize()
+    assert len(way) - len(final) <= 20 + 12, "what was driven on the island is in the final trajectory"
+    true = poses[[way[round(stamp * 30)] for stamp in final.timestamps]]
+    aligned = align(final.T_world_cam, true, "sim3").apply(final.T_world_cam)
+    assert np.linalg.norm(aligned[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.2
+    went, was = (np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1) for each in (aligned, true))
+    path = went / was
+    before, after = (np.median(path[final.timestamps[1:] * 30 > at][:50]) for at in (0, 80))
+    assert after == pytest.approx(before, rel=0.1), "lengths on the island are those of the first map"
+
+
+def test_without_depth_an_island_that_would_not_fit_is_left_for_the_first_map(monkeypatch):
+    monkeypatch.setattr(Islands, "may_lie", lambda *_: False)  # as where its lengths have drifted apart
+    world, step = RingWorld(side=6.0, seed=3), 0.07
+    way, lap = lap_with_a_gap(world, step)
+    backend, _, found = drive_without_depth(world, way, step)
+    states = np.array([each.state for each in found])
+    back = 80 + int(np.flatnonzero(states[80:] == "ok")[0])
+    assert way[back] == pytest.approx(lap, abs=20) and (states[back:] == "ok").all()
+    assert not backend.loops.closed and found[-1].maps == 2
+    assert len(backend.finalize()) == np.count_nonzero(states == "ok"), "nothing of the island's"
+    assert all(each.T_world_cam[:3, 3] @ each.T_world_cam[:3, 3] < 10.0**2 for each in found[back:])
+
+
 def test_maps_that_never_meet_stay_apart():
     way = [*range(25), *[None] * 20, *range(60, 90)]
     backend, states, _ = drive(RingWorld(), way, **{"loop_closing.enabled": True})
@@ -88,7 +152,7 @@ def test_an_island_lies_where_the_camera_can_have_got():
         start = np.array([1.0, 0.0 if number == first else 3.0, 0.0])
         for way in (reach - 0.01, reach + 0.01):
             moved[:3, 3] = np.array([1.0, 0.0, way]) - start
-            assert islands.may_lie(number, moved) == (way < reach)
+            assert islands.may_lie(number, partial(se3.transform, moved)) == (way < reach)
     here = np.zeros(3)
     assert islands.within(0, 0, here, np.array([0.0, 0.0, 1.9]), 2.0)
     assert not islands.within(0, 0, here, np.array([0.0, 0.0, 2.1]), 2.0)

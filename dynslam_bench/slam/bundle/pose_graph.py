@@ -46,6 +46,17 @@ class Edge:
         return Edge(self.one, self.other, pose, self.weight)
 
 
+def rescaled(edges: Sequence[Edge], ids: NDArray[np.int64], factors: Array) -> list[Edge]:
+    """The ties as they are where lengths at keyframes were multiplied by factors."""
+    by_id = dict(zip(ids.tolist(), factors.tolist(), strict=True))
+    return [edge.scaled(by_id.get(edge.one, 1.0)) for edge in edges]
+
+
+def within(ids: NDArray[np.int64], edges: Sequence[Edge]) -> list[Edge]:
+    """The ties of which both ends are among keyframes."""
+    return [edge for edge in edges if np.isin([edge.one, edge.other], ids).all()]
+
+
 def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale: float) -> Array:
     """What lengths at each keyframe are to be multiplied by, so that a tie that asks for a scale is content.
 

@@ -51,10 +51,16 @@ class CameraMotion:
         if self._state is not None:
             self._state = self._state.relocated(T_cam_world)
 
-    def rescale(self, factor: float) -> None:
-        """Lengths around the camera were multiplied by a factor, as where a loop corrects the scale."""
-        if self._state is not None and factor != 1.0:
-            self._state = self._state.rescaled(factor)
+    def carried(self, T_cam_before: Array, T_cam_now: Array, factor: float) -> None:
+        """The same motion after a loop was closed.
+
+        Args:
+            T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
+            T_cam_now: That pose now.
+            factor: What lengths around it were multiplied by.
+        """
+        if self._state is not None:
+            self._state = self._state.carried(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], factor)
 
     def regular(self, last: Tracked, timestamp: float) -> float:
         """The stamp, or where it is within `JITTER` of a regular one, the regular one."""

@@ -103,11 +103,12 @@ class MotionState:
         rotation = apply_twist(pose, twist)[:3, :3]  # keeps it orthonormal
         return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
-    def rescaled(self, factor: float) -> MotionState:
-        """The same motion where lengths are multiplied by a factor."""
-        by = np.tile(np.repeat([factor, 1.0], 3), 2)
+    def carried(self, turn: Array, factor: float) -> MotionState:
+        """The same motion where the world was turned by a rotation ``[3, 3]`` and its lengths were multiplied."""
+        by = np.eye(12)
+        by[:3, :3] = by[6:9, 6:9] = factor * turn
         return MotionState(
-            self.position * factor, self.rotation, self.speed * by[6:], self.covariance * by[:, None] * by
+            by[:3, :3] @ self.position, self.rotation @ turn.T, by[6:, 6:] @ self.speed, by @ self.covariance @ by.T
         )
 
     def relocated(self, T_cam_world: Array) -> MotionState:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
 from ..localisation.observation import Observations
@@ -36,16 +37,16 @@ class FirstMap:
     """Two views and what they give together; lengths in units of the first view's median depth.
 
     Attributes:
-        first: The first view; its camera is the world's frame of reference.
+        first: The first view.
         second: The second.
-        T_cam_world: World-to-camera pose ``[4, 4]`` of the second.
+        T_cam_first: Pose ``[4, 4]`` from the first camera's frame to the second's.
         pair: Which features show a point.
-        points: World points ``[M, 3]``.
+        points: ``[M, 3]`` in the first camera's frame.
     """
 
     first: View
     second: View
-    T_cam_world: Array
+    T_cam_first: Array
     pair: Pair
     points: Array
 
@@ -103,14 +104,22 @@ def _scaled(first: View, second: View, found: TwoViews) -> FirstMap:
     return FirstMap(first, second, pose, found.pair, found.points / depth)
 
 
-def put(world: Map, start: FirstMap) -> tuple[int, int]:
-    """Put a first map into an empty one; the slots of its two keyframes."""
-    poses = np.eye(4), start.T_cam_world
+def put(world: Map, start: FirstMap, T_first_world: Array, island: int) -> tuple[int, int]:
+    """Put a first map into the map as an island that has nothing yet; the slots of its two keyframes.
+
+    Args:
+        world: The map.
+        start: What the two views give.
+        T_first_world: Pose ``[4, 4]`` of the first view in the island's world, world to camera.
+        island: The island's number (`Map.kf_island`).
+    """
+    poses = T_first_world, start.T_cam_first @ T_first_world
     slots = [
-        world.add_keyframe(view.seen, pose, view.frame.index, view.frame.timestamp)
+        world.add_keyframe(view.seen, pose, view.frame.index, view.frame.timestamp, island)
         for view, pose in zip((start.first, start.second), poses, strict=True)
     ]
-    points = world.add_points(start.points, start.first.seen.rgb[start.pair.first], slots[0], start.pair.first)
+    position = se3.transform(se3.inverse(T_first_world), start.points)
+    points = world.add_points(position, start.first.seen.rgb[start.pair.first], slots[0], start.pair.first)
     world.observe(slots[1], start.pair.second, points)
     world.refresh(points)
     return slots[0], slots[1]

@@ -7,6 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from ..localisation.motion_model import pose_covariance, smooth
+from ..settings import MotionModelSettings
 from .map import Map
 
 Array = NDArray[np.float64]
@@ -62,3 +67,15 @@ class History:
         rows = np.flatnonzero(world.kf_island[self._reference[: self.count]] == 0)
         poses = self._relative[rows] @ world.kf_pose[self._reference[rows]]
         return self._stamp[rows], poses, self._information[rows].astype(np.float64)
+
+    def trajectory(self, world: Map, motion: MotionModelSettings) -> Trajectory:
+        """Camera-to-world poses in the order of their stamps, smoothed where the settings say so."""
+        stamps, poses, information = self.poses(world)
+        order = np.argsort(stamps, kind="stable")
+        fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
+        rows = order[fresh]
+        stamps, poses = stamps[rows], poses[rows]
+        if motion.smooth and len(stamps) > 2:
+            spread = [pose_covariance(*pair, motion.inflation) for pair in zip(poses, information[rows], strict=True)]
+            poses = smooth(stamps, poses, np.array(spread), motion)
+        return Trajectory(stamps, se3.inverse(poses))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.geometry import se3
-
 Array = NDArray[np.float64]
+
+UNIT_MAY_DIFFER = 10.0
+"""Without depth the unit of length is the median depth of the first views: so many times another's it may be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +34,12 @@ class Islands:
 
     Args:
         known: Those of a loaded map, from number 1 on.
+        stretch: How many times longer a way on an island may be than it looks: without depth each has its own unit.
     """
 
-    def __init__(self, known: Iterable[Island] = ()) -> None:
+    def __init__(self, known: Iterable[Island] = (), *, stretch: float = 1.0) -> None:
         self._islands = dict(enumerate(known, 1))
+        self._stretch = stretch
 
     def all(self) -> list[Island]:
         """All of them in the order of their numbers."""
@@ -70,15 +73,21 @@ class Islands:
         anchor, most = (last, reach_m) if there == left else self._from_first(left, last, reach_m)
         return there in (left, 0) and bool(np.linalg.norm(now - anchor) <= most)
 
-    def may_lie(self, number: int, T_first_island: Array) -> bool:
-        """Whether an island can have begun where a pose ``[4, 4]`` of its world in the first map's puts it."""
+    def may_lie(self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0) -> bool:
+        """Whether an island can have begun where it would come to lie in the first map's world.
+
+        Args:
+            number: The island.
+            moved: Where in the first map's world a place ``[3]`` of the island's would come to lie, ``[3]``.
+            drift_m: By how much drift may have put it too far away.
+        """
         island = self._islands[number]
-        begun = se3.transform(T_first_island, island.start[None])[0]
-        return bool(np.linalg.norm(begun - island.anchor) <= island.reach_m)
+        return bool(np.linalg.norm(moved(island.start) - island.anchor) <= island.reach_m + drift_m)
 
     def _from_first(self, left: int, last: Array, reach_m: float) -> tuple[Array, float]:
         """Where the first map was left, and how far from there the camera can be now."""
         island = self._islands.get(left)
         if island is None:
             return last.copy(), reach_m
-        return island.anchor, island.reach_m + float(np.linalg.norm(last - island.start)) + reach_m
+        way = self._stretch * float(np.linalg.norm(last - island.start))
+        return island.anchor, island.reach_m + way + reach_m

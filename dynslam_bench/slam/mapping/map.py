@@ -220,20 +220,22 @@ class Map:
         order = np.lexsort((-self.kf_id[slots], -counts[slots]))
         return slots[order], counts[slots[order]]
 
-    def move_island(self, island: int, T_new_old: Array, joined_to: int) -> None:
+    def move_island(self, island: int, T_new_old: Array, joined_to: int, factor: float = 1.0) -> None:
         """Move all keyframes of an island, and their points, to where they belong in another, and join it to that.
 
         Args:
             island: Its number.
             T_new_old: From the world as the island had it to the world as the other has it, ``[4, 4]``.
             joined_to: The other's number.
+            factor: What lengths in the island's world are multiplied by before it is moved.
         """
         slots = np.flatnonzero(self.kf_alive & (self.kf_island == island))
         table = self.kf_point[slots]
         points = np.unique(table[table >= 0]).astype(np.int64)
+        self.kf_pose[slots, :3, 3] *= factor
         for slot in slots.tolist():
             self.set_pose(slot, self.kf_pose[slot] @ se3.inverse(T_new_old))
-        self.position[points] = se3.transform(T_new_old, self.position[points])
+        self.position[points] = se3.transform(T_new_old, factor * self.position[points])
         self.kf_island[slots] = joined_to
         self.refresh(points)
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.camera import Camera
 
-from .islands import Island, Islands
+from ..localisation.observation import Observations
+from .islands import UNIT_MAY_DIFFER, Island, Islands
 from .map import Map
 from .saved_map import (
     FEATURE_ARRAYS,
@@ -45,20 +47,35 @@ def begin_map(file: str, camera: Camera, features: MapFeatures, *, depth: bool) 
         SettingsError: The file cannot be read, is no map, or one of another camera, features or sensor.
     """
     if not file:
-        return Map(camera, features.scales), Islands()
+        return Map(camera, features.scales), Islands(stretch=1.0 if depth else UNIT_MAY_DIFFER)
     path = Path(file).expanduser()
     saved = read_map(path)
     saved.check(camera, features, _sensors(depth), str(path))
     return restored(saved, camera, features.scales)
 
 
+def check_descriptors(world: Map, seen: Observations, frame: int) -> None:
+    """Make sure that a frame's features can be found in a map.
+
+    Raises:
+        TrackerError: Their descriptors are not those of the map.
+    """
+    if len(seen) and 8 * seen.words.shape[1] != world.descriptor_bytes:
+        raise TrackerError(
+            f"the map's descriptors have {world.descriptor_bytes} bytes, frame {frame}'s {8 * seen.words.shape[1]}",
+            "make the map with the same features",
+        )
+
+
 def save(path: Path, world: Map, islands: Islands, features: MapFeatures, *, depth: bool, made_by: str = "") -> None:
     """Write a map, with all that `begin` asks for.
 
     Raises:
-        TrackerError: The map is too large for a file.
+        TrackerError: There is no map yet, or it is too large for a file.
         DynslamError: The file cannot be written.
     """
+    if not world.next_keyframe:
+        raise TrackerError("there is no map to save: no frame has begun one")
     header = MapHeader(
         sensors=_sensors(depth),
         camera=described(world.camera),
@@ -118,7 +135,8 @@ def restored(saved: SavedMap, camera: Camera, scales: Array) -> tuple[Map, Islan
     tables["kf_centre"] = np.zeros((len(count), 3))
     world = Map(camera, scales)
     world.take_over(tables, header.next_keyframe, header.next_point)
-    return world, Islands(_islands(arrays))
+    stretch = 1.0 if header.sensors == "rgbd" else UNIT_MAY_DIFFER
+    return world, Islands(_islands(arrays), stretch=stretch)
 
 
 def _table(rows: NDArray[Any], counts: NDArray[Any]) -> NDArray[Any]:
