@@ -180,7 +180,7 @@ class MappingSettings(Settings):
         ge=0,
         le=100,
         description="the same in standard deviations of a feature's place, which grow with its octave: with six "
-        "depth is known to a sixth",
+        "depth is known to a quarter",
     )
     min_found_ratio: float = tunable(
         0.25,

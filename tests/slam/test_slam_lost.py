@@ -11,10 +11,11 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.localisation.motion_model import MotionState
 from dynslam_bench.slam.mapping.islands import Islands
 from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
-from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.settings import BackendSettings, MotionModelSettings
 
 STEP = 0.15
 QUARTER = round((4.0 + np.pi / 2) / STEP)
@@ -159,3 +160,20 @@ def test_an_island_lies_where_the_camera_can_have_got():
     assert not islands.within(0, first, here, here, 2.0), "nothing is known of the way to another island"
     assert islands.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.4]), 0.5)
     assert not islands.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.6]), 0.5)
+
+
+def test_the_camera_moves_on_as_it_felt_it_where_a_loop_turns_the_world():
+    """Forward stays forward, at a speed in the new unit of length; so does what is not known of it."""
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 2.0, 0.3]))
+    state = MotionState.at(se3.inverse(se3.exp(np.array([1.0, 2.0, 3.0, 0.2, 0.1, 0.4]))), 1e-4 * np.eye(6))
+    state.speed[:] = [0.3, 0.1, 0.9, 0.02, 0.3, 0.1]
+    state.covariance[6:9, 6:9] = np.diag([0.1, 0.2, 0.3])
+    carried = state.carried(turn[:3, :3], 2.0)
+    assert np.allclose(carried.rotation @ carried.speed[:3], 2.0 * state.rotation @ state.speed[:3])
+    assert np.allclose(carried.position, 2.0 * turn[:3, :3] @ state.position)
+    assert np.array_equal(carried.speed[3:], state.speed[3:])
+    assert np.allclose(np.linalg.eigvalsh(carried.covariance[6:9, 6:9]), 4.0 * np.array([0.1, 0.2, 0.3]))
+    settings = MotionModelSettings()
+    there, here = carried.predicted(0.1, settings).T_cam_world, state.predicted(0.1, settings).T_cam_world
+    steps = [b @ se3.inverse(a) for a, b in ((carried.T_cam_world, there), (state.T_cam_world, here))]
+    assert np.allclose(steps[0][:3, :3], steps[1][:3, :3]) and np.allclose(steps[0][:3, 3], 2.0 * steps[1][:3, 3])

@@ -53,6 +53,23 @@ def test_one_point_that_many_keyframes_see_costs_the_others_nothing(room):
     assert world.obs_kf.size < 2500, "300 points of one observation each, and one of a hundred"
 
 
+def test_what_points_become_together_finds_room(room):
+    world = Map(room.camera, np.ones(1))
+    slots = [keyframe_of(room, world, np.eye(4), index) for index in range(40)]
+    one, other, last = world.add_points(np.ones((3, 3)), np.zeros((3, 3), np.uint8), slots[0], np.arange(3))
+    for slot in slots[1:]:
+        world.observe(slot, np.array([0, 1]) if slot % 2 else np.array([1, 0]), np.array([one, other]))
+    for slot in slots[20:]:
+        world.unobserve(np.array([slot]), np.array([1 if slot % 2 else 0]))
+    world.observe(slots[1], np.array([2]), np.array([last]))
+    known = observers(world, last), observers(world, one), observers(world, other)
+    assert [len(each) for each in known] == [2, 40, 20]
+    world.merge(int(one), int(last))
+    found = observers(world, last)
+    assert set(found) >= set(known[0]) and len({slot for slot, _ in found}) == len(found) == 40
+    assert observers(world, other) == known[2], "beside it nothing has changed"
+
+
 def test_room_that_points_leave_is_used_again(room):
     world = Map(room.camera, np.ones(1))
     slots = [keyframe_of(room, world, np.eye(4), index) for index in range(9)]
@@ -69,17 +86,45 @@ def test_room_that_points_leave_is_used_again(room):
     assert sizes[1:] == sizes[1:2] * 5
 
 
-@pytest.mark.parametrize(
-    ("octave", "sigmas", "made"), [(0, 0.0, True), (0, 6.0, True), (7, 0.0, True), (7, 6.0, False)]
-)
-def test_a_coarse_feature_makes_a_point_only_of_a_wide_parallax(room, octave, sigmas, made):
-    """1.5 degrees are 14 standard deviations of a feature of the finest octave, and 4 of one of the coarsest."""
-    world = Map(room.camera, 1.2 ** np.arange(8))
+def flat(room, degrees):
+    """Two poses before 400 points on a wall 3 m away, the second one so much to the side."""
     room.points = room.points[:400] * [1.0, 1.0, 0.0] + [0.0, 0.0, 3.0]
     room.descriptors = room.descriptors[:400]
     step = np.eye(4)
-    step[0, 3] = 3.0 * np.tan(np.deg2rad(1.5))
-    one, other = (keyframe_of(room, world, pose, index, octave) for index, pose in enumerate((np.eye(4), step)))
+    step[0, 3] = 3.0 * np.tan(np.deg2rad(degrees))
+    return np.eye(4), step
+
+
+@pytest.mark.parametrize(
+    ("octaves", "sigmas", "made"),
+    [
+        *(((0, 0), 0.0, True), ((0, 0), 6.0, True), ((0, 3), 6.0, True), ((7, 7), 0.0, True), ((7, 5), 0.0, True)),
+        *(((7, 7), 6.0, False), ((5, 7), 6.0, False), ((7, 5), 6.0, False)),
+    ],
+)
+def test_a_coarse_feature_makes_a_point_only_of_a_wide_parallax(room, octaves, sigmas, made):
+    """1.5 degrees are 14 standard deviations of a feature of the finest octave, and 4 of one of the coarsest."""
+    world = Map(room.camera, 1.2 ** np.arange(8))
+    poses = enumerate(flat(room, 1.5))
+    one, other = (keyframe_of(room, world, pose, i, octave) for (i, pose), octave in zip(poses, octaves, strict=True))
     ours, _, position = triangulate(world, one, other, MappingSettings(min_parallax_sigmas=sigmas))
     assert (len(ours) > 30) is made and (made or not len(ours))
     assert np.allclose(position[:, 2], 3.0, rtol=0.01)
+
+
+def test_where_the_right_feature_is_too_far_away_no_worse_one_stands_in_for_it(room):
+    """One further along the epipolar line that looks somewhat like it would be a point much too near."""
+    world, poses = Map(room.camera, 1.2 ** np.arange(8)), flat(room, 1.5)
+    one, other = (keyframe_of(room, world, pose, index, 6) for index, pose in enumerate(poses))
+    ours, theirs, _ = triangulate(world, one, other, MappingSettings())
+    feature, same = int(ours[0]), int(theirs[0])
+    alike = (same + 1) % int(world.kf_count[other])
+    world.kf_words[other, alike] = world.kf_words[one, feature] ^ np.uint64(0b111)
+    world.kf_words[other, same] = world.kf_words[one, feature]
+    world.kf_xy[other, alike] = world.kf_xy[other, same] - [40.0, 0.0]
+    for sigmas, made in ((0.0, [same]), (6.0, [])):
+        ours, theirs, _ = triangulate(world, one, other, MappingSettings(min_parallax_sigmas=sigmas))
+        assert theirs[ours == feature].tolist() == made
+    world.kf_xy[other, same] -= [0.0, 50.0]
+    ours, theirs, _ = triangulate(world, one, other, MappingSettings(min_parallax_sigmas=6.0))
+    assert theirs[ours == feature].tolist() == [alike], "what would be believed"

@@ -66,7 +66,7 @@ def test_two_views_tell_the_motion_up_to_scale(room, flat):
     assert len(found.pair) > 120 and (found.points[:, 2] > 0).all() and found.parallax_deg > 1.0
 
 
-def before_a_wall(room, seed):
+def before_a_wall(room, seed, noise_px):
     """400 points on a wall, and 100 on things before it that are found less exactly; gives the frames of a step."""
     rng = np.random.default_rng(seed)
     depth = np.where(np.arange(500) < 400, 3.0, rng.uniform(1.2, 2.2, 500))
@@ -79,24 +79,25 @@ def before_a_wall(room, seed):
         frame = without_depth(room.see(pose, index, limit=500))
         uv = room.camera.project(se3.transform(se3.inverse(pose), room.points))
         row = np.linalg.norm(uv[None] - frame.xy[:, None], axis=2).argmin(axis=1)
-        noise = np.where(row[:, None] >= 400, rng.normal(0, 0.8, (len(row), 2)), 0.0)
+        noise = np.where(row[:, None] >= 400, rng.normal(0, noise_px, (len(row), 2)), 0.0)
         frames.append(replace(frame, xy=frame.xy + noise))
     return frames
 
 
-def test_a_motion_that_leaves_out_what_tells_against_it_is_not_believed(room):
+@pytest.mark.parametrize("noise_px", [0.8, 1.5])
+def test_a_motion_that_leaves_out_what_tells_against_it_is_not_believed(room, noise_px):
     """The homography's other motion fits the wall, and drops the things before it: it was believed, 72 degrees off."""
     off, settings = [], MonocularBackendSettings().tracking
     for seed in range(6):
         first_views, begun = FirstViews(), None
-        for frame in before_a_wall(room, seed):
+        for frame in before_a_wall(room, seed, noise_px):
             keep, weight = np.ones(len(frame), bool), np.ones(len(frame), np.float32)
             seen = observe(frame, keep, weight, room.camera, 1.2 ** np.arange(8), settings)
             begun = begun or first_views.take(View(frame, seen), room.camera, TwoViewSettings())
         if begun is not None:
             way = begun.T_cam_first[:3, 3] / np.linalg.norm(begun.T_cam_first[:3, 3])
             off.append(np.degrees(np.arccos(way @ (np.array([-0.1, 0.0, -0.04]) / np.hypot(0.1, 0.04)))))
-    assert off and max(off) < 10.0
+    assert max(off, default=0.0) < 10.0 and (off or noise_px > 1.0), "what is noisier than it should be may wait"
 
 
 def test_the_right_motion_is_carried_on_where_the_newest_view_does_not_tell_it(room, monkeypatch):

@@ -196,14 +196,14 @@ def possible_motions(
 def believed(motions: Sequence[TwoViews], settings: TwoViewSettings) -> TwoViews | None:
     """The first of the motions, if it leaves no doubt about any other, and shows enough parallax.
 
-    Each one's cost is that of the matches which it made points of. A wrong motion may fit those it kept better for what
-    it left out, such as all that stands before a wall: a match that others explain and it does not counts against it
-    in both views, and the same motion has to be the best either way.
+    Each one's cost is that of the matches which it was adjusted with. A wrong motion may fit those better for what it
+    left out, such as all that stands before a wall: each observation that another has and it has not counts against it,
+    and the same motion has to be the best either way.
     """
     if not motions or not all(motions[0].beats(other) for other in motions[1:]):
         return None
-    most = max(len(each.pair) for each in motions)
-    left = [each.cost * each.count + 2 * CHI2_POINT * (most - len(each.pair)) for each in motions]
+    most = max(each.count for each in motions)
+    left = [each.cost * each.count + CHI2_POINT * (most - each.count) for each in motions]
     if not motions[int(np.argmin(left))].is_as(motions[0]):
         return None
     return motions[0] if motions[0].parallax_deg >= settings.min_parallax_deg else None
