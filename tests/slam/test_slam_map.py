@@ -110,21 +110,3 @@ def test_a_coarse_feature_makes_a_point_only_of_a_wide_parallax(room, octaves, s
     ours, _, position = triangulate(world, one, other, MappingSettings(min_parallax_sigmas=sigmas))
     assert (len(ours) > 30) is made and (made or not len(ours))
     assert np.allclose(position[:, 2], 3.0, rtol=0.01)
-
-
-def test_where_the_right_feature_is_too_far_away_no_worse_one_stands_in_for_it(room):
-    """One further along the epipolar line that looks somewhat like it would be a point much too near."""
-    world, poses = Map(room.camera, 1.2 ** np.arange(8)), flat(room, 1.5)
-    one, other = (keyframe_of(room, world, pose, index, 6) for index, pose in enumerate(poses))
-    ours, theirs, _ = triangulate(world, one, other, MappingSettings())
-    feature, same = int(ours[0]), int(theirs[0])
-    alike = (same + 1) % int(world.kf_count[other])
-    world.kf_words[other, alike] = world.kf_words[one, feature] ^ np.uint64(0b111)
-    world.kf_words[other, same] = world.kf_words[one, feature]
-    world.kf_xy[other, alike] = world.kf_xy[other, same] - [40.0, 0.0]
-    for sigmas, made in ((0.0, [same]), (6.0, [])):
-        ours, theirs, _ = triangulate(world, one, other, MappingSettings(min_parallax_sigmas=sigmas))
-        assert theirs[ours == feature].tolist() == made
-    world.kf_xy[other, same] -= [0.0, 50.0]
-    ours, theirs, _ = triangulate(world, one, other, MappingSettings(min_parallax_sigmas=6.0))
-    assert theirs[ours == feature].tolist() == [alike], "what would be believed"

@@ -77,9 +77,6 @@ def _triangulate(
                 s = (p0 * q0 + p1 * q1) / (p0 * p0 + p1 * p1)
             elif z_b[b] > 0.0 and abs(d2) > 1e-6:
                 s = (z_b[b] - t[2]) / d2  # too little parallax, but the other keyframe has depth
-            elif sigmas > 0.0:  # the right one may be too far away to tell its depth: no worse one stands in for it
-                best_distance[i], partner[i] = d, -1
-                continue
             else:
                 continue
             w = d2 * s + t[2]
