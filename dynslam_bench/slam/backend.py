@@ -303,9 +303,10 @@ class RgbdBackend:
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             before = self.world.kf_pose[slot].copy()
-            if self.loops.close(slot, tracked.seen):
-                self.history.rescale(self.loops.rescaled)
-                self.motion.carried(before, self.world.kf_pose[slot], self.loops.rescaled.get(slot, 1.0))
+            self.loops.close(slot, tracked.seen)
+            self.history.rescale(self.loops.rescaled)
+            if slot in self.loops.rescaled:  # what a loop turns with depth is within the motion's noise
+                self.motion.carried(before, self.world.kf_pose[slot], self.loops.rescaled[slot])
             spent["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
         gone = [dropped for dropped, _, _ in self.mapper.dropped]

@@ -116,7 +116,8 @@ class LoopCloser:
         self.closed: list[Loop] = []
         """All loops that were closed."""
         self.rescaled: dict[int, float] = {}
-        """By what the last call of `close` rescaled the surroundings of keyframes, by their slots."""
+        """By what the last call of `close` rescaled the surroundings of keyframes, by their slots; with depth by 1, and
+        of those alone that it moved to another map."""
         self.misfit = False
         """Whether the last call of `close` found an island's camera in an older map, which the island cannot join."""
         self._seed = seed
