@@ -97,7 +97,7 @@ class RgbdBackend:
         self._tracked = False
         self._island = 0
         self._unrecognised = 0
-        self._reach = Reach(anywhere=bool(start.file))
+        self._reach = Reach(self.camera, anywhere=bool(start.file))
         self._last: Tracked | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
         self.motion = CameraMotion(self.camera.readout_s)
@@ -184,9 +184,9 @@ class RgbdBackend:
             seen = self._straightening.foreseen(raw, last, frame.timestamp, self.settings.motion)
         prediction = self.motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self._anywhere()
-        reach = self._reach.metres(last, frame.timestamp, self.settings.relocalisation)
-        close, island = self.mapper.close_m, None if self._tracked else self._island
-        before = Before(last, prediction, self._reference, around, island, reach, close, self.seed, frame.index)
+        asks = self.settings.relocalisation
+        lost = None if self._tracked else self._reach.since(last, raw, frame.timestamp, self._island, asks)
+        before = Before(last, prediction, self._reference, around, lost, self.mapper.close_m, self.seed, frame.index)
         first = first_pose(self.world, self._islands, seen, before, self.settings)
         if first is None:
             return self._lost(frame, raw, last, prediction)
@@ -233,7 +233,7 @@ class RgbdBackend:
         self.state, self._first = "lost", None
         shown = self._usable(seen)
         if self._tracked:
-            self._reach.lost(last, shown, MIN_INITIAL)
+            self._reach.lost(last, seen, self.settings.relocalisation, shows=shown >= MIN_INITIAL)
         self._tracked = False
         self.motion.forget()
         self._unrecognised = self._unrecognised + 1 if shown >= MIN_INITIAL else 0
@@ -251,15 +251,16 @@ class RgbdBackend:
         return int(np.count_nonzero(seen.z > 0))
 
     def _begin_island(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised | None:
-        """Begin a map of its own, which takes the last tracked pose for that of its first frame; None if not yet."""
+        """Begin a map of its own where the camera was lost, turned as the images say; None if not yet."""
         self._note_island(last, frame.timestamp)
-        return self._begin_map(frame, seen, last.T_cam_world)
+        return self._begin_map(frame, seen, self._reach.turned(last))
 
     def _note_island(self, last: Tracked, timestamp: float) -> None:
         """An island begins with the frame of this stamp."""
         reach = self._reach.metres(last, timestamp, self.settings.relocalisation)
         self._unrecognised = 0
-        self._island = self._islands.begin(self._island, se3.inverse(last.T_cam_world)[:3, 3], reach)
+        start = se3.inverse(last.T_cam_world)[:3, 3]
+        self._island = self._islands.begin(self._island, start, reach, self._reach.slack)
 
     def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: Tracked) -> Tracked:
         """The frame is tracked: what it sees counts as found, and its pose is weighed against the motion model."""

@@ -26,6 +26,7 @@ from dynslam_bench.geometry import se3
 
 from .bundle.pose_graph import Edge, optimise_poses, rescaled, spread_scale, within
 from .corrections import Correction
+from .localisation.lookalikes import Sight, ambiguous
 from .localisation.observation import Observations
 from .localisation.recognition import Recognised, around, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
@@ -151,6 +152,9 @@ class LoopCloser:
         self._row.append(correction)
         if len(self._row) < self.settings.loop_closing.confirmations:
             return False
+        if loop.joins and self._ambiguous(slot, seen, loop):
+            self._row.clear()
+            return False
         loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
         self._row.clear()
         if not loop.fits:
@@ -248,6 +252,9 @@ class LoopCloser:
         if loop.joins and (loop.inliers < s.join_inliers or loop.share < s.join_share):
             return False
         if loop.joins:
+            here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
+            if np.radians(loop.turned_deg) > self.islands.slack(here, there):
+                return False
             return loop.fits or (not self._scale_is_known and self._may_be_there(slot, loop))
         way = self._way_to(loop.keyframe)
         if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
@@ -265,6 +272,17 @@ class LoopCloser:
         here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
         now = se3.inverse(loop.T_cam_world)[:3, 3]
         return not there and self.islands.within(here, there, self.world.kf_centre[slot], now, 0.0)
+
+    def _ambiguous(self, slot: int, seen: Observations, loop: Loop) -> bool:
+        """Whether the keyframe looks like two places: nothing but what is seen tells how islands lie together."""
+        world = self.world
+        here, there = (int(world.kf_island[each]) for each in (slot, loop.keyframe))
+        own = world.kf_point[slot, world.kf_point[slot] >= 0]
+        depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[own])[:, 2]))
+        known = {here: Sight(world.kf_pose[slot], loop.share, depth)}
+        known[there] = Sight(loop.T_cam_world, loop.share, depth * loop.scale)
+        elsewhere = not_held(world, slot, self.settings.loop_closing.away)
+        return ambiguous(world, seen, known, elsewhere, self.settings, self._seed)
 
     def _way_to(self, slot: int) -> float:
         """The way along which drift can have come in since a keyframe: walked and turned, or over a closed loop."""

@@ -77,7 +77,9 @@ class MonocularBackend(RgbdBackend):
             return None
         spent = {"mapping": perf_counter() - begin}
         self._note_island(last, start.first.frame.timestamp)
-        return self._begin_from_two(start, last.T_cam_world, spent)
+        T_first_world = last.T_cam_world.copy()
+        T_first_world[:3] = start.T_cam_first[:3, :3].T @ self._reach.turned(last)[:3]
+        return self._begin_from_two(start, T_first_world, spent)
 
     def _anywhere(self) -> Slots:
         """Not on an island whose lengths have drifted apart."""
@@ -90,6 +92,7 @@ class MonocularBackend(RgbdBackend):
         if self.loops.misfit:
             self._misfits.add(self._island)
             self._tracked, self._last = False, self._showing_nothing(frame, tracked.T_cam_world)
+            self._reach.left(tracked)
             self.motion.forget()
         return spent
 

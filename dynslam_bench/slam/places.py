@@ -20,6 +20,8 @@ VALUES = 1 << 16
 """Values of a piece."""
 EVERY = 4
 """Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
+AT_ONCE = 64
+"""Keyframes that are looked at before the map may rest: a large one does not have to fit into memory."""
 
 Pieces = NDArray[np.uint16]
 
@@ -49,9 +51,17 @@ def likeness(world: Map, keyframes: NDArray[np.int64], seen: Observations) -> ND
     own = np.ascontiguousarray(seen.words).view(np.uint16)[:, ::EVERY]
     wanted = np.full((own.shape[1], VALUES), -1, np.int32)
     wanted[np.arange(own.shape[1])[None, :], own] = 0
-    frequency = _count(pieces, world.kf_point, world.kf_count, keyframes, wanted)
+    some = [keyframes[at : at + AT_ONCE] for at in range(0, len(keyframes), AT_ONCE)]
+    frequency = 0
+    for slots in some:
+        frequency += _count(pieces, world.kf_point, world.kf_count, slots, wanted)
+        world.rest()
     weight = np.where(wanted > 0, np.log(max(frequency, 1) / np.maximum(wanted, 1)), 0.0).astype(np.float32)
-    return _scores(pieces, world.kf_point, world.kf_count, keyframes, weight)
+    scores = []
+    for slots in some:
+        scores.append(_scores(pieces, world.kf_point, world.kf_count, slots, weight))
+        world.rest()
+    return np.concatenate(scores)
 
 
 @kernel

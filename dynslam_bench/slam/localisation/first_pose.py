@@ -7,19 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.geometry import se3
 
 from ..mapping.islands import Islands
 from ..mapping.map import Map
 from ..places import most_alike
 from ..settings import BackendSettings, TrackingSettings
+from .lookalikes import ambiguous, sight
 from .observation import Observations
 from .pose import PoseEstimate
+from .reach import Lost
 from .recognition import recognise
 from .relocalisation import Relocalised, locate
 from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
@@ -46,8 +48,7 @@ class Before:
         prediction: World-to-camera pose that the motion model expects.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
         keyframes: Slots of the keyframes near which the frame may have been taken.
-        lost_on: The island, or 0, where the camera was tracked last; None if the frame before this one was tracked.
-        reach_m: How far it may have gone since then.
+        lost: What is known of the time since then, in which it was lost; None if it was tracked in the frame before.
         close_m: Depth below which a feature's depth is trusted, metres.
         seed: Of the sequence's random draws.
         frame: Index of the frame that comes.
@@ -57,8 +58,7 @@ class Before:
     prediction: Array
     reference: int
     keyframes: Slots
-    lost_on: int | None
-    reach_m: float
+    lost: Lost | None
     close_m: float
     seed: int
     frame: int
@@ -98,20 +98,22 @@ def first_pose(
         settings: Of tracking and relocalisation.
     """
     best: tuple[Matches, PoseEstimate] | None = None
+    lost = before.lost is not None
     for matches in _from_last_frame(world, seen, before, settings.tracking):
         estimate = solve(world, seen, matches, before.prediction, rounds=3)
         if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
             best = matches, estimate
         if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
-            return _agreed(*best, before.reference)
-    lost = before.lost_on is not None
+            if not lost:
+                return _agreed(*best, before.reference)
+            break
+    if lost and best is not None:
+        guess = _there(world, islands, seen, Relocalised(before.reference, *best), before, settings)
+        if guess is not None:
+            return guess
     least = ENOUGH_FIRST // 2 if best is None or lost else best[1].count + 1
     found = _from_keyframes(world, islands, seen, before, settings, least)
-    if found is not None or best is None:
-        return found
-    if lost:
-        return _there(world, islands, seen, Relocalised(before.reference, *best), before, settings)
-    return _agreed(*best, before.reference)
+    return found if found is not None or best is None or lost else _agreed(*best, before.reference)
 
 
 def _there(
@@ -122,15 +124,22 @@ def _there(
     A place may only have something in common with another.
     """
     there = int(world.kf_island[found.keyframe])
-    last, now = (se3.inverse(pose)[:3, 3] for pose in (before.last.T_cam_world, found.estimate.T_cam_world))
-    if before.lost_on is not None and not islands.within(before.lost_on, there, last, now, before.reach_m):
+    if not _may_be(islands, before, there, found.estimate.T_cam_world):
         return None
     matches = found.matches.select(found.estimate.inliers)
     place = recognise(world, found.keyframe, seen, matches, found.estimate.T_cam_world, settings.tracking)
     many = len(place.matches) >= MANY
     if place.share < (MANY_SHARE if many else 1.0) * settings.relocalisation.min_share:
         return None
+    known, possible = {there: sight(place)}, partial(_may_be, islands, before)
+    if before.lost is not None and ambiguous(world, seen, known, before.keyframes, settings, before.seed, possible):
+        return None
     return FirstPose(place.T_cam_world, place.matches, found.keyframe, relocalised=True)
+
+
+def _may_be(islands: Islands, before: Before, island: int, T_cam_world: Array) -> bool:
+    """Whether the camera can have got to a pose on an island; anywhere, if it was tracked in the frame before."""
+    return before.lost is None or before.lost.may_be(islands, before.last.T_cam_world, island, T_cam_world)
 
 
 def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool = False) -> FirstPose:
@@ -153,7 +162,7 @@ def _from_keyframes(
     """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike."""
     s = settings.relocalisation
     rng = stream(before.seed, "relocalisation", before.frame)
-    for alike in (True,) if before.lost_on is not None else (False, True):
+    for alike in (True,) if before.lost is not None else (False, True):
         keyframes = most_alike(world, before.keyframes, seen, s.searched) if alike else [before.reference]
         found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
         if found is None or found.estimate.count < least:

@@ -22,11 +22,13 @@ class Island:
         start: Camera centre of its first frame in its own world ``[3]``, metres.
         anchor: Camera centre where the first map was left ``[3]``, in that map's world, metres.
         reach_m: How far from there it began, at most.
+        slack: How far its world may be turned against the first map's, radians; any angle if it comes from a file.
     """
 
     start: Array
     anchor: Array
     reach_m: float
+    slack: float = np.pi
 
 
 class Islands:
@@ -45,20 +47,28 @@ class Islands:
         """All of them in the order of their numbers."""
         return [*self._islands.values()]
 
-    def begin(self, left: int, start: Array, reach_m: float) -> int:
+    def begin(self, left: int, start: Array, reach_m: float, slack: float = np.pi) -> int:
         """A new island begins where the camera was lost, as far as anybody knows.
 
         Args:
             left: The island, or 0, in which the camera was tracked last.
             start: Camera centre there ``[3]``; the new island takes it for that of its own first frame.
             reach_m: How far the camera may have gone since.
+            slack: How far the directions that it has there may be turned against those of the island left, radians.
 
         Returns:
             Its number.
         """
         number = 1 + len(self._islands)
-        self._islands[number] = Island(start.copy(), *self._from_first(left, start, reach_m))
+        turned = min(slack + self.slack(left, 0), np.pi)
+        self._islands[number] = Island(start.copy(), *self._from_first(left, start, reach_m), turned)
         return number
+
+    def slack(self, one: int, other: int) -> float:
+        """How far the worlds of two islands, or 0, may be turned against each other, radians."""
+        if one == other:
+            return 0.0
+        return float(sum(self._islands[each].slack for each in (one, other) if each in self._islands))
 
     def within(self, left: int, there: int, last: Array, now: Array, reach_m: float) -> bool:
         """Whether a camera can have got from one place to another.

@@ -16,6 +16,7 @@ from dynslam_bench.geometry.camera import Camera
 
 from ..localisation.observation import Observations
 from . import map_kernels as kernels
+from .table_space import TableSpace
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
@@ -23,14 +24,6 @@ Slots = NDArray[np.int64]
 
 FEWEST_ROOM = 4
 """Observations that find room when a point has its first one."""
-
-
-def _grown(table: NDArray[np.generic], length: int, axis: int = 0) -> NDArray[np.generic]:
-    shape = list(table.shape)
-    shape[axis] = length
-    bigger = np.zeros(shape, table.dtype)
-    bigger[tuple(slice(0, n) for n in table.shape)] = table
-    return bigger
 
 
 class Map:
@@ -64,7 +57,11 @@ class Map:
         self._vacant: dict[int, list[int]] = {}
         self._features = 0
         self._words = 4
+        self._space = TableSpace()
         self._allocate()
+
+    def _grow(self, name: str, length: int, axis: int = 0) -> None:
+        setattr(self, name, self._space.grown(name, getattr(self, name), length, axis))
 
     def _allocate(self) -> None:
         s, f, w, m = 0, self._features, self._words, 0
@@ -155,7 +152,7 @@ class Map:
         n = len(seen)
         if n > self._features:
             for name in self._FEATURE_TABLES:
-                setattr(self, name, _grown(getattr(self, name), n, axis=1))
+                self._grow(name, n, axis=1)
             self.kf_point[:, self._features :] = -1
             self._features = n
         free = np.flatnonzero(~self.kf_alive)
@@ -163,7 +160,7 @@ class Map:
             length = max(16, self.kf_alive.size + self.kf_alive.size // 2)
             free = np.array([self.kf_alive.size])
             for name in self._KEYFRAME_TABLES:
-                setattr(self, name, _grown(getattr(self, name), length))
+                self._grow(name, length)
         slot = int(free[0])
         self.kf_alive[slot] = True
         self.kf_id[slot] = self.next_keyframe
@@ -263,7 +260,7 @@ class Map:
         if self._top + fresh > self.alive.size:
             length = max(2048, self._top + fresh, self.alive.size + self.alive.size // 2)
             for name in self._POINT_TABLES:
-                setattr(self, name, _grown(getattr(self, name), length))
+                self._grow(name, length)
         slots = np.concatenate([np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)])
         self._top += fresh
         self.alive[slots] = True
@@ -318,8 +315,13 @@ class Map:
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nobody holds them any more."""
+        self.rest()
         self._free_points.extend(sorted(self._freed_points, reverse=True))
         self._freed_points.clear()
+
+    def rest(self) -> None:
+        """Let what is not in use leave the memory; it comes back when it is touched."""
+        self._space.rest()
 
     @property
     def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:
@@ -349,7 +351,7 @@ class Map:
             if self._observations > self.obs_kf.size:
                 length = max(self._observations, self.obs_kf.size + self.obs_kf.size // 2)
                 for name in ("obs_kf", "obs_ft"):
-                    setattr(self, name, _grown(getattr(self, name), length))
+                    self._grow(name, length)
             left = zip(self.obs_room[wanting].tolist(), self.obs_at[wanting].tolist(), strict=True)
             kernels.move(*self._observed, wanting, np.concatenate([np.array(at, np.int64), fresh]))
             self.obs_room[wanting] = room
