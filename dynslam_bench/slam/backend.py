@@ -92,7 +92,7 @@ class RgbdBackend:
         self.world, self._islands = begin_map(start.file, self.camera, self._made_of, depth=self.uses_depth)
         self._grows = not start.localisation_only
         self.mapper = LocalMapper(self.world, self.settings)
-        self.history = History()
+        self.history = History(self.world.space)
         self.state: TrackingState = "initialising"
         self._tracked = False
         self._island = 0
@@ -127,6 +127,7 @@ class RgbdBackend:
         begin = perf_counter()
         seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
         found = self._localise(frame, seen) if self.world.next_keyframe else self._initialise(frame, seen)
+        self.world.space.rest()
         tracking = perf_counter() - begin - sum(found.timings.values())
         stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
         return replace(found, timings={**stages, **found.timings})
@@ -327,7 +328,7 @@ class RgbdBackend:
             residual_px=0.0,
             relocalised=False,
             keyframe=bool(spent),
-            map_points=len(self.map_points()[0]),
+            map_points=self.world.point_count,
             keyframes=self.world.keyframe_count,
             maps=self.world.map_count,
             loops=len(self.loops.closed),

@@ -20,7 +20,7 @@ VALUES = 1 << 16
 """Values of a piece."""
 EVERY = 4
 """Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
-AT_ONCE = 64
+AT_ONCE = 128
 """Keyframes that are looked at before the map may rest: a large one does not have to fit into memory."""
 
 Pieces = NDArray[np.uint16]
@@ -55,12 +55,12 @@ def likeness(world: Map, keyframes: NDArray[np.int64], seen: Observations) -> ND
     frequency = 0
     for slots in some:
         frequency += _count(pieces, world.kf_point, world.kf_count, slots, wanted)
-        world.rest()
+        world.space.rest("kf_words", "kf_point")
     weight = np.where(wanted > 0, np.log(max(frequency, 1) / np.maximum(wanted, 1)), 0.0).astype(np.float32)
     scores = []
     for slots in some:
         scores.append(_scores(pieces, world.kf_point, world.kf_count, slots, weight))
-        world.rest()
+        world.space.rest("kf_words", "kf_point")
     return np.concatenate(scores)
 
 

@@ -124,7 +124,7 @@ def test_keyframes_in_a_row_agree_on_a_similarity(scale, told, agree):
 
 def test_frames_of_a_rescaled_keyframe_move_with_it(lap_without_depth):
     _, _, backend, _ = lap_without_depth
-    world, history = backend.world, History()
+    world, history = backend.world, History(backend.world.space)
     one, other = (int(slot) for slot in world.keyframes[:2])
     information = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0])
     for stamp, slot in ((0.0, one), (1.0, other), (2.0, one)):

@@ -11,7 +11,9 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.localisation.lookalikes import Sight, ambiguous
 from dynslam_bench.slam.localisation.motion_model import MotionState
+from dynslam_bench.slam.localisation.observation import observe
 from dynslam_bench.slam.mapping.islands import Islands
 from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
@@ -177,3 +179,29 @@ def test_the_camera_moves_on_as_it_felt_it_where_a_loop_turns_the_world():
     there, here = carried.predicted(0.1, settings).T_cam_world, state.predicted(0.1, settings).T_cam_world
     steps = [b @ se3.inverse(a) for a, b in ((carried.T_cam_world, there), (state.T_cam_world, here))]
     assert np.allclose(steps[0][:3, :3], steps[1][:3, :3]) and np.allclose(steps[0][:3, 3], 2.0 * steps[1][:3, 3])
+
+
+@pytest.mark.parametrize(("alike", "found"), [(0.0, True), (0.2, True), (0.5, False), (0.9, False)])
+@pytest.mark.parametrize("more", [0, 10])
+def test_what_looks_like_two_places_tells_nothing_after_a_long_loss(alike, found, more):
+    """Blind for three seconds, in which both can be reached; with 10 frames more the last one saw the look-alike."""
+    way = [*range(2 * QUARTER + more), *[None] * 30, *range(10, 18)]
+    _, states, errors = drive(RingWorld(alike=alike), way)
+    assert (states[-8:] == ("ok" if found else "lost")).all()
+    assert not found or errors[-8:].max() < 0.1
+
+
+@pytest.mark.parametrize(("alike", "twice"), [(0.0, False), (0.2, False), (0.6, True), (1.0, True)])
+def test_a_frame_is_ambiguous_where_its_features_are_found_in_two_places(alike, twice):
+    world, settings = RingWorld(alike=alike), BackendSettings()
+    backend, states, _ = drive(world, [*range(2 * QUARTER)])
+    assert (states == "ok").all()
+    lap = world.lap(2 * QUARTER, STEP)
+    frame = world.see(lap[10], 999)
+    seen = observe(frame, np.ones(len(frame), bool), np.ones(len(frame)), world.camera, np.ones(8), settings.tracking)
+    here = Sight(se3.inverse(lap[10]) @ lap[0], 1.0, 3.0)
+    everywhere = backend.world.keyframes
+    assert ambiguous(backend.world, seen, {0: here}, everywhere, settings, 0) is twice
+    assert not ambiguous(backend.world, seen, {0: here}, everywhere[:4], settings, 0), "nothing else is looked at"
+    near = lambda island, T_cam_world: not here.contradicts(Sight(T_cam_world, 1.0, 3.0))  # noqa: E731
+    assert not ambiguous(backend.world, seen, {0: here}, everywhere, settings, 0, near), "it cannot have got there"

@@ -13,15 +13,21 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from ..localisation.motion_model import pose_covariance, smooth
 from ..settings import MotionModelSettings
 from .map import Map
+from .table_space import TableSpace
 
 Array = NDArray[np.float64]
 
 
 class History:
-    """Frames with stamp, reference keyframe and pose relative to it; grows by doubling."""
+    """Frames with stamp, reference keyframe and pose relative to it; grows by doubling.
 
-    def __init__(self) -> None:
+    Args:
+        space: Where its tables have room to grow.
+    """
+
+    def __init__(self, space: TableSpace) -> None:
         self.count = 0
+        self._space = space
         self._stamp = np.zeros(64)
         self._reference = np.zeros(64, np.int32)
         self._relative = np.zeros((64, 4, 4))
@@ -31,10 +37,7 @@ class History:
         """Note a tracked frame: stamp, reference keyframe's slot, ``T_cam_ref`` and the information of the pose."""
         if self.count == len(self._stamp):
             for name in ("_stamp", "_reference", "_relative", "_information"):
-                old = getattr(self, name)
-                new = np.zeros((2 * len(old), *old.shape[1:]), old.dtype)
-                new[: len(old)] = old
-                setattr(self, name, new)
+                setattr(self, name, self._space.grown(f"history{name}", getattr(self, name), 2 * self.count))
         self._stamp[self.count] = stamp
         self._reference[self.count] = reference
         self._relative[self.count] = T_cam_ref

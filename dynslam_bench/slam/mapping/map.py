@@ -29,6 +29,9 @@ FEWEST_ROOM = 4
 class Map:
     """Keyframes, points and who observes what.
 
+    Attributes:
+        space: Where the tables have room to grow.
+
     Attributes (keyframes, by slot; F is the largest number of features so far):
         kf_alive, kf_id, kf_island (0 for the map that began first; others began where nothing was recognised),
         kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count, kf_raw
@@ -57,11 +60,11 @@ class Map:
         self._vacant: dict[int, list[int]] = {}
         self._features = 0
         self._words = 4
-        self._space = TableSpace()
+        self.space = TableSpace()
         self._allocate()
 
     def _grow(self, name: str, length: int, axis: int = 0) -> None:
-        setattr(self, name, self._space.grown(name, getattr(self, name), length, axis))
+        setattr(self, name, self.space.grown(name, getattr(self, name), length, axis))
 
     def _allocate(self) -> None:
         s, f, w, m = 0, self._features, self._words, 0
@@ -248,6 +251,11 @@ class Map:
     # ------------------------------------------------------------------ points
 
     @property
+    def point_count(self) -> int:
+        """Number of points."""
+        return int(np.count_nonzero(self.alive[: self._top]))
+
+    @property
     def points(self) -> Slots:
         """Slots of all points, ascending."""
         return np.flatnonzero(self.alive[: self._top])
@@ -315,13 +323,8 @@ class Map:
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nobody holds them any more."""
-        self.rest()
         self._free_points.extend(sorted(self._freed_points, reverse=True))
         self._freed_points.clear()
-
-    def rest(self) -> None:
-        """Let what is not in use leave the memory; it comes back when it is touched."""
-        self._space.rest()
 
     @property
     def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:

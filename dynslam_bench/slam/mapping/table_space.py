@@ -71,11 +71,12 @@ class TableSpace:
         bigger[tuple(slice(0, n) for n in table.shape)] = table
         return bigger
 
-    def rest(self) -> None:
-        """Let go of the pages of all files; those that are needed come back by themselves."""
+    def rest(self, *names: str) -> None:
+        """Let go of the pages of these tables, or of all that lie in files; what is needed comes back by itself."""
         if hasattr(mmap, "MADV_DONTNEED"):
-            for _, mapped in self._files.values():
-                mapped.madvise(mmap.MADV_DONTNEED)
+            for name in names or self._files:
+                if name in self._files:
+                    self._files[name][1].madvise(mmap.MADV_DONTNEED)
 
     def _in_file(self, name: str, size: int, file: IO[bytes] | None = None) -> NDArray[np.uint8] | None:
         """A file's bytes, as many as asked for, behind what it has zeros; None where there is no room for it."""

@@ -1,0 +1,101 @@
+"""Memory and frame time of the back end where the camera never comes back: a straight corridor without end.
+
+    python tests/benchmarks/backend_territory.py [--frames 10000] [--step 0.04] [--features 1000] [--set KEY=VALUE ...]
+
+Walls, floor and ceiling are points with random descriptors; nothing is rendered. Every 1,000 frames it prints the
+map, the resident memory of the process, what of the map lies in files, and the processor time of a frame; in the end
+the growth between the second thousand and the last, and the largest memory at any time.
+
+Bars: 1 MB of resident memory a 1,000 frames, frame time at the end at most 1.2 times that after 1,000 frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+import time
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "slam")]
+
+import numpy as np  # noqa: E402
+from point_world import PointWorld  # noqa: E402
+
+from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
+from dynslam_bench.core.settings import apply_overrides, parse_assignments  # noqa: E402
+from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
+from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
+
+AHEAD_M, POINTS_A_METRE = 10.0, 250
+BAR_MB, BAR_SLOWER = 1.0, 1.2
+
+
+class Corridor(PointWorld):
+    """A corridor along z, 2.4 m wide and high, of which a camera sees the next ten metres."""
+
+    def __init__(self, length_m: float, seed: int = 0) -> None:
+        super().__init__(seed, count=10)
+        rng = np.random.default_rng(seed)
+        count = int(length_m * POINTS_A_METRE)
+        across = rng.uniform(-1.2, 1.2, count)
+        side, wall = rng.integers(0, 2, count).astype(bool), rng.choice([-1.2, 1.2], count)
+        x, y = np.where(side, wall, across), np.where(side, across, wall)
+        self.all_points = np.stack([x, y, np.sort(rng.uniform(0, length_m, count))], axis=1)
+        self.looks = rng.integers(0, 256, (count, 32), dtype=np.uint8)
+
+    def at(self, z: float, index: int, features: int) -> FrameBundle:
+        """The frame of that number, taken so many metres from the beginning."""
+        first, last = np.searchsorted(self.all_points[:, 2], [z + 0.3, z + AHEAD_M])
+        self.points, self.descriptors = self.all_points[first:last], self.looks[first:last]
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1 * np.sin(index / 20), 0.05 * np.sin(index / 13), z
+        return self.see(pose, index, limit=features)
+
+
+def resident_mb() -> float:
+    """Resident memory of this process in MB (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def main() -> int:
+    """Drive it once."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--step", type=float, default=0.04, help="metres between frames")
+    parser.add_argument("--features", type=int, default=1000)
+    parser.add_argument("--set", nargs="*", default=[], help="settings of the back end, e.g. loop_closing.enabled=true")
+    options = parser.parse_args()
+    world = Corridor(options.frames * options.step + AHEAD_M)
+    backend = RgbdBackend(apply_overrides(BackendSettings(), parse_assignments(options.set)))
+    backend.reset(world.camera, 0)
+    spent, memory, lost = np.zeros(options.frames), np.zeros(options.frames), 0
+    for index in range(options.frames):
+        frame = world.at(index * options.step, index, options.features)
+        keep, sure = np.ones(len(frame), bool), np.ones(len(frame), np.float32)
+        begin = time.process_time()
+        found = backend.track(frame, keep, sure)
+        spent[index], memory[index] = time.process_time() - begin, resident_mb()
+        lost += found.state != "ok"
+        if (index + 1) % 1000 == 0:
+            newest = slice(index - 999, index + 1)
+            print(
+                f"{index + 1} frames: {found.keyframes} keyframes, {found.map_points} points, "
+                f"{memory[newest].mean():.1f} MB resident, {backend.world.space.bytes_in_files / 1e6:.0f} MB in files, "
+                f"{1e3 * spent[newest].mean():.1f} ms a frame",
+                flush=True,
+            )
+    thousands = options.frames // 1000
+    growth = (memory[-1000:].mean() - memory[1000:2000].mean()) / max(thousands - 2, 1)
+    slower = spent[-1000:].mean() / spent[1000:2000].mean()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    print(f"{growth:.2f} MB a 1,000 frames after frame 2,000, at most {peak:.0f} MB; time x {slower:.3f}; {lost} lost")
+    return int(growth > BAR_MB or slower > BAR_SLOWER)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
