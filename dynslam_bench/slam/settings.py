@@ -155,7 +155,7 @@ class KeyframeSettings(Settings):
         limits=(0.1, 1.0),
         meaning="a keyframe goes when this share of its points is seen by three others at the same scale or finer",
     )
-    maximum: int = Field(600, ge=10, le=100000, description="keyframes kept at most; bounds the memory")
+    maximum: int = Field(600, ge=10, le=100000, description="keyframes kept at most; bounds memory and searches")
     depth_images: int = Field(8, ge=0, le=1000, description="newest keyframes that keep their depth image, for filters")
 
 

@@ -289,6 +289,20 @@ def test_the_number_of_keyframes_is_bounded(room, tracked):
     assert errors(results, truth).max() < 0.03
 
 
+def test_where_there_are_too_many_keyframes_those_around_the_camera_stay(room):
+    """They overlap most: once they were the first to go, and the local error grew tenfold on long ways."""
+    most = 16
+    backend = make(room, keyframes__maximum=most, keyframes__tracked_share=1.0, keyframes__redundant_share=1.0)
+    made = []
+    for index, pose in enumerate(room.path(240)):
+        frame = room.see(pose, index)
+        found = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
+        made += [index] if found.keyframe else []
+        kept = backend.world.kf_frame[backend.world.keyframes].tolist()
+        assert len(kept) == min(len(made), most) and kept[-4:] == made[-4:] and kept[0] == 0
+    assert len(made) > 2 * most
+
+
 def test_a_repeated_stamp_is_no_error(room, tracked):
     truth = room.path(10)
     frames = [room.see(pose, i, stamp=min(i, 5) / 30.0) for i, pose in enumerate(truth)]

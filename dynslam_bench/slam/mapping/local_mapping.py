@@ -23,6 +23,8 @@ Slots = NDArray[np.int64]
 
 TENDER = 3
 """So many keyframes after its own a point may still go because it is seldom found."""
+RECENT = 4
+"""Of as many keyframes as may be kept, the newest that stay: one in so many."""
 
 
 class LocalMapper:
@@ -223,14 +225,27 @@ class LocalMapper:
             total, redundant = world.redundancy(other, self.close_m)
             if total and redundant > s.redundant_share * total:
                 self.drop_keyframe(other)
-        while world.keyframe_count > s.maximum:  # of an island one stays: its frames hang on it
+        while world.keyframe_count > s.maximum:
             shares = []
-            kept = world.keyframes[1:-2]
-            alone = np.bincount(world.kf_island[world.keyframes])[world.kf_island[kept]] < 2
-            for other in kept[~alone].tolist():
+            for other in self._far(slot).tolist():
                 total, redundant = world.redundancy(other, self.close_m)
                 shares.append((-redundant / max(total, 1), int(world.kf_id[other]), other))
+            if not shares:
+                break
             self.drop_keyframe(min(shares)[2])
+
+    def _far(self, slot: int) -> Slots:
+        """Keyframes that may go where there are too many: of an island one stays, its frames hang on it.
+
+        The newest and those around the camera are what tracking lives on, and overlap most: they stay if others can go.
+        """
+        world = self.world
+        kept = world.keyframes[1:-2]
+        kept = kept[np.bincount(world.kf_island[world.keyframes])[world.kf_island[kept]] > 1]
+        near, _ = world.covisible(slot)
+        older = kept[world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT]
+        far = older[~np.isin(older, near)]
+        return next((each for each in (far, older, kept) if len(each)), kept)
 
     def drop_keyframe(self, slot: int) -> None:
         """Remove a keyframe; the heirs of its frames are told through `dropped`."""
