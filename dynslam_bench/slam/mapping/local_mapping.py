@@ -25,6 +25,8 @@ TENDER = 3
 """So many keyframes after its own a point may still go because it is seldom found."""
 RECENT = 4
 """Of as many keyframes as may be kept, the newest that stay: one in so many."""
+COMPARED = 64
+"""Keyframes of which the most redundant one goes where there are too many; others are compared the next time."""
 
 
 class LocalMapper:
@@ -245,7 +247,8 @@ class LocalMapper:
         near, _ = world.covisible(slot)
         older = kept[world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT]
         far = older[~np.isin(older, near)]
-        return next((each for each in (far, older, kept) if len(each)), kept)
+        some = next((each for each in (far, older, kept) if len(each)), kept)
+        return np.roll(some, -COMPARED * world.next_keyframe)[:COMPARED]
 
     def drop_keyframe(self, slot: int) -> None:
         """Remove a keyframe; the heirs of its frames are told through `dropped`."""
