@@ -127,7 +127,7 @@ class RgbdBackend:
         begin = perf_counter()
         seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
         found = self._localise(frame, seen) if self.world.next_keyframe else self._initialise(frame, seen)
-        self.world.space.rest()
+        self.world.rest()
         tracking = perf_counter() - begin - sum(found.timings.values())
         stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
         return replace(found, timings={**stages, **found.timings})

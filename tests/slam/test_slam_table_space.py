@@ -55,6 +55,12 @@ def test_what_rests_leaves_the_memory_and_comes_back():
     assert abs(resident() - full) < 4_000_000
     space.rest("a")
     assert full - resident() > 12_000_000
+    table[:] = 1.0
+    space.rest("a", rows=250_000)
+    assert 6_000_000 < full - resident() < 10_000_000, "the first half"
+    space.rest("a", rows=-5)
+    space.rest("a", rows=10**9)
+    assert full - resident() > 12_000_000
     assert table.sum() == 2_000_000
 
 

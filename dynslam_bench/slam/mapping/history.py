@@ -17,6 +17,10 @@ from .table_space import TableSpace
 
 Array = NDArray[np.float64]
 
+TABLES = ("_stamp", "_reference", "_relative", "_information")
+RESTS = 64
+"""After so many frames those before them may leave the memory."""
+
 
 class History:
     """Frames with stamp, reference keyframe and pose relative to it; grows by doubling.
@@ -36,8 +40,10 @@ class History:
     def append(self, stamp: float, reference: int, T_cam_ref: Array, information: Array) -> None:
         """Note a tracked frame: stamp, reference keyframe's slot, ``T_cam_ref`` and the information of the pose."""
         if self.count == len(self._stamp):
-            for name in ("_stamp", "_reference", "_relative", "_information"):
+            for name in TABLES:
                 setattr(self, name, self._space.grown(f"history{name}", getattr(self, name), 2 * self.count))
+        if self.count % RESTS == 0:
+            self._space.rest(*(f"history{name}" for name in TABLES))
         self._stamp[self.count] = stamp
         self._reference[self.count] = reference
         self._relative[self.count] = T_cam_ref

@@ -24,6 +24,10 @@ Slots = NDArray[np.int64]
 
 FEWEST_ROOM = 4
 """Observations that find room when a point has its first one."""
+REUSED = 1 << 15
+"""Slots of points, the newest, that are used again: what is mapped together lies together, and rests together."""
+NEWEST_OBSERVATIONS = 1 << 18
+"""Observations, the newest, that stay in memory, as the newest points do: 2 MB."""
 
 
 class Map:
@@ -323,8 +327,16 @@ class Map:
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nobody holds them any more."""
-        self._free_points.extend(sorted(self._freed_points, reverse=True))
+        newest = self._top - REUSED
+        self._free_points = [slot for slot in self._free_points if slot >= newest]
+        self._free_points.extend(sorted((slot for slot in self._freed_points if slot >= newest), reverse=True))
         self._freed_points.clear()
+
+    def rest(self) -> None:
+        """Let what is not in use leave the memory; points and observations only where they are not the newest."""
+        self.space.rest(*self._KEYFRAME_TABLES)
+        self.space.rest(*self._POINT_TABLES, rows=self._top - REUSED)
+        self.space.rest("obs_kf", "obs_ft", rows=self._observations - NEWEST_OBSERVATIONS)
 
     @property
     def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:

@@ -37,6 +37,7 @@ class TableSpace:
     def __init__(self, in_memory_bytes: int = IN_MEMORY_BYTES) -> None:
         self._most = in_memory_bytes
         self._bytes: dict[str, int] = {}
+        self._row_bytes: dict[str, int] = {}
         self._files: dict[str, tuple[IO[bytes], mmap.mmap]] = {}
 
     def __reduce__(self) -> tuple[type[TableSpace], tuple[int]]:
@@ -60,6 +61,7 @@ class TableSpace:
         shape = list(table.shape)
         shape[axis] = length
         size = self._bytes[name] = math.prod(shape) * table.itemsize
+        self._row_bytes[name] = math.prod(shape[1:]) * table.itemsize
         former = self._files.pop(name, None)
         if former is not None and axis == 0:
             longer = self._in_file(name, size, former[0])
@@ -71,12 +73,20 @@ class TableSpace:
         bigger[tuple(slice(0, n) for n in table.shape)] = table
         return bigger
 
-    def rest(self, *names: str) -> None:
-        """Let go of the pages of these tables, or of all that lie in files; what is needed comes back by itself."""
-        if hasattr(mmap, "MADV_DONTNEED"):
-            for name in names or self._files:
-                if name in self._files:
-                    self._files[name][1].madvise(mmap.MADV_DONTNEED)
+    def rest(self, *names: str, rows: int | None = None) -> None:
+        """Let go of pages of tables that lie in files; what is needed comes back by itself.
+
+        Args:
+            names: Which tables; none for all.
+            rows: How many rows of each, from the first one on; None for all.
+        """
+        for name in names or self._files:
+            if name in self._files:
+                mapped = self._files[name][1]
+                size = len(mapped) if rows is None else min(max(rows, 0) * self._row_bytes[name], len(mapped))
+                size -= size % mmap.PAGESIZE if rows is not None else 0
+                if size and hasattr(mmap, "MADV_DONTNEED"):
+                    mapped.madvise(mmap.MADV_DONTNEED, 0, size)
 
     def _in_file(self, name: str, size: int, file: IO[bytes] | None = None) -> NDArray[np.uint8] | None:
         """A file's bytes, as many as asked for, behind what it has zeros; None where there is no room for it."""
