@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 class TableSpace:
     """Gives named tables room to grow.
 
+    A forked process shares the files: only one of the two may go on with the tables.
+
     Args:
         in_memory_bytes: What all of them together may take in memory.
     """
