@@ -214,3 +214,16 @@ def test_keyframes_without_depth_become_redundant_too(room, tracked):
     tracked(kept, frames)
     tracked(all_of_them, frames)
     assert kept.world.keyframe_count < all_of_them.world.keyframe_count
+
+
+def test_the_baseline_of_a_depth_sensor_that_is_not_used_changes_nothing(room, tracked):
+    """Neither do the settings of depth: some baselines, rounded, made all points of a keyframe too far to count."""
+    frames = [without_depth(room.see(pose, i)) for i, pose in enumerate(room.path(60))]
+    usual = make(room)
+    tracked(usual, frames)
+    for baseline_m in (0.06, 0.08, 40 / 525):
+        other = make(room)
+        other.reset(replace(room.camera, baseline_m=baseline_m), seed=0)
+        tracked(other, frames)
+        assert other.world.keyframe_count == usual.world.keyframe_count
+        assert np.array_equal(other.finalize().T_world_cam, usual.finalize().T_world_cam)

@@ -392,7 +392,7 @@ class Map:
 
         All points of a keyframe without any depth count as close.
         """
-        depth = self.kf_z if self.kf_z[slot].any() else np.full(self.kf_z.shape, close_m, np.float32)
-        keyframe = slot, int(self.kf_count[slot]), self.kf_point, self.kf_octave, depth, close_m
-        total, redundant = kernels.redundancy(*keyframe, *self._observed, others)
+        depth = self.kf_z[slot, : self.kf_count[slot]]
+        close = (depth > 0) & (depth <= close_m) if depth.any() else np.ones(len(depth), bool)
+        total, redundant = kernels.redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed, others)
         return int(total), int(redundant)

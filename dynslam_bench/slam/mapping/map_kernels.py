@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Slots = NDArray[np.int64]
 Table = NDArray[np.int32]
+Flags = NDArray[np.bool_]
 
 
 @kernel
@@ -212,14 +213,14 @@ def project(
 
 @kernel
 def redundancy(
-    keyframe: int, count: int, kf_point: Table, kf_octave: Any, kf_z: Any, close: float,
+    keyframe: int, close: Flags, kf_point: Table, kf_octave: Any,
     obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, others: int,
 ) -> tuple[int, int]:  # fmt: skip
     """How many close points the keyframe observes, and how many of them `others` keyframes see as well or finer."""
     total, redundant = 0, 0
-    for f in range(count):
+    for f in range(close.shape[0]):
         p = kf_point[keyframe, f]
-        if p < 0 or kf_z[keyframe, f] <= 0.0 or kf_z[keyframe, f] > close:
+        if p < 0 or not close[f]:
             continue
         total += 1
         if n_obs[p] <= others:
