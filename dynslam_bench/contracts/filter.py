@@ -84,12 +84,12 @@ class FilterState:
         previous: The previous frame, None on the first.
         previous_keep: bool, which keypoints of the previous frame were kept.
         T_world_prev: Pose of the previous frame, None if it was not tracked.
-        T_world_pred: Pose predicted for this frame by the motion model, None without one.
+        T_world_pred: Pose predicted for this frame by the motion model; None without one, and while the camera is lost.
         motion_covariance: Covariance ``[6, 6]`` of the predicted motion since the previous frame: position in the world
             (m), rotation in the camera's frame (rad); None where the motion model knows nothing.
         flow: Flow of this frame's keypoints *to the previous image* (raw pixels); None until the flow stage ran.
-        keyframes: The latest keyframes, newest first.
-        map_point: int64 ``[M]`` ids and float64 ``[M, 3]`` positions of local map points, or None.
+        keyframes: The latest keyframes of the map that the camera is in, newest first.
+        map_points: int64 ``[M]`` ids and float64 ``[M, 3]`` positions of that map's points, or None.
         seed: Seed of everything random a filter does on this frame.
     """
 

@@ -21,7 +21,8 @@ from .sequence import Frame, MaskSource
 class Tracker(Protocol):
     """A SLAM or odometry system that is fed one frame at a time.
 
-    Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last optimisation of the map),
+    Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last optimisation of the map; runs
+    ask once, at the end, `SlamEnv.final_trajectory` after any frame, and a tracker that cannot go on then says so),
     ``map_outputs() -> MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``),
     ``save_map(path, made_by)`` (the map as a file from which a later run may start) and ``close()``.
     """

@@ -125,6 +125,7 @@ class RgbdBackend:
         """
         assert self._ready, "reset() comes before track()"
         begin = perf_counter()
+        self.mapper.resume()
         seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
         found = self._localise(frame, seen) if self.world.next_keyframe else self._initialise(frame, seen)
         self.world.rest()
@@ -338,14 +339,14 @@ class RgbdBackend:
     # ------------------------------------------------------------------ what others may see
 
     def predict(self, timestamp: float) -> Array | None:
-        """The motion model's camera-to-world pose at a time; None when nothing is known yet.
+        """The motion model's camera-to-world pose at a time; None while lost, and when nothing is known yet.
 
-        While lost, and after a gap that nothing is assumed about, this is the last tracked pose.
+        After a gap that nothing is assumed about this is the last tracked pose.
 
         Args:
             timestamp: The stamp of the frame to come, seconds.
         """
-        if self._last is None:
+        if self._last is None or not self._tracked:
             return None
         regular = self.motion.regular(self._last, timestamp)
         return se3.inverse(self.motion.predicted(self._last, regular, self.settings.motion))
@@ -366,12 +367,12 @@ class RgbdBackend:
         return self.motion.covariance(self._last, regular, self.settings.motion)
 
     def keyframe_views(self, limit: int) -> tuple[KeyframeView, ...]:
-        """The newest keyframes, newest first, at most `limit`."""
-        return self._views.keyframes(limit)
+        """The newest keyframes of the map that the camera is in, newest first, at most `limit`."""
+        return self._views.keyframes(limit, self._island)
 
     def map_points(self) -> tuple[NDArray[np.int64], Array]:
-        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points."""
-        return self._views.points()
+        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all points of the map that the camera is in."""
+        return self._views.points(self._island)
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
@@ -393,7 +394,8 @@ class RgbdBackend:
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
 
-        With `bundle_adjustment.full` all of the map is refined first, unless the run only localises in it.
+        With `bundle_adjustment.full` all of the map is refined first, unless the run only localises in it; should
+        the run go on, that is taken back.
         """
         if self._grows and self.settings.bundle_adjustment.full:
             self.mapper.adjust_all()

@@ -278,10 +278,10 @@ class RelocalisationSettings(Settings):
     )
     new_map_after: int = Field(
         5,
-        ge=1,
+        ge=2,
         le=100000,
         description="with loop closing: so many frames in a row that show enough but are not recognised begin a map of "
-        "their own; its frames count as lost until a loop joins it to the first one",
+        "their own, the one that tracking ends with, which is not looked for elsewhere, included; its frames count as lost until a loop joins it to the first one",
     )
 
 

@@ -24,8 +24,8 @@ class MapViews:
     def __init__(self, world: Map) -> None:
         self._world = world
         self._depth_images: dict[int, NDArray[np.float32]] = {}
-        self._views: dict[int, tuple[KeyframeView, ...]] = {}
-        self._cloud: tuple[NDArray[np.int64], Array] | None = None
+        self._views: dict[tuple[int, int], tuple[KeyframeView, ...]] = {}
+        self._clouds: dict[int, tuple[NDArray[np.int64], Array]] = {}
 
     def renew(self, slot: int, depth: NDArray[np.float32], dropped: list[int], depth_images: int) -> None:
         """A keyframe was made.
@@ -37,26 +37,27 @@ class MapViews:
             depth_images: How many of the newest keyframes keep their depth image.
         """
         self._views.clear()
-        self._cloud = None
+        self._clouds.clear()
         for gone in dropped:
             self._depth_images.pop(gone, None)
         self._depth_images[slot] = depth
         for old in self._world.keyframes[: -depth_images or None].tolist():
             self._depth_images.pop(old, None)
 
-    def keyframes(self, limit: int) -> tuple[KeyframeView, ...]:
-        """The newest keyframes, newest first, at most `limit`."""
-        if limit not in self._views:
-            newest = self._world.keyframes[::-1][: max(limit, 0)].tolist()
-            self._views[limit] = tuple(self._keyframe(slot) for slot in newest)
-        return self._views[limit]
+    def keyframes(self, limit: int, island: int) -> tuple[KeyframeView, ...]:
+        """The newest keyframes of an island, newest first, at most `limit`: where others lie is unknown there."""
+        if (limit, island) not in self._views:
+            newest = self._world.island(island)[::-1][: max(limit, 0)].tolist()
+            self._views[limit, island] = tuple(self._keyframe(slot) for slot in newest)
+        return self._views[limit, island]
 
-    def points(self) -> tuple[NDArray[np.int64], Array]:
-        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points."""
-        if self._cloud is None:
-            points = self._world.points
-            self._cloud = self._world.id[points], self._world.position[points]
-        return self._cloud
+    def points(self, island: int) -> tuple[NDArray[np.int64], Array]:
+        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points of an island."""
+        if island not in self._clouds:
+            world, points = self._world, self._world.points
+            points = points[world.kf_island[world.obs_kf[world.obs_at[points]]] == island]
+            self._clouds[island] = world.id[points], world.position[points]
+        return self._clouds[island]
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""

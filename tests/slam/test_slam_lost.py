@@ -147,6 +147,26 @@ def test_maps_that_never_meet_stay_apart():
     assert (states[25:] == "lost").all() and {record.map for record in without.outputs().keyframes} == {0}
 
 
+def test_filters_see_the_map_that_the_camera_is_in_alone():
+    """A prediction on an island, of keyframes of the first map, would be of places that have nothing to do with it."""
+    way = [*range(25), *[None] * 20, *range(60, 90)]
+    backend, _, _ = drive(RingWorld(), way, **{"loop_closing.enabled": True})
+    ids, _ = backend.map_points()
+    views = backend.keyframe_views(100)
+    assert views and all(view.timestamp > 2.4 for view in views), "those of the first map were made before"
+    world = backend.world
+    held = world.kf_point[world.island(1)]
+    assert set(ids.tolist()) == set(world.id[np.unique(held[held >= 0])].tolist())
+    assert 0 < len(ids) < world.point_count and backend.predict(8.0) is not None
+
+
+def test_a_lost_camera_predicts_nothing():
+    """Filters would judge what it sees by a pose that is known to be wrong, and hide the place from recognition."""
+    backend, states, _ = drive(RingWorld(), [*range(25), None])
+    assert states[-1] == "lost" and backend.predict(2.6) is None and backend.motion_covariance(2.6) is None
+    assert drive(RingWorld(), [*range(25)])[0].predict(2.5) is not None
+
+
 def test_an_island_lies_where_the_camera_can_have_got():
     islands, moved = Islands(), np.eye(4)
     first = islands.begin(0, np.array([1.0, 0.0, 0.0]), 2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.features.matching import CellGrid, search_in_radius
 from dynslam_bench.geometry import se3
 
-from ..bundle.schur import adjust_bundle
+from ..bundle.schur import BundleResult, adjust_bundle
 from ..localisation.observation import Observations
 from ..settings import BackendSettings
 from .bundles import Bundle, around, whole
@@ -44,6 +45,7 @@ class LocalMapper:
         """Points that the last `insert` replaced by others."""
         self.dropped: list[tuple[int, int, Array]] = []
         """Keyframes that the last `insert` removed: slot, heir's slot, and the pose ``T_dropped_heir``."""
+        self._unrefined: tuple[Slots, Array, Slots, dict[str, NDArray[Any]]] | None = None
         points = world.points
         self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < TENDER]
 
@@ -195,25 +197,51 @@ class LocalMapper:
         self._refine(around(self.world, slot, settings), settings.iterations)
 
     def adjust_all(self) -> None:
-        """Refine all keyframes but the oldest, and all points."""
-        self._refine(whole(self.world), self.settings.bundle_adjustment.full_iterations)
+        """Refine all keyframes but the oldest, and all points, as the end of a run; `resume` takes it back."""
+        if self._unrefined is not None:
+            return
+        world, keyframes, points = self.world, self.world.keyframes, self.world.points
+        tables = {name: getattr(world, name)[points] for name in ("position", "normal", "far", "words")}
+        self._unrefined = keyframes, world.kf_pose[keyframes], points, tables
+        if self._solve(whole(world), self.settings.bundle_adjustment.full_iterations) is not None:
+            world.refresh(points)
+
+    def resume(self) -> None:
+        """The run goes on: the map is again what it was before `adjust_all`."""
+        if self._unrefined is None:
+            return
+        keyframes, poses, points, tables = self._unrefined
+        self._unrefined = None
+        for slot, pose in zip(keyframes.tolist(), poses, strict=True):
+            self.world.set_pose(slot, pose)
+        for name, values in tables.items():
+            getattr(self.world, name)[points] = values
 
     def _refine(self, chosen: Bundle | None, iterations: int) -> None:
-        if chosen is None:
+        """Refine poses and points, and forget the observations that do not fit then."""
+        result = self._solve(chosen, iterations)
+        if chosen is None or result is None:
             return
+        world, problem, points = self.world, chosen.problem, chosen.points
+        out = ~result.inliers
+        world.unobserve(chosen.poses[problem.obs_pose[out]], chosen.features[out])
+        world.refresh(points[world.alive[points]])
+
+    def _solve(self, chosen: Bundle | None, iterations: int) -> BundleResult | None:
+        """Put refined poses and points into the map; None if there are none."""
+        if chosen is None:
+            return None
         world, problem, poses, points = self.world, chosen.problem, chosen.poses, chosen.points
         solver = adjust_bundle
         if self.settings.bundle_adjustment.solver == "gtsam":
             from ..bundle.with_gtsam import adjust_bundle_gtsam as solver
         result = solver(problem, iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
-            return
+            return None
         for k in range(problem.variable):
             world.set_pose(int(poses[k]), result.poses[k])
         world.position[points] = result.points
-        out = ~result.inliers
-        world.unobserve(poses[problem.obs_pose[out]], chosen.features[out])
-        world.refresh(points[world.alive[points]])
+        return result
 
     # ------------------------------------------------------------------ keyframes
 

@@ -24,6 +24,7 @@ class Worker:
         self._slam: Any = None
         self._monocular = False
         self._tracked: list[float] = []
+        self._final: list[list[float]] | None = None
 
     def reset(self, request: dict[str, Any]) -> None:
         """Load the vocabulary and start ORB-SLAM3's threads."""
@@ -37,10 +38,13 @@ class Worker:
         options = request["options"]
         self._monocular = options["sensor"] == "MONOCULAR"
         sensor = getattr(pyorbslam3.Sensor, options["sensor"])
+        self._tracked, self._final = [], None
         self._slam = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], sensor)
 
     def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
         """One frame; without depth in monocular mode."""
+        if self._final is not None:
+            raise RuntimeError("finalize() has stopped ORB-SLAM3's threads: only reset() begins anew")
         start = time.perf_counter()
         image = np.ascontiguousarray(rgb)
         if self._monocular:
@@ -67,6 +71,8 @@ class Worker:
 
         Its file also holds predicted poses of lost frames, and repeats a stamp where a frame had no pose at all.
         """
+        if self._final is not None:
+            return self._final
         self._slam.shutdown()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "final.txt"
@@ -78,7 +84,8 @@ class Worker:
             stamp = own.get(f"{row[0]:.6f}")
             if stamp is not None:
                 poses.setdefault(stamp, [stamp, *row[1:]])
-        return [poses[stamp] for stamp in sorted(poses)]
+        self._final = [poses[stamp] for stamp in sorted(poses)]
+        return self._final
 
 
 def main() -> None:
