@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.frames import tracked_frames
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 
@@ -16,7 +17,6 @@ from dynslam_bench.geometry.trajectory import Trajectory
 def episode_metrics(
     protocol: Protocol,
     trajectory: Trajectory,
-    tracked: int,
     timestamps: NDArray[np.float64],
     ground_truth: Trajectory | None,
 ) -> dict[str, float]:
@@ -24,8 +24,7 @@ def episode_metrics(
 
     Args:
         protocol: How to evaluate.
-        trajectory: Poses of the tracked frames, online or final.
-        tracked: How many frames were tracked when they came.
+        trajectory: Poses of the tracked frames, online or final: coverage is that of what is scored.
         timestamps: Stamps in seconds of all frames that were due, tracked or not.
         ground_truth: True poses; None leaves only the coverage and the counts.
 
@@ -34,6 +33,10 @@ def episode_metrics(
         missing if there is no ground truth or the protocol finds nothing to evaluate.
     """
     frames = len(timestamps)
+    try:
+        tracked = int(tracked_frames(trajectory, timestamps).sum())
+    except EvaluationError:  # a final trajectory whose poses are of no frame
+        tracked = 0
     counts = {
         "coverage": tracked / frames if frames else 0.0,
         "frames": float(frames),

@@ -97,7 +97,7 @@ def stats_observation(frame: Frame, result: TrackResult, context: ObservationCon
         motion = np.tanh(se3.log(context.T_prev_cur) / 0.1)
     gray = frame.rgb[::4, ::4].mean(axis=2, dtype=np.float32)
     depth = frame.depth[::4, ::4]
-    valid = depth[depth > 0]
+    valid = depth[(depth > 0) & np.isfinite(depth)]
     values = [
         float(result.state == "initialising"),
         float(result.state == "ok"),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.checks import check_sensors, check_trajectory
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
-from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Settings, apply_overrides
@@ -42,7 +42,7 @@ from .observation import (
 )
 from .one_frame import FrameTransform, track_one
 from .reward import RewardKind, reward_named
-from .source import Frames, open_frames, preprocessing_of
+from .source import Frames, check_frames, check_same_size, open_frames, preprocessing_of
 
 Array = NDArray[np.float64]
 
@@ -210,20 +210,20 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             options: ``sequence`` and ``settings`` replace those of the constructor from this episode on.
 
         Raises:
-            DynslamError: Unknown option, or a new sequence whose images do not fit the observation space.
+            DynslamError: Unknown option, or a new sequence whose images do not fit the observation space; settings and
+                sequence stay as they were, and no episode runs.
             TrackerError: The tracker cannot be built or broke its contract.
         """
         super().reset(seed=seed)
+        self.episode = Episode()
         self._apply_options(options or {})
         tracker = self._ready_tracker()
         if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
             tracker.configure(self.settings)  # type: ignore[attr-defined]
         tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
-        self.episode = Episode()
         self._errors = OnlineError(
             self.sequence.ground_truth if self.tracker_spec.metric else None, self.protocol.max_dt
         )
-        self._final = None
         self._canvas = None
         self._track_next(tracker)
         return self._observe(), frame_info(self.episode.outcomes[-1])
@@ -284,7 +284,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         trajectory = final if final is not None else self.online_trajectory()
         due = self.sequence.timestamps if self.episode.over else self.sequence.timestamps[: self.episode.next_index]
         truth = self.sequence.ground_truth if self.tracker_spec.metric or self.protocol.finds_scale else None
-        return episode_metrics(self.protocol, trajectory, self.episode.tracked, due, truth)
+        return episode_metrics(self.protocol, trajectory, due, truth)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The current frame with its features and masks beside the trajectory, uint8 ``[H, W, 3]``."""
@@ -316,6 +316,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                     f"tracker '{self.tracker_spec.id}' takes {self.tracker_spec.settings.__name__}, "
                     f"not {type(settings).__name__}"
                 )
+            settings.verify()
             self.settings: Settings = settings
         else:
             self.settings = resolve_settings(self.tracker_spec, settings)
@@ -323,8 +324,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
         opened = self._open(sequence)
-        if len(opened) < 2:
-            raise SequenceError(f"'{opened.id}' has {len(opened)} frames here, an episode needs 2 or more")
+        check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)
         self.sequence = opened
@@ -334,22 +334,21 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         unknown = sorted(set(options) - {"sequence", "settings"})
         if unknown:
             raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
-        if "settings" in options:
-            changes = options["settings"]
-            before_settings = preprocessing_of(self.settings)
-            complete = isinstance(changes, Settings)
-            self._use_settings(changes if complete else apply_overrides(self.settings, changes or {}))
-            if preprocessing_of(self.settings) != before_settings:
-                options = {"sequence": self._source, **options}
-        if "sequence" in options:
-            before = self.sequence
-            self._use_sequence(options["sequence"])
-            old, new = before.camera, self.sequence.camera
-            if self._observation == "rgbd" and (old.width, old.height) != (new.width, new.height):
-                self.sequence = before
-                raise SequenceError(
-                    f"images of {new.width}x{new.height} do not fit the observation space of {old.width}x{old.height}"
-                )
+        before = self.settings, self._actions, self.sequence, self._source
+        try:
+            if "settings" in options:
+                changes = options["settings"]
+                complete = isinstance(changes, Settings)
+                self._use_settings(changes if complete else apply_overrides(self.settings, changes or {}))
+                if preprocessing_of(self.settings) != preprocessing_of(before[0]):
+                    options = {"sequence": self._source, **options}
+            if "sequence" in options:
+                self._use_sequence(options["sequence"])
+                if self._observation == "rgbd":
+                    check_same_size(before[2].camera, self.sequence.camera)
+        except DynslamError:
+            self.settings, self._actions, self.sequence, self._source = before
+            raise
 
     def _ready_tracker(self) -> Tracker:
         """The tracker for the current settings and sequence; built anew only if one of them changed."""
@@ -382,6 +381,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _track_next(self, tracker: Tracker) -> None:
         index = self.episode.next_index
+        self._final = None
         done = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
         frame, result = self.frame, self.result = done.frame, done.result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
@@ -395,6 +395,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         here = outcomes[-1].T_world_cam
         before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
         motion = se3.inverse(before) @ here if here is not None and before is not None else None
-        context = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
         make = stats_observation if self._observation == "stats" else rgbd_observation
-        return make(self.frame, self.result, context)
+        seen = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
+        return make(self.frame, self.result, seen)

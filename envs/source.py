@@ -6,9 +6,12 @@ from collections.abc import Sequence as PySequence
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.view import SequenceView
@@ -47,6 +50,25 @@ def open_frames(
     return cast("Sequence", SequenceView(sequence, start, stop, stride))
 
 
+def check_frames(sequence: Sequence) -> None:
+    """Refuse a sequence that is too short for an episode, or whose stamps tell no frame from another.
+
+    Raises:
+        SequenceError: It has fewer than two frames, or stamps that do not increase.
+    """
+    if len(sequence) < 2:
+        raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
+    stamps = np.asarray(sequence.timestamps, dtype=np.float64)
+    wrong = np.flatnonzero(~(np.diff(stamps) > 0))
+    if len(wrong):
+        at = int(wrong[0]) + 1
+        raise SequenceError(
+            f"'{sequence.id}' has {len(wrong)} of {len(stamps)} stamps that are not later than the one before, first "
+            f"that of frame {at}: {stamps[at]} after {stamps[at - 1]} s",
+            "each frame has a stamp of its own, in seconds, ascending",
+        )
+
+
 def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
     """The group ``preprocessing`` of a tracker's settings; None for trackers without one."""
     found = getattr(settings, "preprocessing", None)
@@ -57,3 +79,15 @@ def _pair(frames: PySequence[int | None]) -> tuple[int, int | None]:
     if len(frames) != 2:
         raise SequenceError(f"frames {list(frames)} has {len(frames)} entries", "give (start, stop)")
     return int(frames[0] or 0), frames[1]
+
+
+def check_same_size(old: Camera, new: Camera) -> None:
+    """Refuse images that do not fit an observation space.
+
+    Raises:
+        SequenceError: Carries both sizes.
+    """
+    if (old.width, old.height) != (new.width, new.height):
+        raise SequenceError(
+            f"images of {new.width}x{new.height} do not fit the observation space of {old.width}x{old.height}"
+        )

@@ -57,6 +57,8 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
     columns = [(title, [row[name] for row in rows]) for name, title in names.items()]
     write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
+    if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
+        write("ATE: of the tracked frames alone; not moving: of all. A report counts a lost frame as not having moved.")
 
 
 def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> None:

@@ -22,7 +22,7 @@ app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_he
 
 @app.command("list")
 def list_(
-    pattern: Annotated[str, typer.Argument(help="Which, e.g. 'tum/fr3/*'.")] = "*",
+    pattern: Annotated[str, typer.Argument(help="Which, e.g. tum/fr3 or 'tum/fr3/*xyz'.")] = "*",
     tag: Annotated[Optional[str], typer.Option(help="Only static, low-dynamic or high-dynamic ones.")] = None,  # noqa: UP045
     here: Annotated[bool, typer.Option("--here", help="Only those on this machine.")] = False,
     data_root: DataRoot = None,
@@ -37,6 +37,9 @@ def list_(
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
     if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
+        asked, pattern = pattern, f"{pattern.rstrip('/')}/*"  # a whole folder
+    if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
+        pattern = asked
         raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, [each.id for each in everything]))
     found = [
         each

@@ -22,6 +22,8 @@ from .sequence import Frame, Sequence
 from .tracker import TrackerSpec
 
 STATES = get_args(TrackingState)
+FARTHEST_M = 1e9
+"""No camera is so far from where its world begins, not even in coordinates of the Earth: a solver diverged."""
 
 
 class TrackerContractError(TrackerError):
@@ -138,6 +140,8 @@ def _pose_faults(pose: object) -> Iterator[Fault]:
     elif not np.isfinite(pose).all():
         bad = int(np.count_nonzero(~np.isfinite(pose)))
         yield Fault(f"a pose with {bad} values that are not finite", "a solver diverged; say 'lost' instead")
+    elif (far := float(np.abs(pose).max())) > FARTHEST_M:
+        yield Fault(f"a pose {far:.3g} m away", "a solver diverged; say 'lost' instead")
     elif not se3.is_pose(pose):
         rotation = pose[:3, :3]
         off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())

@@ -26,7 +26,7 @@ from .process.supervise import Verdict, supervise
 from .spec import RunSpec, place_of
 from .start_map import check_unchanged
 from .storage.frames import FrameLog
-from .storage.record import RunRecord, SequenceInfo, Status, TrackerInfo
+from .storage.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
 from .storage.scoring import DEFAULT_PROTOCOL
 from .storage.store import RunStore
 
@@ -34,9 +34,8 @@ WORK = "dynslam_bench.runs.loop:run_loop"
 """What the child does."""
 PROGRESS_EVERY = 50
 CACHED_TIMES = "times of features and masks are those of the stage cache's entries, not of this run"
-LOST_COVERAGE = 0.5
 LOST_AT_END = 10
-"""A run whose coverage is below the first, or that is lost on so many frames at its end, has status ``lost``."""
+"""A run whose coverage is below `LOST_COVERAGE`, or that is lost on so many frames at its end, has status ``lost``."""
 
 OnProgress = Callable[[str, dict[str, Any]], bool]
 """Called as ``on_progress(run_id, partial)`` every `PROGRESS_EVERY` frames; returning False stops the run.

@@ -281,7 +281,8 @@ class RelocalisationSettings(Settings):
         ge=2,
         le=100000,
         description="with loop closing: so many frames in a row that show enough but are not recognised begin a map of "
-        "their own, the one that tracking ends with, which is not looked for elsewhere, included; its frames count as lost until a loop joins it to the first one",
+        "their own; the one that tracking ends with counts, and is not looked for elsewhere; the map's frames count as "
+        "lost until a loop joins it to the first one",
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..model.board import Board
-from ..tables.paper import STATISTICS, averages
+from ..tables.paper import LOST_MARK, STATISTICS, averages, has_lost
 from .style import Figure, axis, colours, layout_of, rounded, safe, wrapped
 
 FIGURES = {"mean": 9, "median": 10, "rmse": 11, "std": 12}
@@ -25,6 +25,9 @@ def bar_figure(board: Board, statistic: str) -> Figure | None:
             "name": wrapped(board.labels[key]),
             "x": [safe(board.short[name]) for name in values],
             "y": rounded([1000 * value for value in values.values()]),
+            "text": [LOST_MARK * has_lost(board.cells[key].get(name)) for name in values],
+            "textposition": "outside",
+            "cliponaxis": False,
             "marker": {"color": palette[key], "opacity": 1.0 if key in board.ranked else 0.45},
             "hovertemplate": "%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
         }

@@ -6,7 +6,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..figures.paper import FIGURES, bar_figure
 from ..model.board import Board
-from ..tables.paper import STATISTICS, absolute_table, relative_table, time_table
+from ..tables.paper import LOST_MARK, LOST_NOTE, STATISTICS, absolute_table, relative_table, time_table
 from .draft import Draft
 from .page import Section
 
@@ -19,9 +19,10 @@ def add_paper(draft: Draft, board: Board, protocol: Protocol) -> None:
     for statistic, number in FIGURES.items():
         figure = bar_figure(board, statistic)
         if figure is not None:
+            lost = any(LOST_MARK in trace["text"] for trace in figure["data"])
             caption = (
                 f"As the paper's Figure {number}: {STATISTICS[statistic]} of the absolute pose error, median over the "
-                "runs that succeeded; pale bars are not ranked."
+                "runs that succeeded; pale bars are not ranked." + f" {LOST_NOTE}" * lost
             )
             section.blocks.append(draft.figure(f"paper-{statistic}", figure, caption))
     draft.add(section)

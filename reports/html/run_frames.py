@@ -79,7 +79,8 @@ def read_frames(runs: Sequence[LoadedRun], exact: Mapping[int, float]) -> Iterat
 
 
 def exact_shares(runs: Sequence[LoadedRun]) -> dict[int, float]:
-    """Frame (before the offset) to its exact share of dynamic pixels, from one of the first runs that knows it."""
+    """Frame (before the offset) to its exact share of dynamic pixels, from those of the first runs that know it."""
+    shares: dict[int, float] = {}
     asked = runs[:_ASKED]
     paths = [run.store.folder(run.row.run_id) / CSV_FILE for run in asked]
     for run, columns in zip(asked, read_tables(paths, {"index", "dynamic_share"}.__contains__), strict=True):
@@ -88,8 +89,8 @@ def exact_shares(runs: Sequence[LoadedRun]) -> dict[int, float]:
         known = np.isfinite(columns["dynamic_share"])
         if known.any():
             indices = (columns["index"][known] + run.row.offset).tolist()
-            return dict(zip(indices, columns["dynamic_share"][known].tolist(), strict=True))
-    return {}
+            shares |= dict(zip(indices, columns["dynamic_share"][known].tolist(), strict=True))
+    return shares
 
 
 def read_tables(paths: Sequence[Path], wanted: Callable[[str], bool]) -> Iterator[Columns | RunError | None]:

@@ -100,6 +100,16 @@ class Board:
         """Any row of a tracker, for what all its rows share."""
         return self._by_key[key][0]
 
+    def no_better_than_still(self, key: str, sequence: str) -> bool:
+        """Whether a tracker that ended well there has, by its median, the error of a camera that never moves, or more.
+
+        Controls make no claim: never.
+        """
+        cell, still = self.cells[key].get(sequence), self.never_move.get(sequence)
+        if cell is None or cell.median is None or still is None or not cell.success:
+            return False
+        return cell.median >= (1 - 1e-9) * still and self.first(key).provenance != "control"
+
     def ranked_order(self) -> list[str]:
         """Ranked trackers from the best to the worst."""
         return [key for key in self.trackers if key in self.ranked]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.storage.record import MetricRecord, RunRecord
+from dynslam_bench.runs.storage.record import LOST_COVERAGE, MetricRecord, RunRecord, Status
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
 from dynslam_bench.segmentation.training_set import seen_in_training
@@ -25,7 +28,7 @@ from .row_values import (
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     """The row of one stored run."""
     scored = score(store, record, protocol)
-    which, failed, reason = _judge(record, scored, protocol)
+    which, status, failed, reason = _judge(record, scored, protocol)
     evaluation = scored.online if protocol.trajectory == "online" else scored.final
     alignment = None if evaluation is None else evaluation.alignment
     tracker, sequence = record.tracker, record.sequence
@@ -53,7 +56,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         seed=record.seed,
         offset=record.offset,
         noise=sequence.noise,
-        status=record.status,
+        status=status,
         reason=reason,
         failed=failed,
         protocol_id=scored.protocol_id,
@@ -65,7 +68,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         held_ate_m=held_error(store, record, protocol, evaluation, still),
         never_move_m=still,
-        **{name: getattr(record, name) for name in ("n_frames", "n_processed", "n_tracked", "coverage")},
+        **_counts(record, scored.final if which == "final" else None),
         epipolar_skipped=record.epipolar_skipped,
         cached=bool(record.identity.get("cache")),
         frame_ms=None if record.frame_time_s is None else 1000 * record.frame_time_s,
@@ -82,15 +85,27 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     )
 
 
-def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple[Which, bool, str]:
-    """Whose errors a row holds, whether it counts as a failure, and why it is not ``ok``."""
+def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple[Which, Status, bool, str]:
+    """Whose errors a row holds, how the run ended, whether it counts as a failure, and why it is not ``ok``."""
     only_final = record.kind == "imported" and scored.online is None and scored.final is not None
     which: Which = "final" if only_final else protocol.trajectory
     evaluation = scored.online if protocol.trajectory == "online" else scored.final
     failed = record.failed or record.status == "lost"
     if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
-        return which, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
-    return which, failed, record.reason
+        return which, record.status, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
+    due = record.n_frames - record.n_dropped
+    if evaluation is not None and evaluation.n_tracked is not None and not failed:
+        if evaluation.n_tracked < LOST_COVERAGE * due:
+            return which, "lost", True, f"the {which} trajectory has poses of {evaluation.n_tracked} of {due} frames"
+    return which, record.status, failed, record.reason
+
+
+def _counts(record: RunRecord, final: Evaluation | None) -> dict[str, Any]:
+    """A row's numbers of frames; where the final trajectory is scored, those that it has poses of."""
+    counts = {name: getattr(record, name) for name in ("n_frames", "n_processed", "n_tracked", "coverage")}
+    if final is not None and final.n_tracked is not None and final.coverage is not None:
+        counts |= {"n_tracked": final.n_tracked, "coverage": final.coverage}
+    return counts
 
 
 def log_of(store: RunStore, run_id: str) -> str:

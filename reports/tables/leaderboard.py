@@ -108,6 +108,8 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "in the map of an earlier one, trackers that lack "
         "sequences or never succeeded.",
     ]
+    if still := _no_better_than_still(board):
+        parts.append(f"No better than a camera that never moves, although their runs ended: {still}.")
     if board.asked_reference and board.reference is None:
         parts.append(
             f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a camera that "
@@ -121,6 +123,16 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
         parts.append(f"{SEEN_NOTE} {rule} Instances 100-199 are held out.")
     return " ".join(parts)
+
+
+def _no_better_than_still(board: Board) -> str:
+    """Trackers with how many sequences they are no better on than a camera that never moves; empty if none is."""
+    counts = {key: sum(board.no_better_than_still(key, name) for name in board.sequences) for key in board.trackers}
+    return "; ".join(
+        f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
+        for key, count in counts.items()
+        if count
+    )
 
 
 def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[TableCell]:

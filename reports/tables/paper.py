@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
+from ..model.cell import Cell
 from ..model.row import SEEN, RunRow
 from .formats import mm
 from .metric import Value, column_marks, median_of
@@ -16,7 +17,7 @@ SUBJECT = "emfoa-oft"
 """Tracker whose improvement over the others is shown, where it was run."""
 STATISTICS = {"rmse": "RMSE", "mean": "mean", "median": "median", "std": "SD"}
 LOST_MARK = "¶"
-_LOST = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
+LOST_NOTE = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
 Found = Mapping[tuple[str, str], float]
 """Variant key and sequence to a number."""
 
@@ -99,7 +100,7 @@ def _statistics_table(
     lost = any(cell.text.endswith(LOST_MARK) for row in rows for cell in row)
     caption = (
         f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
-        + (f" {_LOST}" if lost else "")
+        + (f" {LOST_NOTE}" if lost else "")
         + (
             f" Below the line: by how many percent the error of {board.labels[str(subject)]} is smaller than that of "
             "the other tracker."
@@ -137,7 +138,7 @@ def _error_cells(
 ) -> Iterator[TableCell]:
     for name in board.sequences:
         cell = board.cells[key].get(name)
-        lost = cell is not None and any(row.coverage < 1 for row in cell.kept if not row.failed)
+        lost = has_lost(cell)
         for kind, values in found.items():
             number = values.get((key, name))
             if cell is not None and not cell.success:
@@ -148,6 +149,11 @@ def _error_cells(
                 mark = marks[kind].get((key, name), "")
                 seen = cell is not None and cell.seen
                 yield TableCell(mm(number) + SEEN * seen + LOST_MARK * lost, value=number, emphasis=mark)
+
+
+def has_lost(cell: Cell | None) -> bool:
+    """Whether frames were lost in a run that succeeded: the errors of the cell are of the tracked ones only."""
+    return cell is not None and any(row.coverage < 1 for row in cell.kept if not row.failed)
 
 
 def _improvement_row(board: Board, subject: str, other: str, found: Mapping[str, Found]) -> list[TableCell]:

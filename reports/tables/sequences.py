@@ -31,7 +31,7 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     for key in board.trackers:
         cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
         for name in board.sequences:
-            cells.append(_error_cell(board, board.cells[key].get(name), name, marks.get((key, name), ""), usual))
+            cells.append(_error_cell(board, key, name, marks.get((key, name), ""), usual))
         rows.append(cells)
     separators = board.separators() | {len(rows)}
     rows.append([TableCell(NEVER_MOVE), *(_never_cell(board, name) for name in board.sequences)])
@@ -151,7 +151,8 @@ def _rotation_doubt(cell: Cell) -> str:
     return f"unreliable: the alignment's rotation is known to ±{max(found):.0f}° only" if found else ""
 
 
-def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, usual: int) -> TableCell:
+def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
+    cell = board.cells[key].get(sequence)
     if cell is None or cell.median is None:
         return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
     coverage, link = 100 * float(np.mean([row.coverage for row in cell.rows])), run_link(cell.typical)
@@ -159,6 +160,8 @@ def _error_cell(board: Board, cell: Cell | None, sequence: str, mark: Emphasis, 
         tip = f"counts as {mm(cell.median)} mm, coverage {coverage:.1f} %"
         return TableCell(cell.ending, _count(cell, usual), emphasis="failed", tip=tip, link=link)
     notes = [_spread(cell), _count(cell, usual), skipped_words(cell)]
+    if board.no_better_than_still(key, sequence):
+        notes.append("no better than not moving")
     if cell.failed:
         notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
     small = ", ".join(filter(None, notes))

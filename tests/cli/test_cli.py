@@ -90,6 +90,10 @@ def test_sequences_list(cli):
     assert [line.split()[0] for line in lines[2:6]] == [
         f"tum/fr3/walking_{motion}" for motion in ("static", "xyz", "halfsphere", "rpy")
     ]
+    whole, starred = (cli("sequences", "list", pattern) for pattern in ("tum/fr3", "tum/fr3/*"))
+    assert whole == starred and whole[0] == 0, "a folder's name is all that lies in it"
+    code, _, err = cli("sequences", "list", "tum/fr9")
+    assert code == 1 and "no sequence matches 'tum/fr9' (did you mean" in one_line(err)
     _, out, _ = cli("sequences", "list", "--here", "--json")
     assert sorted(each["id"] for each in json.loads(out)) == sorted(SYNTHETIC_IDS)
 

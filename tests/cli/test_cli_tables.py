@@ -5,7 +5,7 @@ import json
 import pytest
 from cli_errors import one_line
 
-from dynslam_bench.cli import output
+from dynslam_bench.cli import output, run_rows
 from dynslam_bench.cli.output import fitted, write_table
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
 
@@ -50,6 +50,15 @@ def test_a_reports_table_has_no_markup(capsys):
     out = capsys.readouterr().out
     assert "\\" not in out and "x|y_*" in out and out.startswith("A_title\na_b\n")
     assert max(map(len, out.splitlines())) <= 120
+
+
+def test_an_error_of_the_tracked_frames_alone_is_said_to_be_one(capsys):
+    def shown(coverage):
+        row = dict.fromkeys((*run_rows.TITLES, *run_rows.WHERE_SAID), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
+        run_rows.show_rows([row], None, "p", as_json=False)
+        return capsys.readouterr().out
+
+    assert "of the tracked frames alone" in shown(0.5) and "tracked frames" not in shown(1.0)
 
 
 def test_report_prints_five_lines_and_its_place(cli, walk, tmp_path):

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from envs_toys import SPEC, STEP_M, TARGET, ToySequence, truth
+from envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker, truth
 
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv, TrackerContractError
 from dynslam_bench.evaluation.evaluate import evaluate
-from dynslam_bench.evaluation.protocol import MONOCULAR
+from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol, get_protocol
 from dynslam_bench.geometry import se3
 
 QUIET = {"noise.enabled": False}
@@ -253,3 +254,82 @@ def test_a_tracker_that_cannot_be_steered(toy_folder: str) -> None:
     env = SlamEnv(toy_folder, TARGET.replace(":SPEC", ":FIXED"), control=["noise.clip"])
     with pytest.raises(TrackerError, match="toy-fixed' cannot be steered in mid-episode"):
         env.reset()
+
+
+def test_the_final_trajectory_is_that_of_the_frames_so_far() -> None:
+    """Asking in mid-episode freezes nothing: the end's metrics are those of a run that was never asked."""
+    final = Protocol.model_validate(get_protocol("tum-rgbd/v1").model_dump() | {"id": "f/v1", "trajectory": "final"})
+    asked, quiet = (SlamEnv(ToySequence(12), TARGET, protocol=final) for _ in range(2))
+    for env in (asked, quiet):
+        env.reset(seed=1)
+    for index in range(1, 12):
+        for env in (asked, quiet):
+            env.step(env.neutral_action)
+        trajectory = asked.final_trajectory()
+        assert trajectory is not None and len(trajectory) == index + 1
+        assert asked.episode_metrics()["coverage"] == 1.0
+    assert asked.episode_metrics() == quiet.episode_metrics()
+
+
+def test_coverage_is_that_of_the_trajectory_that_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tracker that answers `finalize` with a few poses does not get the coverage of its online states."""
+    final = Protocol.model_validate(get_protocol("tum-rgbd/v1").model_dump() | {"id": "f/v1", "trajectory": "final"})
+    whole = ToyTracker.finalize
+    monkeypatch.setattr(ToyTracker, "finalize", lambda self: whole(self).select(slice(0, 4)))
+    spec = replace(SPEC, entry_point="envs_toys:ToyTracker")
+    for protocol, tracked in ((final, 4), (get_protocol("tum-rgbd/v1"), 12)):
+        _, infos, _ = play(SlamEnv(ToySequence(12), spec, protocol=protocol))
+        metrics = infos[-1]["episode_metrics"]
+        assert (metrics["tracked_frames"], metrics["coverage"]) == (tracked, tracked / 12)
+
+
+def test_a_reset_that_fails_ends_the_episode_and_changes_nothing() -> None:
+    env = SlamEnv(ToySequence(12), "emfoa-oft-no-masks")
+    env.reset(seed=0)
+    settings, sequence = env.settings, env.sequence
+    for options, words in (
+        ({"settings": {"backend.map.localisation_only": True}}, "needs a map"),
+        ({"settings": _only_localising(settings)}, "needs a map"),
+        ({"settings": {"epipolar.threshold_px": 1.25}, "sequence": "no/such"}, "no/such"),
+        ({"colour": 1}, "unknown reset option"),
+    ):
+        with pytest.raises(DynslamError, match=words):
+            env.reset(options=options)
+        assert (env.settings, env.sequence) == (settings, sequence)
+        with pytest.raises(DynslamError, match="before reset"):
+            env.step(env.neutral_action)
+    with pytest.raises(SettingsError, match="needs a map"):
+        SlamEnv(ToySequence(12), "emfoa-oft-no-masks", settings=_only_localising(settings))
+    env.reset(seed=0)
+    env.step(env.neutral_action)
+
+
+def _only_localising(settings: Any) -> Any:
+    """Complete settings that do not go together."""
+    start = settings.backend.map.model_copy(update={"localisation_only": True})
+    backend = settings.backend.model_copy(update={"map": start})
+    return settings.model_copy(update={"backend": backend})
+
+
+@pytest.mark.parametrize("stamps", [[0.0, 0.1, 0.1, 0.2], [0.0, 0.2, 0.1, 0.3], [0.0, 0.1, np.nan, 0.3]])
+def test_stamps_that_do_not_tell_frames_apart_are_refused_before_anything_runs(stamps: list[float]) -> None:
+    sequence = ToySequence(4)
+    sequence.timestamps = np.array(stamps)
+    with pytest.raises(SequenceError, match="stamps"):
+        SlamEnv(sequence, TARGET)
+
+
+def test_poses_out_of_this_world_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = ToyTracker.track
+
+    def far(self: ToyTracker, frame: Any) -> Any:
+        found = whole(self, frame)
+        found.T_world_cam[:3, 3] *= 1e200 if frame.index == 5 else 1.0
+        return found
+
+    monkeypatch.setattr(ToyTracker, "track", far)
+    env = SlamEnv(ToySequence(12), replace(SPEC, entry_point="envs_toys:ToyTracker"))
+    env.reset(seed=0)
+    with pytest.raises(TrackerContractError, match=r"frame 5 returned a pose 4\.99e"):
+        for _ in range(11):
+            env.step(env.neutral_action)

@@ -73,6 +73,7 @@ def add_run(
     duration_s=None,
     masks="",
     settings=None,
+    final_frames=None,
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -119,7 +120,9 @@ def add_run(
             (work / "trajectory_online.txt").write_text(format_tum(Trajectory(stamps[ok], poses[ok])))
         if final_error is not None:
             better = truth.T_world_cam[nearest] @ se3.exp(drift * final_error / error)
-            (work / "trajectory_final.txt").write_text(format_tum(Trajectory(stamps[ok], better[ok])))
+            (work / "trajectory_final.txt").write_text(
+                format_tum(Trajectory(stamps[ok], better[ok]).select(final_frames or slice(None)))
+            )
         (work / "log.txt").write_text("a log\n")
         store.publish(work, record)
     return run_id

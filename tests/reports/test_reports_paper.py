@@ -44,6 +44,8 @@ def test_four_statistics_and_improvements_are_those_of_the_evaluation(store):
     for label in ("ours", "ORB", "Loser"):
         assert [cell.value for cell in rows[label][4:]] == pytest.approx(metrics[label], rel=1e-6)
         assert rows[label][4].text.endswith(LOST_MARK) == (label == "Loser")
+    bars = {trace["name"]: trace["text"] for trace in bar_figure(board, "rmse")["data"]}
+    assert bars["Loser"] == [LOST_MARK] * 2 and bars["ours"] == ["", ""]
     gains = [cell.value for cell in rows["improvement on ORB"][4:]]
     assert gains == pytest.approx(100 * (1 - np.array(metrics["ours"]) / metrics["ORB"]), rel=1e-6)
     assert all(cell.emphasis == "failed" for cell in rows.get("Broken", [])) and "improvement on ours" not in rows

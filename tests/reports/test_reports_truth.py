@@ -11,6 +11,7 @@ from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
 from dynslam_bench.reports.html.explore_data import FrameSums, summarise
+from dynslam_bench.reports.html.run_frames import exact_shares
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
@@ -367,3 +368,39 @@ def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
     steady, follower = ([mm for mm, _ in sums.by_share(row(name).variant_key) if mm] for name in ("steady", "follower"))
     assert steady == [1.2]
     assert follower == [pytest.approx(np.sqrt(0.9 * 0.9**2 + 0.1 * 40.0**2), rel=1e-3)]
+
+
+def test_what_is_no_better_than_not_moving_is_named():
+    rows = [row("good", s, 0.1) for s in "st"] + [row("frozen", "s", 0.3), row("frozen", "t", 0.2)]
+    rows += [row("control", s, 0.3, provenance="control") for s in "st"]
+    board = make_board(rows)
+    assert "No better than a camera that never moves, although their runs ended: FROZEN on 1 of 2 sequences." in (
+        leaderboard(board, PROTOCOL).caption
+    )
+    table = per_sequence(board, PROTOCOL, [])
+    small = {cells[0].text: [cell.small for cell in cells[1:]] for cells in table.rows}
+    assert "no better than not moving" in small["FROZEN"][0]
+    assert not any("no better" in text for name in ("GOOD", "CONTROL") for text in small[name])
+
+
+def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
+    """Under a protocol of the final trajectory, coverage and success are those of what is scored."""
+    store = RunStore(tmp_path / "r")
+    for name, kept in (("whole", None), ("thin", [0, 1, 2, 3])):
+        add_run(store, name, "s/a", error=0.01, final_error=0.005, final_frames=kept)
+    protocol = PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
+    rows = {run.row.tracker: run.row for run in load_runs([store], protocol).runs}
+    assert (rows["whole"].coverage, rows["whole"].failed) == (1.0, False)
+    thin = rows["thin"]
+    assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
+    assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
+    assert {run.row.tracker: run.row.failed for run in load_runs([store], PROTOCOL).runs} == dict.fromkeys(rows, False)
+
+
+def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
+    """What the masks show of a frame is known if any run saw the frame, not only the first one of the sequence."""
+    store = RunStore(tmp_path / "r")
+    for name, count in (("crashed", 30), ("whole", 60)):
+        add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
+    runs = sorted(load_runs([store], PROTOCOL).runs, key=lambda run: run.row.tracker)
+    assert [*exact_shares(runs)] == [*range(60)]

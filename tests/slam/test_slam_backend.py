@@ -72,6 +72,24 @@ def test_same_seed_same_bits_and_reset_forgets(room, tracked):
     assert np.array_equal(final, backend.finalize().T_world_cam)
 
 
+def test_finalize_with_all_of_the_map_refined_may_be_asked_at_any_time(room):
+    """It gives the same when asked twice, and a run that goes on is what it would have been."""
+    asked, quiet = (make(room, bundle_adjustment__full=True) for _ in range(2))
+    keep = np.ones(2000, bool), np.ones(2000, np.float32)
+    for index, pose in enumerate(room.path(60)):
+        frame = room.see(pose, index)
+        outcomes = [backend.track(frame, *(each[: len(frame)] for each in keep)) for backend in (asked, quiet)]
+        assert outcomes[0].state == outcomes[1].state
+        assert outcomes[0].state != "ok" or np.array_equal(outcomes[0].T_world_cam, outcomes[1].T_world_cam)
+        if index in (30, 45):
+            before = asked.outputs().positions
+            first, second = asked.finalize(), asked.finalize()
+            assert np.array_equal(first.T_world_cam, second.T_world_cam)
+            assert not np.array_equal(before, asked.outputs().positions), "files show the refined map"
+    finals = [backend.finalize().T_world_cam for backend in (asked, quiet)]
+    assert len(finals[0]) > 40 and np.array_equal(*finals)
+
+
 def test_culled_features_enter_neither_tracking_nor_map(room, tracked):
     truth = room.path(40)
     frames, keeps = [], []

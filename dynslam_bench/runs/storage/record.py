@@ -16,6 +16,8 @@ METRIC_SCHEMA = 1
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
+LOST_COVERAGE = 0.5
+"""A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
 
 
 class TrackerInfo(Record):
