@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
 
@@ -35,7 +36,6 @@ from .settings import BackendSettings
 from .views import MapViews
 
 Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
@@ -71,9 +71,7 @@ class RgbdBackend:
         """Put other settings into force from the next frame on."""
         self.settings = settings
         if self._ready:
-            self.mapper.settings = settings
-            self.loops.settings = settings
-            self._surroundings.settings = settings
+            self.mapper.settings = self.loops.settings = self._surroundings.settings = settings
             self._keyframes.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
@@ -186,9 +184,10 @@ class RgbdBackend:
             seen = self._straightening.foreseen(raw, last, frame.timestamp, self.settings.motion)
         prediction = self.motion.predicted(last, frame.timestamp, self.settings.motion)
         around = self._surroundings.keyframes(self._reference) if self._tracked else self._anywhere()
-        asks = self.settings.relocalisation
-        lost = None if self._tracked else self._reach.since(last, raw, frame.timestamp, self._island, asks)
-        before = Before(last, prediction, self._reference, around, lost, self.mapper.close_m, self.seed, frame.index)
+        known = last, raw, frame.timestamp, self._island, self.settings.relocalisation
+        told = partial(self._reach.at_most, *known, prediction) if self._tracked else partial(self._reach.since, *known)
+        where = last, prediction, self._reference, around, not self._tracked, cache(told)
+        before = Before(*where, self.mapper.close_m, self.seed, frame.index)
         first = first_pose(self.world, self._islands, seen, before, self.settings)
         if first is None:
             return self._lost(frame, raw, last, prediction)
@@ -200,7 +199,8 @@ class RgbdBackend:
             seen, fit, speeds = self._straightening.refitted(raw, seen, fit, last, at, motion, anyhow=second)
         if self._grows:
             self.world.visible[fit.in_view] += 1
-        if fit.count < self._needed_inliers() or not np.isfinite(fit.estimate.T_cam_world).all():
+        asked = self.settings.tracking if self._tracked else self.settings.relocalisation
+        if fit.count < asked.min_inliers or not np.isfinite(fit.estimate.T_cam_world).all():
             found = self._lost(frame, raw, last, prediction)
         else:
             taken = self._accept(frame, seen, fit, last)
@@ -216,9 +216,6 @@ class RgbdBackend:
     def _rolling(self) -> bool:
         """Whether the frame that comes can be straightened."""
         return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked)
-
-    def _needed_inliers(self) -> int:
-        return self.settings.tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
 
     def _nowhere(self, frame: FrameBundle, seen: Observations) -> Tracked:
         """What stands for the last tracked frame before the camera is found in a loaded map: it shows nothing."""
@@ -244,9 +241,10 @@ class RgbdBackend:
         begun = self._begin_island(frame, seen, last) if begins else None
         return begun or self._localised(None if self._last is None else prediction)
 
-    def _anywhere(self) -> Slots:
-        """Slots of the keyframes where a lost camera may be."""
-        return self.world.keyframes
+    def _anywhere(self) -> NDArray[np.int64]:
+        """Slots of the keyframes where a lost camera may be: how other islands lie to its own is unknown."""
+        slots = self.world.keyframes
+        return slots[np.isin(self.world.kf_island[slots], (0, self._island))]
 
     def _usable(self, seen: Observations) -> int:
         """How many features a map could begin with."""

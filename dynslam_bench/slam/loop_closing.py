@@ -323,6 +323,7 @@ class LoopCloser:
         after = optimise_poses(ids, before[slots], [*edges, *within(ids, self._ties)])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
+        self.islands.carried(int(world.kf_island[slot]), before[slots], after, scales[slots])
         seen = np.unique(world.kf_point[slots])
         points = seen[seen >= 0].astype(np.int64)
         reference = world.obs_kf[world.obs_at[points]]

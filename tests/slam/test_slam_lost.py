@@ -225,3 +225,36 @@ def test_a_frame_is_ambiguous_where_its_features_are_found_in_two_places(alike, 
     assert not ambiguous(backend.world, seen, {0: here}, everywhere[:4], settings, 0), "nothing else is looked at"
     near = lambda island, T_cam_world: not here.contradicts(Sight(T_cam_world, 1.0, 3.0))  # noqa: E731
     assert not ambiguous(backend.world, seen, {0: here}, everywhere, settings, 0, near), "it cannot have got there"
+
+
+@pytest.mark.parametrize(("alike", "found"), [(0.0, True), (0.5, False), (1.0, False)])
+def test_from_one_frame_to_the_next_two_places_that_look_alike_tell_nothing_either(alike, found):
+    """The camera is put back to where it was, and the corridor after that one looks the same."""
+    way = [*range(2 * QUARTER), *range(10, 18)]
+    _, states, errors = drive(RingWorld(alike=alike), way)
+    assert states[2 * QUARTER] == "lost", "nobody gets there in a tenth of a second"
+    assert (states[-7:] == ("ok" if found else "lost")).all()
+    assert not found or errors[-7:].max() < 0.1
+
+
+def test_what_is_known_of_an_island_is_carried_along_when_its_surroundings_are():
+    """The camera was lost near the second of two keyframes, which a loop moves, turns and rescales."""
+    islands, before = Islands(), np.tile(np.eye(4), (2, 1, 1))
+    before[1, :3, 3] = [-5.0, 0.0, 0.0]  # a centre at x = 5
+    first = islands.begin(0, np.array([5.5, 0.0, 0.0]), 1.0, slack=0.1)
+    second = islands.begin(first, np.array([5.5, 0.0, 0.2]), 1.0, slack=0.1)
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
+    after = before.copy()
+    after[1] = turn @ before[1]
+    after[1, :3, 3] += [0.0, 0.0, 3.0]
+    islands.carried(0, before, after, np.array([1.0, 2.0]))
+    expected = se3.transform(se3.inverse(after[1]), np.array([1.0, 0.0, 0.0]))
+    known = islands.all()
+    assert np.allclose(known[0].anchor, expected) and known[0].reach_m == pytest.approx(2.0)
+    assert np.array_equal(known[0].start, [5.5, 0.0, 0.0]), "its own world is what it was"
+    assert islands.slack(first, 0) == pytest.approx(0.4)
+    islands.carried(second, before, after, np.array([1.0, 1.0]))
+    assert np.array_equal(islands.all()[0].start, known[0].start), "a loop of another island moves nothing of it"
+    assert np.allclose(islands.all()[1].anchor, known[1].anchor) and not np.allclose(
+        islands.all()[1].start, known[1].start
+    )

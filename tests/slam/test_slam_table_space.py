@@ -120,5 +120,5 @@ def test_poses_do_not_depend_on_where_the_map_lies(monkeypatch):
     monkeypatch.setattr(table_space, "SMALL_BYTES", 1)
     monkeypatch.setattr(TableSpace.__init__, "__defaults__", (0,))
     in_files = driven()
-    assert in_memory.world.space.bytes_in_files == 0 and in_files.world.space.bytes_in_files > 1_500_000
+    assert in_memory.world.space.bytes_in_files == 0 and in_files.world.space.bytes_in_files > 1_000_000
     np.testing.assert_array_equal(in_files.finalize().T_world_cam, in_memory.finalize().T_world_cam)

@@ -1,11 +1,11 @@
-"""A first pose of a frame: from the last frame; else from the reference keyframe, or any keyframe.
+"""A first pose of a frame: from the last frame; else from the reference keyframe, or any that the camera can be at.
 
 All functions are pure: they read the map and never change it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -23,7 +23,7 @@ from .observation import Observations
 from .pose import PoseEstimate
 from .reach import Lost
 from .recognition import recognise
-from .relocalisation import Relocalised, locate
+from .relocalisation import Relocalised, located
 from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
 
 Array = NDArray[np.float64]
@@ -48,7 +48,8 @@ class Before:
         prediction: World-to-camera pose that the motion model expects.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
         keyframes: Slots of the keyframes near which the frame may have been taken.
-        lost: What is known of the time since then, in which it was lost; None if it was tracked in the frame before.
+        lost: Whether it was lost since then; else it was tracked in the frame before.
+        since: Tells what is known of the time since then.
         close_m: Depth below which a feature's depth is trusted, metres.
         seed: Of the sequence's random draws.
         frame: Index of the frame that comes.
@@ -58,7 +59,8 @@ class Before:
     prediction: Array
     reference: int
     keyframes: Slots
-    lost: Lost | None
+    lost: bool
+    since: Callable[[], Lost]
     close_m: float
     seed: int
     frame: int
@@ -87,8 +89,8 @@ def first_pose(
     """A first pose, or None.
 
     The last frame's map points come first. Where they are few, what only its depth gives helps as well. A pose that few
-    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes'. After a loss it
-    counts only if all around agrees.
+    matches agree on, as by chance after a gap or a sudden turn, has to compete with the keyframes', and
+    the camera has to be able to get to it. After a loss it counts only if all around agrees.
 
     Args:
         world: The map.
@@ -98,48 +100,55 @@ def first_pose(
         settings: Of tracking and relocalisation.
     """
     best: tuple[Matches, PoseEstimate] | None = None
-    lost = before.lost is not None
     for matches in _from_last_frame(world, seen, before, settings.tracking):
         estimate = solve(world, seen, matches, before.prediction, rounds=3)
         if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
             best = matches, estimate
         if best is not None and estimate.count >= max(TRUSTED_FIRST, TRUSTED_SHARE * len(matches)):
-            if not lost:
+            if not before.lost:
                 return _agreed(*best, before.reference)
             break
-    if lost and best is not None:
-        guess = _there(world, islands, seen, Relocalised(before.reference, *best), before, settings)
+    if before.lost and best is not None:
+        guess = _there(world, islands, seen, Relocalised(before.reference, *best), before, settings, before.since())
         if guess is not None:
             return guess
-    least = ENOUGH_FIRST // 2 if best is None or lost else best[1].count + 1
+    least = ENOUGH_FIRST // 2 if best is None or before.lost else best[1].count + 1
     found = _from_keyframes(world, islands, seen, before, settings, least)
-    return found if found is not None or best is None or lost else _agreed(*best, before.reference)
+    if found is not None or best is None or before.lost:
+        return found
+    T_cam_world, since = best[1].T_cam_world, before.since()
+    return (
+        _agreed(*best, before.reference)
+        if since.may_be(islands, before.last.T_cam_world, since.island, T_cam_world)
+        else None
+    )
 
 
 def _there(
-    world: Map, islands: Islands, seen: Observations, found: Relocalised, before: Before, settings: BackendSettings
+    world: Map,
+    islands: Islands,
+    seen: Observations,
+    found: Relocalised,
+    before: Before,
+    settings: BackendSettings,
+    since: Lost,
 ) -> FirstPose | None:
     """The pose at a keyframe's place, if the camera can have got there, and what was mapped around that is there.
 
     A place may only have something in common with another.
     """
-    there = int(world.kf_island[found.keyframe])
-    if not _may_be(islands, before, there, found.estimate.T_cam_world):
+    there, may_be = int(world.kf_island[found.keyframe]), partial(since.may_be, islands, before.last.T_cam_world)
+    if not may_be(there, found.estimate.T_cam_world):
         return None
     matches = found.matches.select(found.estimate.inliers)
     place = recognise(world, found.keyframe, seen, matches, found.estimate.T_cam_world, settings.tracking)
     many = len(place.matches) >= MANY
     if place.share < (MANY_SHARE if many else 1.0) * settings.relocalisation.min_share:
         return None
-    known, possible = {there: sight(place)}, partial(_may_be, islands, before)
-    if before.lost is not None and ambiguous(world, seen, known, before.keyframes, settings, before.seed, possible):
+    known = {there: sight(place)}
+    if before.lost and ambiguous(world, seen, known, before.keyframes, settings, before.seed, may_be):
         return None
     return FirstPose(place.T_cam_world, place.matches, found.keyframe, relocalised=True)
-
-
-def _may_be(islands: Islands, before: Before, island: int, T_cam_world: Array) -> bool:
-    """Whether the camera can have got to a pose on an island; anywhere, if it was tracked in the frame before."""
-    return before.lost is None or before.lost.may_be(islands, before.last.T_cam_world, island, T_cam_world)
 
 
 def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool = False) -> FirstPose:
@@ -159,17 +168,21 @@ def _from_last_frame(world: Map, seen: Observations, before: Before, s: Tracking
 def _from_keyframes(
     world: Map, islands: Islands, seen: Observations, before: Before, settings: BackendSettings, least: int
 ) -> FirstPose | None:
-    """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike."""
-    s = settings.relocalisation
+    """A pose with at least so many inliers by descriptors: from the reference keyframe, else from those alike.
+
+    Each has to be one that the camera can have got to, and its place to be there; the first that is counts.
+    """
+    s, since = settings.relocalisation, before.since()
     rng = stream(before.seed, "relocalisation", before.frame)
-    for alike in (True,) if before.lost is not None else (False, True):
+    for alike in (True,) if before.lost else (False, True):
         keyframes = most_alike(world, before.keyframes, seen, s.searched) if alike else [before.reference]
-        found = locate(world, keyframes, seen, s, rng, settings.tracking.min_inliers)
-        if found is None or found.estimate.count < least:
-            continue
-        if not alike:
-            return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
-        there = _there(world, islands, seen, found, before, settings)
-        if there is not None:
-            return there
+        for found in located(world, keyframes, seen, s, rng, settings.tracking.min_inliers):
+            if found.estimate.count < least:
+                continue
+            if alike:
+                there = _there(world, islands, seen, found, before, settings, since)
+                if there is not None:
+                    return there
+            elif since.may_be(islands, before.last.T_cam_world, since.island, found.estimate.T_cam_world):
+                return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
     return None

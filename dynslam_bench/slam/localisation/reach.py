@@ -102,6 +102,24 @@ class Reach:
         self._follow(seen, settings)
         return Lost(island, self.metres(last, timestamp, settings), self.turn)
 
+    def at_most(
+        self,
+        last: Tracked,
+        seen: Observations,
+        timestamp: float,
+        island: int,
+        settings: RelocalisationSettings,
+        prediction: Array,
+    ) -> Lost:
+        """What is known of the time since the frame before, in which the camera was tracked; arguments as `since`.
+
+        A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera `prediction`.
+        """
+        turn = Turn(last.seen, np.eye(3)).on(seen, self._camera, settings.max_distance)
+        centres = [se3.inverse(pose)[:3, 3] for pose in (last.T_cam_world, prediction)]
+        step = float(np.linalg.norm(centres[1] - centres[0]))
+        return Lost(island, step + _way(last, timestamp, settings), turn)
+
     def _follow(self, seen: Observations, settings: RelocalisationSettings) -> None:
         if self.turn is not None:
             self.turn = self.turn.on(seen, self._camera, settings.max_distance)
@@ -123,4 +141,8 @@ class Reach:
             timestamp: Seconds.
             settings: The largest speed.
         """
-        return np.inf if self._sudden else SLACK_M + settings.max_speed * max(timestamp - last.timestamp, 0.0)
+        return np.inf if self._sudden else _way(last, timestamp, settings)
+
+
+def _way(last: Tracked, timestamp: float, settings: RelocalisationSettings) -> float:
+    return SLACK_M + settings.max_speed * max(timestamp - last.timestamp, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -115,15 +116,15 @@ def _inliers(poses: Array, position: Array, xy: Array, info: Array, camera: Came
     return np.asarray((local[..., 2] > 0.05) & (info * np.square(error).sum(axis=-1) < 2.0 * 5.991))
 
 
-def locate(
+def located(
     world: Map,
     keyframes: list[int],
     seen: Observations,
     settings: RelocalisationSettings,
     rng: np.random.Generator,
     min_inliers: int,
-) -> Relocalised | None:
-    """The best pose that any of the keyframes supports.
+) -> Iterator[Relocalised]:
+    """Poses that the keyframes support: a good one at once, the others after all were looked at, the best first.
 
     Args:
         world: The map.
@@ -134,10 +135,10 @@ def locate(
         min_inliers: Inliers that the optimised pose needs.
     """
     if len(seen) < min_inliers:
-        return None
+        return
     matched = [(match_keyframe(world, keyframe, seen, settings.max_distance), keyframe) for keyframe in keyframes]
     matched = sorted(matched, key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
-    best: Relocalised | None = None
+    others: list[Relocalised] = []
     for matches, keyframe in matched[: settings.candidates]:
         if len(matches) < max(8, min_inliers // 3):
             break
@@ -151,8 +152,9 @@ def locate(
         estimate = optimise_pose(
             pose, kept.position, seen.xy[f], seen.right[f], seen.info[f], seen.info_right[f], world.camera
         )
-        if best is None or estimate.count > best.estimate.count:
-            best = Relocalised(keyframe, kept, estimate)
-        if best.estimate.count >= 2 * min_inliers:
-            break
-    return best
+        pose_there = Relocalised(keyframe, kept, estimate)
+        if estimate.count >= 2 * min_inliers:
+            yield pose_there
+        else:
+            others.append(pose_there)
+    yield from sorted(others, key=lambda each: -each.estimate.count)

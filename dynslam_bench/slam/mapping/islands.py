@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dynslam_bench.geometry import se3
 
 Array = NDArray[np.float64]
 
@@ -63,6 +65,31 @@ class Islands:
         turned = min(slack + self.slack(left, 0), np.pi)
         self._islands[number] = Island(start.copy(), *self._from_first(left, start, reach_m), turned)
         return number
+
+    def carried(self, number: int, before: Array, after: Array, scales: Array) -> None:
+        """Keyframes of an island, or 0, were moved: so was what is known of places in its world, with the nearest.
+
+        Args:
+            number: The island.
+            before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
+            after: Those from now on.
+            scales: What lengths around each were multiplied by ``[K]``.
+        """
+        centres = se3.inverse(before)[:, :3, 3]
+        for each, island in self._islands.items():
+            if number not in (0, each):
+                continue
+            place = island.start if number else island.anchor
+            nearest = int(np.linalg.norm(centres - place, axis=1).argmin())
+            local = scales[nearest] * se3.transform(before[nearest], place)
+            now, scale = se3.transform(se3.inverse(after[nearest]), local), float(scales[nearest])
+            turned = float(se3.rotation_angle(se3.inverse(after[nearest]) @ before[nearest]))
+            slack = min(island.slack + turned, np.pi)
+            self._islands[each] = (
+                replace(island, start=now, slack=slack)
+                if number
+                else replace(island, anchor=now, reach_m=scale * island.reach_m, slack=slack)
+            )
 
     def slack(self, one: int, other: int) -> float:
         """How far the worlds of two islands, or 0, may be turned against each other, radians."""
