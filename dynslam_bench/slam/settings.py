@@ -277,7 +277,7 @@ class RelocalisationSettings(Settings):
         "elsewhere from one frame to the next: places farther away only look like the one that is recognised",
     )
     new_map_after: int = Field(
-        5,
+        10,
         ge=2,
         le=100000,
         description="with loop closing: so many frames in a row that show enough but are not recognised begin a map of "

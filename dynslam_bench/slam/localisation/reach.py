@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 
 SLACK_M = 0.5
 """Metres that are believed in no time."""
-SUDDEN = 100
-"""A frame that shows so many map points, followed by one that shows nothing of it: the camera was put elsewhere."""
+SUDDEN = 60
+"""A frame that shows so many map points, as many as a map begins with, followed by one that shows nothing of it: the
+camera was put elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
