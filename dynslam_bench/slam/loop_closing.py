@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 
-from .bundle.pose_graph import Edge, optimise_poses, rescaled, spread_scale, within
+from .bundle.pose_graph import Edge, inherited, optimise_poses, rescaled, spread_scale, within
 from .corrections import Correction
 from .localisation.lookalikes import Sight, ambiguous
 from .localisation.observation import Observations
@@ -142,6 +142,9 @@ class LoopCloser:
         """
         self.rescaled, self.misfit = {}, False
         self._note_way(slot)
+        for dropped, heir, relative in self.mapper.dropped if self._ties else ():
+            ids = (int(self.world.kf_id[each]) for each in (dropped, heir))
+            self._ties = inherited(self._ties, *ids, relative)
         loop = self._verified(slot, seen)
         if loop is None:
             self._row.clear()

@@ -10,7 +10,7 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, optimise_poses, spread_scale
+from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, inherited, optimise_poses, spread_scale
 from dynslam_bench.slam.corrections import Correction
 from dynslam_bench.slam.localisation.surroundings import not_held
 from dynslam_bench.slam.loop_closing import FIRM
@@ -163,6 +163,18 @@ def test_a_pose_graph_spreads_what_one_tie_contradicts():
     found = optimise_poses(ids, drifted, [*steps, ring])
     np.testing.assert_allclose(found[:, 0, 3], np.arange(5) * 1.02, atol=1e-6, err_msg="five ties share 0.4 m equally")
     np.testing.assert_allclose(optimise_poses(ids, drifted, steps), drifted, atol=1e-9)
+
+
+def test_a_loops_tie_goes_to_the_heir_of_a_keyframe_that_goes():
+    poses = {number: se3.exp(np.random.default_rng(number).normal(size=6)) for number in range(4)}
+    tie = lambda a, b: Edge(a, b, poses[b] @ se3.inverse(poses[a]), 2.0)  # noqa: E731
+    for dropped in (0, 1):
+        (found,) = inherited([tie(0, 1)], dropped, 3, poses[dropped] @ se3.inverse(poses[3]))
+        expected = tie(3 if dropped == 0 else 0, 3 if dropped == 1 else 1)
+        assert (found.one, found.other, found.weight) == (expected.one, expected.other, 2.0)
+        np.testing.assert_allclose(found.T_other_one, expected.T_other_one, atol=1e-12)
+    assert inherited([tie(0, 1)], 0, 1, poses[0] @ se3.inverse(poses[1])) == [], "nothing is tied to itself"
+    assert len(inherited([tie(0, 1), tie(1, 2)], 3, 2, np.eye(4))) == 2
 
 
 def test_a_scale_is_spread_over_the_ties_it_drifted_along():

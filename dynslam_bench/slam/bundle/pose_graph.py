@@ -52,6 +52,27 @@ def rescaled(edges: Sequence[Edge], ids: NDArray[np.int64], factors: Array) -> l
     return [edge.scaled(by_id.get(edge.one, 1.0)) for edge in edges]
 
 
+def inherited(edges: Sequence[Edge], dropped: int, heir: int, T_dropped_heir: Array) -> list[Edge]:
+    """The ties where a keyframe has gone and another stands for it; what would tie that to itself is left out.
+
+    Args:
+        edges: Ties.
+        dropped: Id of the keyframe that has gone.
+        heir: Id of the other.
+        T_dropped_heir: Pose ``[4, 4]`` from the heir's camera frame to that of the one that has gone.
+    """
+    found = []
+    for edge in edges:
+        one, other, pose = edge.one, edge.other, edge.T_other_one
+        if one == dropped:
+            one, pose = heir, pose @ T_dropped_heir
+        if other == dropped:
+            other, pose = heir, se3.inverse(T_dropped_heir) @ pose
+        if one != other:
+            found.append(Edge(one, other, pose, edge.weight))
+    return found
+
+
 def within(ids: NDArray[np.int64], edges: Sequence[Edge]) -> list[Edge]:
     """The ties of which both ends are among keyframes."""
     return [edge for edge in edges if np.isin([edge.one, edge.other], ids).all()]

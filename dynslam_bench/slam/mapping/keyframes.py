@@ -70,10 +70,12 @@ class KeyframeRule:
 
 
 def established(world: Map, keyframe: int, observations: int) -> int:
-    """How many of a keyframe's points at least so many keyframes observe (or all there are, in a young map)."""
+    """How many of a keyframe's points at least so many keyframes observe (or all of its island, if that is young)."""
     points = world.kf_point[keyframe]
     points = points[points >= 0]
-    return int(np.count_nonzero(world.n_obs[points] >= min(observations, world.keyframe_count)))
+    return int(
+        np.count_nonzero(world.n_obs[points] >= min(observations, len(world.island(int(world.kf_island[keyframe])))))
+    )
 
 
 def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
