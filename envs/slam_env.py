@@ -87,7 +87,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and ground truth.
         frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
         stride: Take every so many frames.
-        lost_after: End the episode after so many lost frames in a row; None never.
+        lost_after: End the episode after so many lost frames in a row, initialising ones not counted; None never.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         render_mode: ``rgb_array`` or None.
         data_root: Folder of the recorded sequences; None for the default one.

@@ -112,7 +112,8 @@ class FilterResult:
 
     Attributes:
         keep: bool ``[N]``; False = dynamic. A filter only judges; what earlier filters dropped stays dropped.
-        weight: float32 ``[N]`` in [0, 1], confidence that the point is static, used by the pose optimiser.
+        weight: float32 ``[N]`` in [0, 1], confidence that the point is static: scales what the point tells the pose
+            optimiser, and with it, as in g2o, the error at which it counts as an outlier.
         stats: Counts and reasons, e.g. ``{"dropped": 41.0, "degenerate": 0.0}``; the same keys on every frame. A filter
             that tests against a fundamental matrix says with ``f_asked`` (1 where there was something to test) and
             ``f_judged`` (1 where the matrix was used) on how many frames it did.

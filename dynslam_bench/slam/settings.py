@@ -153,7 +153,7 @@ class KeyframeSettings(Settings):
         low=0.7,
         high=1.0,
         limits=(0.1, 1.0),
-        meaning="a keyframe goes when this share of its points is seen by three others at the same scale or finer",
+        meaning="a keyframe goes when three others see this share of its points, at most one octave coarser",
     )
     maximum: int = Field(600, ge=10, le=100000, description="keyframes kept at most; bounds memory and searches")
     depth_images: int = Field(8, ge=0, le=1000, description="newest keyframes that keep their depth image, for filters")
@@ -194,7 +194,7 @@ class MappingSettings(Settings):
         low=1,
         high=4,
         limits=(1, 10),
-        meaning="a point goes when, three keyframes after its creation, fewer keyframes observe it",
+        meaning="a point goes when, two keyframes after its creation, fewer keyframes observe it",
     )
 
 

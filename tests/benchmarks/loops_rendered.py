@@ -5,8 +5,8 @@
 Frames are rendered, their ORB features kept, nothing else. Prints for each back end: frames that count as tracked and
 RMSE of their positions after the best rigid alignment, online and final (with `full`: all of the map refined at the
 end, which takes minutes in a large one), and every loop with the true distance between its two ends. `--rivals`
-gives each frame to so many ORB-SLAM3s, too, while it is there (docs/orbslam3.md). With `--without-depth` the monocular
-back end drives, and the alignment has a scale.
+gives each frame to so many ORB-SLAM3s, with depth, while it is there (docs/orbslam3.md). With `--without-depth` the
+monocular back end drives, and the alignment has a scale.
 """
 
 from __future__ import annotations
@@ -113,6 +113,8 @@ def main() -> None:
     parser.add_argument("--settings", nargs="+", choices=sorted(SETTINGS), default=list(SETTINGS))
     parser.add_argument("--without-depth", action="store_true", help="with the monocular back end")
     options = parser.parse_args()
+    if options.without_depth and options.rivals:
+        parser.error("the rivals get depth; their monocular mode: dynslam-bench run orbslam3-mono SEQUENCE --stride 2")
     cv2.setNumThreads(1)
     for source in options.sequences:
         sequence, frames, together = features_of(source, options.stride, options.rivals)

@@ -41,8 +41,6 @@ class LocalMapper:
     def __init__(self, world: Map, settings: BackendSettings) -> None:
         self.world = world
         self.settings = settings
-        self.merged: dict[int, int] = {}
-        """Points that the last `insert` replaced by others."""
         self.dropped: list[tuple[int, int, Array]] = []
         """Keyframes that the last `insert` removed: slot, heir's slot, and the pose ``T_dropped_heir``."""
         self._unrefined: tuple[Slots, Array, Slots, dict[str, NDArray[Any]]] | None = None
@@ -72,7 +70,6 @@ class LocalMapper:
         """
         begin = perf_counter()
         world = self.world
-        self.merged.clear()
         self.dropped.clear()
         first = not world.island(island).size
         slot = world.add_keyframe(seen, T_cam_world, frame, stamp, island)
@@ -181,13 +178,9 @@ class LocalMapper:
             if rival < 0 or rival == point or not world.alive[point]:
                 continue
             if world.n_obs[rival] > world.n_obs[point]:
-                self._merge(point, rival)
+                world.merge(point, rival)
             else:
-                self._merge(rival, point)
-
-    def _merge(self, old: int, new: int) -> None:
-        self.world.merge(old, new)
-        self.merged[old] = new
+                world.merge(rival, point)
 
     # ------------------------------------------------------------------ bundle adjustment
 

@@ -388,7 +388,7 @@ class Map:
         )  # fmt: skip
 
     def redundancy(self, slot: int, close_m: float, others: int = 3) -> tuple[int, int]:
-        """A keyframe's close points, and how many of them `others` keyframes see at the same scale or finer.
+        """A keyframe's close points, and how many of them `others` keyframes see, at most one octave coarser.
 
         All points of a keyframe without any depth count as close.
         """
