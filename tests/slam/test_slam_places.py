@@ -6,7 +6,8 @@ import pytest
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.localisation.observation import observe
 from dynslam_bench.slam.mapping.map import Map
-from dynslam_bench.slam.places import most_alike
+from dynslam_bench.slam.mapping.piece_index import EVERY
+from dynslam_bench.slam.places import likeness, most_alike
 from dynslam_bench.slam.settings import TrackingSettings
 
 SCALES = np.ones(1)
@@ -70,3 +71,40 @@ def test_equal_scores_go_to_the_newer_keyframe(room, world):
 def test_a_frame_without_features_names_the_first_given(room, world):
     blind = observe(room.blind(0), np.zeros(0, bool), np.zeros(0, np.float32), room.camera, SCALES, TrackingSettings())
     assert most_alike(world, world.keyframes, blind, 2) == world.keyframes[:2].tolist()
+
+
+def counted(world, keyframes, features):
+    """The same score, counted piece by piece without an index."""
+    own = np.ascontiguousarray(features.words).view(np.uint16)[:, ::EVERY]
+    shared = []
+    for slot in keyframes.tolist():
+        pieces = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::EVERY]
+        shared.append([pieces[np.isin(pieces[:, place], own[:, place]), place] for place in range(own.shape[1])])
+    everything = [np.concatenate([each[place] for each in shared]) for place in range(own.shape[1])]
+    total = sum(map(len, everything))
+    scores = []
+    for slot, each in zip(keyframes.tolist(), shared, strict=True):
+        weights = [
+            np.log(total / np.count_nonzero(everything[p] == value)) for p, found in enumerate(each) for value in found
+        ]
+        scores.append(sum(weights) / np.sqrt(max(np.count_nonzero(world.kf_point[slot] >= 0), 1)))
+    return np.array(scores)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_index_counts_what_is_there_after_keyframes_came_and_went(room, seed):
+    """Keyframes of many sizes, some features without a point, slots used again, and only some asked for."""
+    world, rng, looked = Map(room.camera, SCALES), np.random.default_rng(seed), 0
+    for number in range(40):
+        if world.keyframe_count < 4 or rng.random() < 0.6:
+            features = seen(room, rng.uniform(0, 6), number)
+            slot = world.add_keyframe(features, np.eye(4), number, number / 30)
+            some = np.flatnonzero(rng.random(len(features)) < 0.6)
+            world.add_points(np.ones((len(some), 3)), features.rgb[some], slot, some)
+        else:
+            world.remove_keyframe(int(rng.choice(world.keyframes)))
+        asked = world.keyframes[rng.random(world.keyframe_count) < 0.8]
+        if number % 3 == 0 and len(asked):  # not each time: several come and go in between
+            features, looked = seen(room, rng.uniform(0, 6), 1000 + number), looked + 1
+            np.testing.assert_allclose(likeness(world, asked, features), counted(world, asked, features), rtol=1e-9)
+    assert looked > 8

@@ -16,6 +16,7 @@ from dynslam_bench.geometry.camera import Camera
 
 from ..localisation.observation import Observations
 from . import map_kernels as kernels
+from .piece_index import PieceIndex
 from .table_space import TableSpace
 
 Array = NDArray[np.float64]
@@ -65,6 +66,7 @@ class Map:
         self._features = 0
         self._words = 4
         self.space = TableSpace()
+        self.pieces = PieceIndex()
         self._allocate()
 
     def _grow(self, name: str, length: int, axis: int = 0) -> None:

@@ -216,7 +216,7 @@ def redundancy(
     keyframe: int, close: Flags, kf_point: Table, kf_octave: Any,
     obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, others: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """How many close points the keyframe observes, and how many of them `others` keyframes see, at most one octave coarser."""
+    """Close points that the keyframe observes, and those that `others` see, at most one octave coarser."""
     total, redundant = 0, 0
     for f in range(close.shape[0]):
         p = kf_point[keyframe, f]

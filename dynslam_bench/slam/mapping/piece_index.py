@@ -1,0 +1,135 @@
+"""An inverted index of the keyframes' descriptors: which features have a piece of theirs in common with a frame's.
+
+Looking at every feature of every keyframe takes as long as there are keyframes; the index goes to those alone that
+share something (Sivic and Zisserman, Video Google, ICCV 2003, with words for pieces).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import kernel
+
+VALUES = 1 << 16
+"""Values of a piece."""
+EVERY = 4
+"""Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
+ROOM = 256
+"""Features are given room in steps of so many."""
+
+Pieces = NDArray[np.uint16]
+Ints = NDArray[np.int32]
+
+
+class PieceIndex:
+    """Lists of features by their descriptors' pieces; keyframes that came and went are seen to when it is asked."""
+
+    def __init__(self) -> None:
+        self._begin(0, 0, 0)
+
+    def _begin(self, slots: int, features: int, places: int) -> None:
+        self._ids = np.full(slots, -1, np.int64)
+        self._counts = np.zeros(slots, np.int64)
+        self._pieces = np.zeros((slots, features, places), np.uint16)
+        self._first = np.full((places, VALUES), -1, np.int32)
+        self._next = np.full((slots, features, places), -1, np.int32)
+
+    def renew(
+        self, alive: NDArray[np.bool_], ids: NDArray[np.int64], counts: NDArray[np.int64], pieces: Pieces
+    ) -> None:
+        """Take up the keyframes of now.
+
+        Args:
+            alive: Of each slot, whether a keyframe is there ``[S]``.
+            ids: Of each slot, its keyframe's ``[S]``.
+            counts: Features of each ``[S]``.
+            pieces: Pieces of their descriptors ``[S, F, P]``.
+        """
+        slots, features, places = pieces.shape
+        if slots > len(self._ids) or features > self._pieces.shape[1] or places != self._pieces.shape[2]:
+            self._begin(slots, -(-features // ROOM) * ROOM, places)
+        known = np.full(len(self._ids), -1, np.int64)
+        known[:slots] = np.where(alive, ids, -1)
+        for slot in np.flatnonzero(known != self._ids).tolist():
+            if self._ids[slot] >= 0:
+                _take_out(self._first, self._next, self._pieces, slot, int(self._counts[slot]))
+            self._ids[slot] = known[slot]
+            if known[slot] >= 0:
+                count = self._counts[slot] = counts[slot]
+                self._pieces[slot, :count] = pieces[slot, :count]
+                _put_in(self._first, self._next, self._pieces, slot, int(count))
+
+    def score(self, kf_point: Ints, slots: NDArray[np.int64], own: Pieces) -> NDArray[np.float64]:
+        """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame.
+
+        A piece weighs the logarithm of how much rarer it is than all of the frame's pieces together.
+
+        Args:
+            kf_point: Of each slot and feature the point, or -1, ``[S, F]``: features without one do not count.
+            slots: Of the keyframes.
+            own: The frame's pieces ``[N, P]``.
+        """
+        values = [np.unique(own[:, place]) for place in range(own.shape[1])]
+        place = np.repeat(np.arange(len(values)), [len(each) for each in values])
+        row = np.full(len(self._ids), -1, np.int64)
+        row[slots] = np.arange(len(slots))
+        return np.asarray(_score(self._first, self._next, kf_point, row, place, np.concatenate(values), len(slots)))
+
+
+@kernel
+def _put_in(first: Ints, after: Ints, pieces: Pieces, slot: int, count: int) -> None:
+    features, places = pieces.shape[1], pieces.shape[2]
+    for feature in range(count):
+        for place in range(places):
+            value = pieces[slot, feature, place]
+            after[slot, feature, place] = first[place, value]
+            first[place, value] = slot * features + feature
+
+
+@kernel
+def _take_out(first: Ints, after: Ints, pieces: Pieces, slot: int, count: int) -> None:
+    features, places = pieces.shape[1], pieces.shape[2]
+    for feature in range(count):
+        gone = slot * features + feature
+        for place in range(places):
+            value = pieces[slot, feature, place]
+            node = first[place, value]
+            if node == gone:
+                first[place, value] = after[slot, feature, place]
+                continue
+            while node >= 0:
+                following = after[node // features, node % features, place]
+                if following == gone:
+                    after[node // features, node % features, place] = after[slot, feature, place]
+                    break
+                node = following
+
+
+@kernel
+def _score(
+    first: Ints, after: Ints, kf_point: Ints, row: NDArray[np.int64],
+    places: NDArray[np.int64], values: Pieces, rows: int,
+) -> NDArray[np.float64]:  # fmt: skip
+    features = after.shape[1]
+    score, frequency = np.zeros(rows), np.zeros(len(values), np.int64)
+    total = 0
+    for k in range(len(values)):
+        node = first[places[k], values[k]]
+        while node >= 0:
+            slot, feature = node // features, node % features
+            if row[slot] >= 0 and kf_point[slot, feature] >= 0:
+                frequency[k] += 1
+            node = after[slot, feature, places[k]]
+        total += frequency[k]
+    for k in range(len(values)):
+        if not frequency[k]:
+            continue
+        weight = np.log(total / frequency[k])
+        node = first[places[k], values[k]]
+        while node >= 0:
+            slot, feature = node // features, node % features
+            if row[slot] >= 0 and kf_point[slot, feature] >= 0:
+                score[row[slot]] += weight
+            node = after[slot, feature, places[k]]
+    return score
