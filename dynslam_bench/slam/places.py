@@ -42,7 +42,7 @@ def likeness(world: Map, keyframes: NDArray[np.int64], seen: Observations) -> ND
     """
     world.pieces.renew(world.kf_alive, world.kf_id, world.kf_count, world.kf_words.view(np.uint16)[:, :, ::EVERY])
     own = np.ascontiguousarray(seen.words).view(np.uint16)[:, ::EVERY]
-    score = world.pieces.score(world.kf_point, keyframes, own)
-    points = np.count_nonzero(world.kf_point[keyframes] >= 0, axis=1)
+    held = world.kf_point >= 0
     world.space.rest("kf_words", "kf_point")
-    return np.asarray(score / np.sqrt(np.maximum(points, 1)))
+    points = np.count_nonzero(held[keyframes], axis=1)
+    return np.asarray(world.pieces.score(held, keyframes, own) / np.sqrt(np.maximum(points, 1)))

@@ -17,6 +17,8 @@ EVERY = 4
 """Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
 ROOM = 256
 """Features are given room in steps of so many."""
+SLOTS = 640
+"""Keyframes that there is room for at once: as many as are kept by default, and some that come and go."""
 
 Pieces = NDArray[np.uint16]
 Ints = NDArray[np.int32]
@@ -31,7 +33,7 @@ class PieceIndex:
     def _begin(self, slots: int, features: int, places: int) -> None:
         self._ids = np.full(slots, -1, np.int64)
         self._counts = np.zeros(slots, np.int64)
-        self._pieces = np.zeros((slots, features, places), np.uint16)
+        self._pieces = np.full((slots, features, places), 0, np.uint16)  # in memory from now on: it does not grow
         self._first = np.full((places, VALUES), -1, np.int32)
         self._next = np.full((slots, features, places), -1, np.int32)
 
@@ -48,7 +50,7 @@ class PieceIndex:
         """
         slots, features, places = pieces.shape
         if slots > len(self._ids) or features > self._pieces.shape[1] or places != self._pieces.shape[2]:
-            self._begin(slots, -(-features // ROOM) * ROOM, places)
+            self._begin(max(slots, SLOTS), -(-features // ROOM) * ROOM, places)
         known = np.full(len(self._ids), -1, np.int64)
         known[:slots] = np.where(alive, ids, -1)
         for slot in np.flatnonzero(known != self._ids).tolist():
@@ -60,21 +62,22 @@ class PieceIndex:
                 self._pieces[slot, :count] = pieces[slot, :count]
                 _put_in(self._first, self._next, self._pieces, slot, int(count))
 
-    def score(self, kf_point: Ints, slots: NDArray[np.int64], own: Pieces) -> NDArray[np.float64]:
+    def score(self, held: NDArray[np.bool_], slots: NDArray[np.int64], own: Pieces) -> NDArray[np.float64]:
         """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame.
 
         A piece weighs the logarithm of how much rarer it is than all of the frame's pieces together.
 
         Args:
-            kf_point: Of each slot and feature the point, or -1, ``[S, F]``: features without one do not count.
+            held: Of each slot and feature whether it observes a point ``[S, F]``: others do not count.
             slots: Of the keyframes.
             own: The frame's pieces ``[N, P]``.
         """
         values = [np.unique(own[:, place]) for place in range(own.shape[1])]
         place = np.repeat(np.arange(len(values)), [len(each) for each in values])
-        row = np.full(len(self._ids), -1, np.int64)
+        row = np.full(len(self._ids), -1, np.int32)
         row[slots] = np.arange(len(slots))
-        return np.asarray(_score(self._first, self._next, kf_point, row, place, np.concatenate(values), len(slots)))
+        lists = self._first, self._next.reshape(-1, self._next.shape[2])
+        return np.asarray(_score(*lists, held, row, place, np.concatenate(values), len(slots)))
 
 
 @kernel
@@ -108,28 +111,28 @@ def _take_out(first: Ints, after: Ints, pieces: Pieces, slot: int, count: int) -
 
 @kernel
 def _score(
-    first: Ints, after: Ints, kf_point: Ints, row: NDArray[np.int64],
+    first: Ints, after: Ints, held: NDArray[np.bool_], row: Ints,
     places: NDArray[np.int64], values: Pieces, rows: int,
 ) -> NDArray[np.float64]:  # fmt: skip
-    features = after.shape[1]
-    score, frequency = np.zeros(rows), np.zeros(len(values), np.int64)
-    total = 0
+    features = len(after) // len(row)
+    ends, found, shared = np.zeros(len(values), np.int64), np.zeros(1 << 12, np.int32), 0
     for k in range(len(values)):
-        node = first[places[k], values[k]]
+        place = places[k]
+        node = first[place, values[k]]
         while node >= 0:
-            slot, feature = node // features, node % features
-            if row[slot] >= 0 and kf_point[slot, feature] >= 0:
-                frequency[k] += 1
-            node = after[slot, feature, places[k]]
-        total += frequency[k]
+            slot = node // features
+            if row[slot] >= 0 and held[slot, node - slot * features]:
+                if shared == len(found):
+                    found = np.concatenate((found, np.zeros(shared, np.int32)))
+                found[shared] = row[slot]
+                shared += 1
+            node = after[node, place]
+        ends[k] = shared
+    score, begin = np.zeros(rows), 0
     for k in range(len(values)):
-        if not frequency[k]:
-            continue
-        weight = np.log(total / frequency[k])
-        node = first[places[k], values[k]]
-        while node >= 0:
-            slot, feature = node // features, node % features
-            if row[slot] >= 0 and kf_point[slot, feature] >= 0:
-                score[row[slot]] += weight
-            node = after[slot, feature, places[k]]
+        if ends[k] > begin:
+            weight = np.log(shared / (ends[k] - begin))
+            for at in range(begin, ends[k]):
+                score[found[at]] += weight
+        begin = ends[k]
     return score
