@@ -206,7 +206,7 @@ def _notes(resolved: ResolvedRun) -> list[str]:
     return ([CACHED_TIMES] if resolved.spec.cache else []) + begun
 
 
-_AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share")
+_AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")
 """What a record takes from the request as it is."""
 
 

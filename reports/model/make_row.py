@@ -77,6 +77,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         mask_iou=record.mask_iou,
         segmentation=record.segmentation,
         seen_in_training=seen_in_training(record.segmentation, sequence.id),
+        study=record.study if record.asked else "",
         started=record.started,
         log=log_of(store, record.run_id),
         command=command_line(record.command),

@@ -71,6 +71,7 @@ class RunRow(Record):
         segmentation: Source of the masks.
         seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
             does not rank unless that is asked for.
+        study: Study of which the run is a trial, with settings of its own; empty for any other run.
         started: UTC, ISO 8601.
         log: Path of the run's log.
         command: Command line that made it.
@@ -124,6 +125,7 @@ class RunRow(Record):
     mask_iou: float | None = None
     segmentation: str = ""
     seen_in_training: bool = False
+    study: str = ""
     started: str = ""
     log: str = ""
     command: str = ""

@@ -74,6 +74,7 @@ def add_run(
     masks="",
     settings=None,
     final_frames=None,
+    study="",
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -113,7 +114,7 @@ def add_run(
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
         started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
-        mask_iou=mask_iou, segmentation=masks, command=list(command), settings=settings or {},
+        mask_iou=mask_iou, segmentation=masks, command=list(command), settings=settings or {}, study=study,
     )  # fmt: skip
     with store.work_folder(run_id) as work:
         if ok.any() and online:

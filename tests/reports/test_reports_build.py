@@ -237,6 +237,24 @@ def test_only_the_newest_of_equal_runs_counts(tmp_path):
     assert "Left out: 1 older runs" in paths.markdown.read_text()
 
 
+def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "orb-slam2", "s/a", study="mine")
+    add_run(store, "orb-slam2", "s/a", error=0.001, overrides={"features": 500}, study="mine")
+    with pytest.raises(ReportError, match="all 1 runs that studies made"):
+        only = RunStore(tmp_path / "only")
+        add_run(only, "orb-slam2", "s/a", overrides={"features": 500}, study="mine")
+        load_runs([only], get_protocol("tum-rgbd/v1"))
+    paths = build_report(store, tmp_path / "report", picture_seconds=0)
+    text = paths.markdown.read_text()
+    assert paths.trials == 1 and "Left out: 1 runs that studies made with settings of their own" in text
+    assert "features=500" not in text and "--trials" not in paths.html.read_text().split("The commands that")[1]
+    shown = build_report(store, tmp_path / "shown", picture_seconds=0, trials=True)
+    assert shown.trials == 0 and "features=500" in shown.markdown.read_text()
+    assert "Left out" not in shown.markdown.read_text()
+    assert "--trials" in shown.html.read_text().split("The commands that")[1]
+
+
 def test_small_and_odd_results(tmp_path):
     """One run; a sequence without ground truth; nothing but failures; hostile names."""
     one = RunStore(tmp_path / "one")

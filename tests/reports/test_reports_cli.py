@@ -50,6 +50,16 @@ def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
     assert "no run of the reference 'our' (did you mean 'ours'" in error
 
 
+def test_trials_of_studies_are_a_switch(cli, tmp_path):
+    store = RunStore(tmp_path / "results")
+    add_run(store, "orb-slam2", "s/a")
+    add_run(store, "orb-slam2", "s/a", overrides={"features": 500}, study="mine")
+    code, out, _ = cli("report", "results", "-o", "without")
+    assert code == 0 and "features=500" not in out and "Left out: 1 runs that studies made" in out
+    code, out, _ = cli("report", "results", "-o", "with", "--trials")
+    assert code == 0 and "features=500" in out and "Left out" not in out
+
+
 def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
     for place, value in (("a", 1), ("b", 2)):
         add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})

@@ -91,6 +91,9 @@ def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> N
     assert {event.run_id for event in told if event.kind == "finished"} == stored  # those of the default among them
     frames = [event.partial["frames_done"] for event in told if event.kind == "progress" and event.partial]
     assert frames and min(frames) > 0
+    records = [RunStore(tmp_path).read_whole(run_id) for run_id in stored]
+    assert {record.study for record in records} == {"toy"}
+    assert "study" not in records[0].identity
 
 
 def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_path: Path) -> None:

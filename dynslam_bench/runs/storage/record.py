@@ -161,6 +161,7 @@ class RunRecord(Record):
         provenance: For imported trajectories: where it came from.
         place: Folder of the sequence where it was named by its path; empty for an id.
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
+        study: Study that made it and nobody else asked for; empty for any other run, and in older records.
         notes: Anything a reader should know, one line each.
     """
 
@@ -210,6 +211,7 @@ class RunRecord(Record):
     provenance: str = ""
     place: str = ""
     stamps_match: bool = True
+    study: str = ""
     notes: list[str] = Field(default_factory=list)
 
     def normalised(self) -> RunRecord:
