@@ -54,6 +54,7 @@ def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_p
     assert not summary.improves, "two held-out sequences prove nothing"
     assert not summary.importances, "fourteen trials are too few"
     page = write_page(tuner, summary).read_text()
+    assert page.count("may differ from 1 though no setting was changed") >= 2, "at the figure and at the table"
     assert "Use them" not in page and "Not recommended" in page
     assert "would need 30 complete trials, there are 14" in page
     assert "from which nothing follows for others" in page and "https://" not in page.split("<script>")[0]
