@@ -12,6 +12,7 @@ import optuna
 from optuna.trial import TrialState
 
 from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block as Piece
 from dynslam_bench.reports.html.page import Section, render
@@ -370,4 +371,4 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
 def _value(value: Any) -> TableCell:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return TableCell(f"{value:.4g}", value=float(value))
-    return TableCell("" if value is None else str(value))
+    return TableCell("" if value is None else setting_text(value))

@@ -55,6 +55,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Show everything about a run."""
+    from dynslam_bench.core.toml import setting_text
     from dynslam_bench.runs import RunStore, score
     from dynslam_bench.runs.storage.run_index import part_words
 
@@ -86,7 +87,7 @@ def show(
         "keyframes": record.keyframes,
         "map_points": record.map_points,
         "maps": record.maps,
-        "overrides": [f"{name}={value}" for name, value in record.overrides.items()],
+        "overrides": [f"{name}={setting_text(value)}" for name, value in record.overrides.items()],
         "notes": record.notes,
         "command": " ".join(record.command),
     }

@@ -216,6 +216,7 @@ def _tracker_info(resolved: ResolvedRun) -> TrackerInfo:
     return TrackerInfo(
         label=resolved.spec.label or tracker.label,
         distribution=resolved.identity["distribution"],
+        given="" if resolved.spec.tracker == tracker.id else resolved.spec.tracker,
         **{name: getattr(tracker, name) for name in same},
     )
 

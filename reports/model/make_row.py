@@ -37,6 +37,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         run_id=record.run_id,
         kind="run here" if record.kind == "run" else "imported",
         tracker=tracker.id,
+        given=tracker.given,
         label=tracker.label or tracker.id,
         variant=variant_of(record),
         provenance=tracker.provenance,

@@ -25,6 +25,7 @@ class RunRow(Record):
         run_id: Its id in the store.
         kind: Made by this toolkit, or a trajectory from elsewhere.
         tracker: Tracker id.
+        given: What the tracker was named by where that is not its id, e.g. ``/path/file.py:Attr``.
         label: Tracker's label.
         variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
         provenance: How closely the tracker follows its source.
@@ -82,6 +83,7 @@ class RunRow(Record):
     run_id: str
     kind: Kind
     tracker: str
+    given: str = ""
     label: str
     variant: dict[str, Any] = Field(default_factory=dict)
     provenance: str = ""

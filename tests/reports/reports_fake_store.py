@@ -75,6 +75,7 @@ def add_run(
     settings=None,
     final_frames=None,
     study="",
+    given="",
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -102,7 +103,7 @@ def add_run(
         ok[n // 4 :] = False
     record = RunRecord(
         kind=kind, run_id=run_id, status=status, reason=reason,
-        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked),
+        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked, given=given),
         overrides=overrides or {}, seed=seed, device="cpu",
         sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
                               content=content or "", block=digest(block, 16) if block else "", noise=noise,

@@ -17,6 +17,7 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.figures.sequence import broken
 from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.model.rows import check_one_protocol, load_runs
 from dynslam_bench.reports.tables.leaderboard import leaderboard
@@ -224,6 +225,21 @@ def test_variants_of_a_tracker_are_rows_of_their_own(tmp_path):
     board = make_board([run.row for run in loaded.runs])
     assert sorted(board.labels.values()) == ["orb-slam2", "orb-slam2 · features=500"]
     assert board.reference_name == "orb-slam2"
+
+
+def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tmp_path):
+    store = RunStore(tmp_path / "r")
+    given = "/home/me/mine.py:SPEC"
+    add_run(store, "mine", "s/a", overrides={"loop": "True"}, settings={"loop": True}, given=given)
+    add_run(store, "mine", "s/b", overrides={"loop": True}, settings={"loop": True}, given=given)
+    add_run(store, "a", "s/a", overrides={"masks": "oracle"})
+    add_run(store, "a", "s/c", overrides={"masks": "oracle"})
+    add_run(store, "b", "s/a", overrides={"masks": "oracle"})
+    rows = [run.row for run in load_runs([store], get_protocol("tum-rgbd/v1")).runs]
+    assert sorted(make_board(rows).labels.values()) == ["a", "b", "mine · loop=true"]
+    row = next(row for row in rows if (row.tracker, row.sequence) == ("mine", "s/a"))
+    assert run_command(row) == f"dynslam-bench run {given} s/a --set loop=true"
+    assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
 
 
 def test_only_the_newest_of_equal_runs_counts(tmp_path):

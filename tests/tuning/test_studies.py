@@ -95,6 +95,7 @@ def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> N
     records = [RunStore(tmp_path).read_whole(run_id) for run_id in stored]
     assert {record.study for record in records} == {"toy"}
     assert "study" not in records[0].identity
+    assert {record.tracker.given for record in records} == {TRACKER}, "its id, toy, names it to nobody"
 
 
 def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_path: Path) -> None:
