@@ -81,6 +81,21 @@ def test_sheet_and_video_of_a_stored_run_are_made(cli, walk, tmp_path):
     assert json.loads(cli("run", "never-move", walk, "--sheet", "--json")[1])[0]["from_store"] is True
 
 
+def test_a_map_that_cannot_be_had_is_said_and_no_success(cli, walk):
+    for options in ((), ("--json",)):
+        code, _, err = cli("run", "never-move", walk, "--save-map", *options)
+        assert code == 3 and err.startswith("no map.npz: tracker 'never-move' cannot save its map")
+        assert err.count("\n") == 1
+    code, out, err = cli("run", "orb-slam2", walk, "--save-map")
+    assert code == 0 and err == "" and "map.npz" in out
+
+
+def test_a_run_that_was_lost_is_no_success(cli, walk):
+    toys = Path(__file__).parents[1] / "envs" / "envs_toys.py"
+    code, out, _ = cli("run", f"{toys}:SPEC", walk, "--set", "mode=lost", "--set", "at=1", "--json")
+    assert json.loads(out)[0]["status"] == "lost" and code == 3
+
+
 def test_show_counts_frames_that_were_initialising_and_closed_loops(cli, walk):
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
     out = cli("runs", "show")[1]

@@ -17,7 +17,6 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.figures.sequence import broken
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.model.rows import check_one_protocol, load_runs
 from dynslam_bench.reports.tables.leaderboard import leaderboard
@@ -227,21 +226,6 @@ def test_variants_of_a_tracker_are_rows_of_their_own(tmp_path):
     assert board.reference_name == "orb-slam2"
 
 
-def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tmp_path):
-    store = RunStore(tmp_path / "r")
-    given = "/home/me/mine.py:SPEC"
-    add_run(store, "mine", "s/a", overrides={"loop": "True"}, settings={"loop": True}, given=given)
-    add_run(store, "mine", "s/b", overrides={"loop": True}, settings={"loop": True}, given=given)
-    add_run(store, "a", "s/a", overrides={"masks": "oracle"})
-    add_run(store, "a", "s/c", overrides={"masks": "oracle"})
-    add_run(store, "b", "s/a", overrides={"masks": "oracle"})
-    rows = [run.row for run in load_runs([store], get_protocol("tum-rgbd/v1")).runs]
-    assert sorted(make_board(rows).labels.values()) == ["a", "b", "mine · loop=true"]
-    row = next(row for row in rows if (row.tracker, row.sequence) == ("mine", "s/a"))
-    assert run_command(row) == f"dynslam-bench run {given} s/a --set loop=true"
-    assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
-
-
 def test_only_the_newest_of_equal_runs_counts(tmp_path):
     store = RunStore(tmp_path / "r")
     add_run(store, "a", "s/a", error=0.3, started="2026-01-01T00:00:00+00:00")
@@ -251,24 +235,6 @@ def test_only_the_newest_of_equal_runs_counts(tmp_path):
     assert loaded.superseded == 1
     paths = build_report(store, tmp_path / "report")
     assert "Left out: 1 older runs" in paths.markdown.read_text()
-
-
-def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
-    store = RunStore(tmp_path / "r")
-    add_run(store, "orb-slam2", "s/a", study="mine")
-    add_run(store, "orb-slam2", "s/a", error=0.001, overrides={"features": 500}, study="mine")
-    with pytest.raises(ReportError, match="all 1 runs that studies made"):
-        only = RunStore(tmp_path / "only")
-        add_run(only, "orb-slam2", "s/a", overrides={"features": 500}, study="mine")
-        load_runs([only], get_protocol("tum-rgbd/v1"))
-    paths = build_report(store, tmp_path / "report", picture_seconds=0)
-    text = paths.markdown.read_text()
-    assert paths.trials == 1 and "Left out: 1 runs that studies made with settings of their own" in text
-    assert "features=500" not in text and "--trials" not in paths.html.read_text().split("The commands that")[1]
-    shown = build_report(store, tmp_path / "shown", picture_seconds=0, trials=True)
-    assert shown.trials == 0 and "features=500" in shown.markdown.read_text()
-    assert "Left out" not in shown.markdown.read_text()
-    assert "--trials" in shown.html.read_text().split("The commands that")[1]
 
 
 def test_small_and_odd_results(tmp_path):
