@@ -54,6 +54,16 @@ def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
     assert "no run of the reference 'our' (did you mean 'ours'" in error
 
 
+def test_intervals_are_named_where_there_are_any(cli, tmp_path):
+    store = RunStore(tmp_path / "results")
+    for at in range(5):
+        add_run(store, "orb-slam2", f"s/{at}")
+        add_run(store, "ours", f"s/{at}", error=0.02)
+        said = cli("report", "results", "--reference", "orb-slam2")[1] if at in (3, 4) else ""
+        assert "Geometric mean of the ATE over that of orb-slam2" in said or at < 3
+        assert ("with 95 % intervals" in said) is (at == 4), "four sequences are too few"
+
+
 def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
     store = RunStore(tmp_path / "r")
     add_run(store, "orb-slam2", "s/a", study="mine")
