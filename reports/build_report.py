@@ -43,6 +43,7 @@ class ReportPaths:
         csv: The tables as CSV, by name.
         data: All rows, for `compare`.
         leaderboard: The table that the page begins with.
+        trials: How many runs were left out since they are trials of studies.
     """
 
     html: Path
@@ -52,6 +53,7 @@ class ReportPaths:
     csv: dict[str, Path]
     data: Path
     leaderboard: Table
+    trials: int = 0
 
 
 def build_report(
@@ -62,6 +64,7 @@ def build_report(
     reference: str | None = None,
     on: On = "common",
     rank_seen: bool = False,
+    trials: bool = False,
     picture_seconds: float = PICTURE_SECONDS,
     most_frames: int = MOST_FRAMES,
     most_pages: int | None = None,
@@ -81,6 +84,7 @@ def build_report(
             run on every ranked sequence, a camera that never moves takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
+        trials: Whether the trials of studies count like other runs; without, they are left out and counted.
         picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
         most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
         most_pages: Runs that have a page of their own, typical ones of their cells first; None for `pages_for`.
@@ -102,9 +106,9 @@ def build_report(
     with hired as crew:
         if crew is not None:  # what only this process needs is loaded while it waits for them
             Thread(target=import_module, args=("scipy.stats",), daemon=True).start()
-        loaded = load_runs(stores, protocol, on_progress, crew, reference)
+        loaded = load_runs(stores, protocol, on_progress, crew, reference, trials=trials)
         board = make_board([run.row for run in loaded.runs], reference, on, rank_seen=rank_seen)
-        again = command or _command([store.root for store in stores], output, board, most_pages)
+        again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
         explored = write_explore(
             board, loaded, protocol, output, title=title, crew=crew,
             picture_seconds=picture_seconds, most_frames=most_frames, most_pages=most_pages,
@@ -113,7 +117,7 @@ def build_report(
         on_progress(0, None, "putting the tables and figures together")
         draft = _drafted(board, protocol, loaded, explored, again, crew)
     on_progress(0, None, "writing")
-    return _write(draft, board, output, _data(board, protocol, title))
+    return _write(draft, board, output, _data(board, protocol, title), loaded.trials)
 
 
 def _data(board: Board, protocol: Protocol, title: str) -> ReportData:
@@ -144,16 +148,16 @@ def _drafted(
     return draft
 
 
-def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None) -> str:
+def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool) -> str:
     """The command that makes the report again."""
     words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
     words += ["--on", board.on] if board.on != "common" else []
     words += ["--reference", board.asked_reference] if board.asked_reference else []
     words += ["--most-pages", str(most_pages)] if most_pages is not None else []
-    return shlex.join(words + ["--rank-seen"] * board.rank_seen)
+    return shlex.join(words + ["--rank-seen"] * board.rank_seen + ["--trials"] * trials)
 
 
-def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> ReportPaths:
+def _write(draft: Draft, board: Board, output: Path, data: ReportData, trials: int) -> ReportPaths:
     facts = _facts(board)
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     footer = f"Made by dynslam-bench {data.version} on {now}. This page works without a network."
@@ -166,6 +170,7 @@ def _write(draft: Draft, board: Board, output: Path, data: ReportData) -> Report
         csv={name: output / "csv" / f"{name}.csv" for name in names},
         data=output / REPORT_FILE,
         leaderboard=next(table for table in draft.tables if table.id == "leaderboard"),
+        trials=trials,
     )
     page = render(draft.sections, draft.figures, title=data.title, protocol=data.protocol, facts=facts, footer=footer)
     for table in draft.tables:

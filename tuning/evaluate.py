@@ -66,6 +66,7 @@ def evaluate(
     threads: int = 1,
     cache: bool = False,
     data_root: str | None = None,
+    study: str = "",
     cancelled: Callable[[], bool] | None = None,
     on_run: Callable[[RunEvent], None] | None = None,
 ) -> dict[Block, Outcome]:
@@ -81,6 +82,7 @@ def evaluate(
         threads: Threads of a run.
         cache: Whether runs use the stage cache; times are then those of when its entries were made.
         data_root: Folder of the recorded sequences.
+        study: Name of the study that the runs are made for, which their records keep.
         cancelled: Asked many times a second; True ends the runs at once.
         on_run: Told of every run, also while it goes on; by several threads where `jobs` is more than 1.
 
@@ -100,7 +102,9 @@ def evaluate(
         return stop[0] or (cancelled is not None and cancelled())
 
     def one(block: Block) -> Outcome:
-        spec = block.run_spec(tracker, settings=dict(settings), threads=threads, cache=cache, data_root=data_root)
+        spec = block.run_spec(
+            tracker, settings=dict(settings), threads=threads, cache=cache, data_root=data_root, study=study
+        )
         if ended():
             raise CancelledError(str(block))
         (record,) = run_many([spec], results=store, protocol=held, cancelled=ended, on_event=on_run)

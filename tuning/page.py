@@ -12,6 +12,7 @@ import optuna
 from optuna.trial import TrialState
 
 from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block as Piece
 from dynslam_bench.reports.html.page import Section, render
@@ -20,6 +21,7 @@ from dynslam_bench.reports.model.row_values import command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 
 from .blocks import Block, scenes
+from .design import FEWEST_STARTS, Design
 from .importance import FEWEST_TRIALS, importances, inert_parameters
 from .page_figures import MOST_SLICES, Star, front, history, settings_table, slices
 from .preset import preset_text
@@ -49,7 +51,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     summary = summary.model_copy(update={"seen": splits_seen(tuner.defaults, tuner.design)})
     tables = [_candidates(summary), _trials(tuner, summary), _settings(tuner, summary)]
     figures = _figures(tuner, summary)
-    result = [Piece("table", table=tables[0]), *_shown(figures, "ratios")]
+    result = [Piece("table", table=tables[0]), *_shown(tuner, figures, "ratios")]
     sections = [
         Section("result", "What the study found", "Result", _found(summary), result),
         Section(
@@ -59,11 +61,11 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             _picks(summary),
             _preset(tuner, summary, tables[2]),
         ),
-        Section("course", "How it went", "Course", warnings_of(tuner), _shown(figures, "history", "front")),
+        Section("course", "How it went", "Course", warnings_of(tuner), _shown(tuner, figures, "history", "front")),
         Section("parameters", "Which settings matter", "Parameters", _importance_notes(tuner, summary), []),
         Section("trials", "All trials", "Trials", [], [Piece("table", table=tables[1])]),
     ]
-    sections[3].blocks += _shown(figures, "importances", "slices")
+    sections[3].blocks += _shown(tuner, figures, "importances", "slices")
     for table in tables:
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
     states = summary.trials
@@ -229,16 +231,31 @@ def _ratio_trace(name: str, points: list[tuple[str, Ratio]], colour: str, symbol
     return trace | {"marker": {"size": 11, "color": colour, "symbol": symbol}}
 
 
-def _shown(figures: dict[str, dict[str, Any]], *names: str) -> list[Piece]:
+def _shown(tuner: Tuner, figures: dict[str, dict[str, Any]], *names: str) -> list[Piece]:
     captions = {
         "ratios": "Ratio to the default settings and its 95 % interval: on the blocks of the choice (confirm), which "
         "no trial had seen, and, for the choice alone, on the held-out blocks and on recordings.",
-        "history": "Every trial that came to the end of the race, on its own blocks; trial 0 is the default.",
+        "history": "Every trial that came to the end of the race, on its own blocks; trial 0 is the default."
+        + fewer_starts(tuner.design),
         "front": "One objective against the other, with those that no other trial beats in both.",
         "importances": "",
         "slices": "The first settings (by importance where that is known) against the objective.",
     }
     return [Piece("figure", figure=name, caption=captions[name]) for name in names if name in figures]
+
+
+def fewer_starts(design: Design) -> str:
+    """Why the default itself may have another ratio than 1; empty where it has 1, since all ran from the same starts.
+
+    It has no start beside those of the trials where they have `FEWEST_STARTS` or more at every place.
+    """
+    if len(design.reference) == len(design.race):
+        return ""
+    return (
+        f" Ratios are to the median of the default over {FEWEST_STARTS} or more starts in each scene, but every trial, "
+        "the default as trial 0 too, ran from fewer: so the ratio of trial 0, and with it the best so far, may differ "
+        "from 1 though no setting was changed."
+    )
 
 
 def warnings_of(tuner: Tuner) -> list[str]:
@@ -346,11 +363,12 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     headings = _marked(summary, *((f"ratio of {each.what}", "tune") for each in tuner.objectives))
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings)]
     columns += numbers("coverage", "fps", *names)
-    caption = f"Reasons of dropped (pruned) and failed trials stand behind their state.{_cautions(summary)}"
+    caption = "Reasons of dropped (pruned) and failed trials stand behind their state."
+    caption += fewer_starts(tuner.design) + _cautions(summary)
     return Table("trials", "All trials", caption, columns, rows)
 
 
 def _value(value: Any) -> TableCell:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return TableCell(f"{value:.4g}", value=float(value))
-    return TableCell("" if value is None else str(value))
+    return TableCell("" if value is None else setting_text(value))

@@ -9,6 +9,7 @@ from typing import Any
 from optuna.trial import FrozenTrial
 
 from dynslam_bench.core.settings import Parameter, Scalar
+from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.figures.style import axis, guide, layout_of, log_axis, significant
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number
 
@@ -61,7 +62,7 @@ def slices(
         for trial in trials:
             value = trial.params.get(parameter.name, default.get(parameter.name) if trial.number == 0 else None)
             if value is not None:
-                points.append((trial.number, value if _is_number(value) else str(value), ratios(trial)[0]))
+                points.append((trial.number, value if _is_number(value) else setting_text(value), ratios(trial)[0]))
         kind = "category" if any(isinstance(x, str) for _, x, _ in points) else parameter.scale
         layout[f"xaxis{tag}"] = axis(parameter.name, type=kind)
         title = f"ratio of {what} to the default" if at == 0 else ""
@@ -142,10 +143,10 @@ def _is_number(value: object) -> bool:
 def _value(value: Scalar | None) -> TableCell:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return number(float(value), ".4g")
-    return TableCell("–" if value is None else str(value))
+    return TableCell("–" if value is None else setting_text(value))
 
 
 def _range(parameter: Parameter) -> str:
     if parameter.low is None or parameter.high is None:
-        return ", ".join(map(str, parameter.choices)) or "true, false"
+        return ", ".join(map(setting_text, parameter.choices)) or "true, false"
     return f"{parameter.low:g} to {parameter.high:g}{', log' * (parameter.scale == 'log')}"

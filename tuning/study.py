@@ -183,7 +183,7 @@ class Tuner:
         return evaluate(
             self.spec.tracker, settings, blocks, results=self.store, jobs=jobs, protocol=self.spec.protocol,
             threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
-            data_root=self.spec.data_root, cancelled=self._interrupted.is_set, on_run=self.on_run,
+            data_root=self.spec.data_root, study=self.spec.name, cancelled=self._interrupted.is_set, on_run=self.on_run,
         )  # fmt: skip
 
     def evaluate_beside(

@@ -8,8 +8,8 @@ __all__ = ["main"]
 def main() -> None:
     """Entry point of ``dynslam-bench``.
 
-    Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed, 4 verification failed,
-    128 and the signal's number after one (130 for Ctrl-C).
+    Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed or were lost (or could not
+    write the map that was asked for), 4 verification failed, 128 and the signal's number after one (130 for Ctrl-C).
     """
     from .ending import leave_interrupted, watch_signals
 

@@ -48,6 +48,9 @@ def make(
     rank_seen: Annotated[
         bool, typer.Option("--rank-seen", help="Rank also where the network behind the masks was trained.")
     ] = False,
+    trials: Annotated[
+        bool, typer.Option("--trials", help="Show the trials of studies, too, which are left out otherwise.")
+    ] = False,
     most_pages: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(min=0, help="Runs that have a page of their own; default all of up to 5000, of more some 2000."),
@@ -58,6 +61,7 @@ def make(
     """Make an offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it."""
     from dynslam_bench.core.errors import ReportError
     from dynslam_bench.reports import build_report
+    from dynslam_bench.reports.model.rows import trial_words
 
     if on not in ("common", "all"):
         raise ReportError(f"--on is 'common' or 'all', got '{on}'")
@@ -71,6 +75,7 @@ def make(
             title=title,
             on="all" if on == "all" else "common",
             rank_seen=rank_seen,
+            trials=trials,
             most_pages=most_pages,
             on_progress=advance,
         )
@@ -78,6 +83,8 @@ def make(
         write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})
     else:
         show_top(paths.leaderboard)
+        if paths.trials:
+            write(wrapped(f"Left out: {trial_words(paths.trials)}."))
         write(str(paths.html))
 
 

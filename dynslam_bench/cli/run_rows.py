@@ -61,16 +61,23 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
         write("ATE: of the tracked frames alone; not moving: of all. A report counts a lost frame as not having moved.")
 
 
-def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> None:
-    """Where the pictures of runs lie; on standard error for which runs there are none, and why."""
+def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> set[str]:
+    """Where the pictures and maps of runs lie; on standard error for which runs there are none, and why.
+
+    Returns:
+        The names of which a run has none.
+    """
+    missing = set[str]()
     by_id = {record.run_id: record for record in records}
     for (run_id, record), name in product(by_id.items(), names):
         path = store.folder(run_id) / name
         if not path.is_file():
+            missing.add(name)
             ended = f"no {name}: the run ended early, {record.status}"
             complain(f"{next((text for text in record.notes if text.startswith(f'no {name}')), ended)} ({run_id})")
         elif not as_json:
             write(str(path))
+    return missing
 
 
 def seen_note(records: Sequence[RunRecord]) -> str:

@@ -256,19 +256,20 @@ def finish(
     as_json: bool,
     scheduler: str | None = None,
 ) -> None:
-    """Make runs, show them, and exit with 3 if some failed."""
+    """Make runs, show them, and exit with 3 if some failed or were lost, or have no map though it was asked for."""
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.many import pictures_asked
+    from dynslam_bench.slam.mapping.saved_map import MAP_FILE
 
     store = RunStore(results)
     reused: set[str] = set()
     records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
-    show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
+    missing = show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
     if seen := seen_note(records):
         note(seen)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
-    if any(record.failed for record in records):
+    if MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -11,6 +12,9 @@ from . import completion
 from .options import AsJson, ProtocolId, Results
 from .output import complain, progress, write, write_fields, write_json, write_table
 from .run_rows import show_rows
+
+if TYPE_CHECKING:
+    from dynslam_bench.runs import RunStore
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
@@ -55,6 +59,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Show everything about a run."""
+    from dynslam_bench.core.toml import setting_text
     from dynslam_bench.runs import RunStore, score
     from dynslam_bench.runs.storage.run_index import part_words
 
@@ -75,6 +80,7 @@ def show(
         "frames": record.n_frames,
         "tracked": record.n_tracked,
         "lost": record.n_lost,
+        "initialising": record.n_initialising or None,
         "coverage": record.coverage,
         "repeat": record.repeat,
         "masks": record.segmentation,
@@ -86,7 +92,8 @@ def show(
         "keyframes": record.keyframes,
         "map_points": record.map_points,
         "maps": record.maps,
-        "overrides": [f"{name}={value}" for name, value in record.overrides.items()],
+        "loops closed": closed_loops(store, record.run_id),
+        "overrides": [f"{name}={setting_text(value)}" for name, value in record.overrides.items()],
         "notes": record.notes,
         "command": " ".join(record.command),
     }
@@ -107,6 +114,19 @@ def show(
         write_table(("metric", "value"), sorted(evaluation.metrics.items()))
         for line in evaluation.diagnostics:
             write(f"  {line}")
+
+
+def closed_loops(store: RunStore, run_id: str) -> int | None:
+    """How many loops a run had closed at its end; None where its table of frames does not tell, or is damaged."""
+    from contextlib import suppress
+
+    from dynslam_bench.core.errors import RunError
+    from dynslam_bench.runs.frame_row import CSV_FILE, read_csv
+
+    told: list[float] = []
+    with suppress(RunError):
+        told = [row.stats["loops"] for row in read_csv(store.folder(run_id) / CSV_FILE) if "loops" in row.stats]
+    return int(told[-1]) if told and isfinite(told[-1]) else None
 
 
 @app.command()

@@ -97,7 +97,9 @@ def info(
 
 def _assigned(values: Mapping[str, Any]) -> str:
     """Settings as ``--set`` takes them."""
-    return ", ".join(f"{name}={value}" for name, value in values.items())
+    from dynslam_bench.core.toml import setting_text
+
+    return ", ".join(f"{name}={setting_text(value)}" for name, value in values.items())
 
 
 def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:

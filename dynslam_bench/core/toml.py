@@ -60,6 +60,11 @@ def read_settings(path: Path) -> dict[str, Any]:
     return dict(_flatten(values))
 
 
+def setting_text(value: Any) -> str:
+    """A setting's value for people and for ``--set``: spelled as in TOML (``true``, not ``True``), without quotes."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     found: list[tuple[str, Any]] = []
     for key, value in values.items():

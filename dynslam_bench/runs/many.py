@@ -67,8 +67,9 @@ def run_many(
     """Make the runs that are not stored yet, and score all of them.
 
     Everything is looked up before the first run begins. A stored run is made again if a video, a sheet or its map is
-    asked for that it lacks; one that is given another label gets that. Each run is a child process; a failure is a
-    record like any other and stops nothing. Interrupting leaves the finished runs stored, so calling again goes on from
+    asked for that it lacks; one that is given another label gets that, and one that a study made is an ordinary run
+    once it is asked for without the study. Each run is a child process; a failure is a record like any other and stops
+    nothing. Interrupting leaves the finished runs stored, so calling again goes on from
     there. Several processes may do so at a time on one results folder: each run is made by one of them (not with
     `executor`).
 
@@ -172,6 +173,8 @@ class _Bench:
     def reuse(self, run: ResolvedRun, record: RunRecord) -> RunRecord:
         if run.spec.label not in ("", record.tracker.label):
             record = self.store.relabel(record, run.spec.label)
+        if record.study and not run.spec.study:
+            record = self.store.leave_study(record)
         score(self.store, record, self.protocol)
         self.tell("reused", run, record=record)
         return record

@@ -206,7 +206,7 @@ def _notes(resolved: ResolvedRun) -> list[str]:
     return ([CACHED_TIMES] if resolved.spec.cache else []) + begun
 
 
-_AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share")
+_AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")
 """What a record takes from the request as it is."""
 
 
@@ -216,6 +216,7 @@ def _tracker_info(resolved: ResolvedRun) -> TrackerInfo:
     return TrackerInfo(
         label=resolved.spec.label or tracker.label,
         distribution=resolved.identity["distribution"],
+        given="" if resolved.spec.tracker == tracker.id else resolved.spec.tracker,
         **{name: getattr(tracker, name) for name in same},
     )
 

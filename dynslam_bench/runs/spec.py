@@ -60,6 +60,7 @@ class RunSpec(Record):
         rrd: Whether to write ``recording.rrd`` for rerun's viewer.
         save_map: Whether to write ``map.npz``, from which a later run may start (setting ``backend.map.file``).
         label: Name in tables, in place of the tracker's; no part of the run's identity.
+        study: Study that makes it; empty for any other run; no part of the run's identity.
         limits: What it may take.
     """
 
@@ -85,6 +86,7 @@ class RunSpec(Record):
     rrd: bool = False
     save_map: bool = False
     label: str = ""
+    study: str = ""
     limits: Limits = Field(default_factory=Limits)
 
     @field_validator("frames", mode="before")

@@ -18,6 +18,7 @@ from ..figures.sequence import broken
 from ..figures.style import significant
 from ..model.missing import run_command
 from ..model.rows import LoadedRun
+from ..tables.metric import DOUBT
 from .run_frames import COUNTS, RunFrames
 from .side_files import packed_rows
 
@@ -156,7 +157,18 @@ def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None, most: i
         "angles": _angles(aligned, true),
         "true_angles": _angles(true, true),
     }
-    return _packed_track(aligned, columns, most) | {"alignment": protocol.alignment}
+    return _packed_track(aligned, columns, most) | {"alignment": protocol.alignment, "doubt": _rotation_doubt(run)}
+
+
+def _rotation_doubt(run: LoadedRun) -> str:
+    """Why the angles of an aligned track say nothing of the tracker; empty where they do."""
+    uncertainty = run.row.rotation_uncertainty_deg
+    if run.row.rotation_reliable or uncertainty is None:
+        return ""
+    return (
+        f"{DOUBT} Rotation is unreliable: the path hardly determines the alignment's rotation (standard error "
+        f"{uncertainty:.0f}°), which turns all angles shown here. Positions are not affected."
+    )
 
 
 def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from ..model.crew import Crew
 from ..model.missing import missing_commands, missing_note
 from ..model.published import is_excerpt, least_length_s, reported_for
 from ..model.records import records_for
-from ..model.rows import Loaded, without_scale_words
+from ..model.rows import Loaded, trial_words, without_scale_words
 from ..model.statistics import FEWEST, power_note
 from ..tables import fairness as fairness_tables
 from ..tables import leaderboard as tables
@@ -65,6 +65,8 @@ def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list
         notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
     if loaded.without_scale:
         notes.append(f"Left out: {without_scale_words(loaded.without_scale, protocol)}.")
+    if loaded.trials:
+        notes.append(f"Left out: {trial_words(loaded.trials)}.")
     return notes
 
 

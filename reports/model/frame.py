@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dynslam_bench.core.toml import setting_text
+
 from .row import RunRow
 
 if TYPE_CHECKING:
@@ -64,7 +66,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
 
 def _own(row: RunRow, columns: Mapping[str, str], labels: Mapping[str, str]) -> tuple[str, str, str]:
     """What a row alone does not know, under the names `_OWN`."""
-    settings = "; ".join(f"{name}={value}" for name, value in row.variant.items())
+    settings = "; ".join(f"{name}={setting_text(value)}" for name, value in row.variant.items())
     return labels[row.variant_key], columns[row.column_id], settings
 
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+
+from dynslam_bench.core.toml import setting_text
 
 from .row import SEEN, RunRow
 
 ALWAYS = ("map", "backend.map.localisation_only")
 """Named in any table: a run that begins in a map knows more than one that begins without."""
+OF_ALL = {"device", "threads"}
+"""What every run has a value of, asked for or not."""
 
 
 def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants.
 
+    What one tracker alone was asked for is named though it has no other variant; what several were, as all that a suite
+    runs, is not.
     Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
     """
     seen = {row.variant_key for row in rows if row.seen_in_training}
@@ -25,16 +31,23 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
         by_tracker.setdefault(row.tracker, []).append(row)
         by_label.setdefault(row.label, set()).add(row.tracker)
     differing_of = {tracker: _differing(others) for tracker, others in by_tracker.items()}
+    single = {tracker: _single(tracker, by_tracker) for tracker in by_tracker}
     kinds = {tracker: {other.kind for other in others} for tracker, others in by_tracker.items()}
     labels = {}
     for key, row in variants.items():
-        shown = {*differing_of[row.tracker], *ALWAYS}
-        parts = [f"{name}={value}" for name, value in sorted(row.variant.items()) if name in shown]
+        shown = {*differing_of[row.tracker], *ALWAYS, *single[row.tracker]}
+        parts = [f"{name}={setting_text(value)}" for name, value in sorted(row.variant.items()) if name in shown]
         if row.imported and len(kinds[row.tracker]) > 1:
             parts.append("imported")
         base = f"{row.label} <{row.tracker}>" if len(by_label[row.label]) > 1 else row.label
         labels[key] = base + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in seen)
     return labels
+
+
+def _single(tracker: str, by_tracker: Mapping[str, Sequence[RunRow]]) -> list[str]:
+    """What only this tracker was asked for."""
+    asked = {each: {name for row in rows for name in row.variant} - OF_ALL for each, rows in by_tracker.items()}
+    return sorted(asked[tracker].difference(*(names for each, names in asked.items() if each != tracker)))
 
 
 def _differing(variants: Sequence[RunRow]) -> list[str]:

@@ -20,13 +20,17 @@ if TYPE_CHECKING:
 
 
 def load_frame(
-    results: Sequence[Path] | Sequence[str] | RunStore | Path | str, protocol: Protocol | str = "tum-rgbd/v1"
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    trials: bool = False,
 ) -> pd.DataFrame:
     """All runs of some results folders, scored under one protocol, one row a run.
 
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
+        trials: As in `build_report`.
 
     Returns:
         The frame that `rows_frame` describes.
@@ -34,7 +38,7 @@ def load_frame(
     Raises:
         ReportError: There are no runs.
     """
-    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol)).runs]
+    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol), trials=trials).runs]
     return rows_frame(rows, name_columns(rows), make_labels(rows))
 
 
@@ -45,6 +49,7 @@ def load_board(
     reference: str | None = None,
     on: On = "common",
     rank_seen: bool = False,
+    trials: bool = False,
 ) -> Board:
     """The board of some results folders: all runs, ordered and ranked as in a report.
 
@@ -54,9 +59,11 @@ def load_board(
         reference: As in `make_board`.
         on: As in `make_board`.
         rank_seen: As in `make_board`.
+        trials: As in `build_report`.
 
     Raises:
         ReportError: As `make_board`.
     """
-    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol), reference=reference).runs]
+    loaded = load_runs(open_stores(results), get_protocol(protocol), reference=reference, trials=trials)
+    rows = [run.row for run in loaded.runs]
     return make_board(rows, reference, on, rank_seen=rank_seen)

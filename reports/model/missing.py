@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterable
 
+from dynslam_bench.core.toml import setting_text
+
 from .board import Board
 from .row import RunRow
 
@@ -52,7 +54,7 @@ def missing_commands(board: Board) -> list[str]:
         repeats = ["--seed", *map(str, seeds)] if seeds != [0] else []
         repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
         for part, names in wanted.items():
-            words = ["dynslam-bench", "run", row.tracker, *names, *part, *repeats, *_settings(row)]
+            words = ["dynslam-bench", "run", row.given or row.tracker, *names, *part, *repeats, *_settings(row)]
             commands.append(shlex.join(words))
     return commands
 
@@ -61,7 +63,7 @@ def run_command(row: RunRow) -> str:
     """The command that makes one run again; empty for an imported trajectory."""
     if row.imported:
         return ""
-    words = ["dynslam-bench", "run", row.tracker, row.place or row.sequence, *row.part_options]
+    words = ["dynslam-bench", "run", row.given or row.tracker, row.place or row.sequence, *row.part_options]
     words += ["--seed", str(row.seed)] if row.seed else []
     words += ["--offset", str(row.offset)] if row.offset else []
     return shlex.join([*words, *_settings(row)])
@@ -88,7 +90,7 @@ def _settings(row: RunRow) -> list[str]:
         elif name.startswith("degrade."):
             words += ["--degrade", f"{name.removeprefix('degrade.')}={value}"]
         else:
-            words += ["--set", f"{name}={value}"]
+            words += ["--set", f"{name}={setting_text(value)}"]
     return words
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from itertools import product
 from statistics import median
 
+from dynslam_bench.core.toml import setting_text
+
 from .cell import make_cell
 from .labels import make_labels
 from .row import SEEN, RunRow
@@ -69,7 +71,7 @@ def differences(a: Side, b: Side, one: str, other: str) -> list[str]:
     words = []
     for name in _differing(first, second):
         before, after = first.variant.get(name, "default"), second.variant.get(name, "default")
-        words.append(f"{name}: {before} in A, {after} in B")
+        words.append(f"{name}: {setting_text(before)} in A, {setting_text(after)} in B")
     return words
 
 

@@ -25,6 +25,7 @@ class RunRow(Record):
         run_id: Its id in the store.
         kind: Made by this toolkit, or a trajectory from elsewhere.
         tracker: Tracker id.
+        given: What the tracker was named by where that is not its id, e.g. ``/path/file.py:Attr``.
         label: Tracker's label.
         variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
         provenance: How closely the tracker follows its source.
@@ -71,6 +72,7 @@ class RunRow(Record):
         segmentation: Source of the masks.
         seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
             does not rank unless that is asked for.
+        study: Study of which the run is a trial, with settings of its own; empty for any other run.
         started: UTC, ISO 8601.
         log: Path of the run's log.
         command: Command line that made it.
@@ -81,6 +83,7 @@ class RunRow(Record):
     run_id: str
     kind: Kind
     tracker: str
+    given: str = ""
     label: str
     variant: dict[str, Any] = Field(default_factory=dict)
     provenance: str = ""
@@ -124,6 +127,7 @@ class RunRow(Record):
     mask_iou: float | None = None
     segmentation: str = ""
     seen_in_training: bool = False
+    study: str = ""
     started: str = ""
     log: str = ""
     command: str = ""

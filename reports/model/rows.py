@@ -77,6 +77,7 @@ class Loaded:
         superseded: How many older ones there were.
         stopped: How many runs were left out since they were ended on request.
         without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
+        trials: How many were left out since they are trials of studies.
         unreadable: Folders without a valid record, with reasons.
     """
 
@@ -84,6 +85,7 @@ class Loaded:
     superseded: int = 0
     stopped: int = 0
     without_scale: int = 0
+    trials: int = 0
     unreadable: list[str] = field(default_factory=list)
 
     @cached_property
@@ -98,6 +100,8 @@ def load_runs(
     on_progress: OnProgress = unheard,
     crew: Crew | None = None,
     reference: str | None = None,
+    *,
+    trials: bool = False,
 ) -> Loaded:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
 
@@ -107,6 +111,7 @@ def load_runs(
         on_progress: As in `build_report`.
         crew: Helpers that score the runs; None to score them here.
         reference: Id of a tracker of which there must be runs, looked for before anything is scored; None for any.
+        trials: Whether trials of studies count like other runs.
 
     Raises:
         ReportError: There is no run at all, or none of the reference.
@@ -120,8 +125,12 @@ def load_runs(
         (store, each) for store, (known, _), new in zip(sources, kept, taken, strict=True) for each in (*known, *new)
     ]
     ended = [LoadedRun(each.row, each.part, store) for store, each in everything if each.row is not None]
-    found = [run for run in ended if protocol.finds_scale or not run.row.monocular]
-    loaded = Loaded(stopped=len(everything) - len(ended), without_scale=len(ended) - len(found), unreadable=unreadable)
+    scaled = [run for run in ended if protocol.finds_scale or not run.row.monocular]
+    found = [run for run in scaled if trials or not run.row.study]
+    loaded = Loaded(
+        stopped=len(everything) - len(ended), without_scale=len(ended) - len(scaled), trials=len(scaled) - len(found),
+        unreadable=unreadable,
+    )  # fmt: skip
     _join_old_imports(found)
     newest: dict[tuple[object, ...], LoadedRun] = {}
     for run in sorted(found, key=lambda run: (run.row.started, run.row.run_id)):
@@ -129,6 +138,8 @@ def load_runs(
     loaded.superseded = len(found) - len(newest)
     if not newest and loaded.without_scale:
         raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
+    if not newest and loaded.trials:
+        raise ReportError(f"all {trial_words(loaded.trials)}")
     if not newest:
         places = ", ".join(str(store.root) for store in sources)
         raise ReportError(
@@ -143,6 +154,14 @@ def without_scale_words(count: int, protocol: Protocol) -> str:
     return (
         f"{count} runs of monocular trackers: their scale is unknown and {protocol.id} aligns without scale; "
         f"--protocol {MONOCULAR} shows them"
+    )
+
+
+def trial_words(count: int) -> str:
+    """Why trials of studies are in no table, and which option shows them."""
+    return (
+        f"{count} runs that studies made with settings of their own, tried out on these very sequences; "
+        "'report --trials' shows them"
     )
 
 

@@ -51,7 +51,8 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         rows.append(cells)
     columns = _columns(board, epipolar)
     caption = _caption(board, protocol, epipolar)
-    brief = f"Geometric mean of the ATE over that of {board.reference_name}, with 95 % intervals"
+    brief = f"Geometric mean of the ATE over that of {board.reference_name}"
+    brief += ", with 95 % intervals" * any(_has_interval(standing.ratio) for standing in board.standings)
     return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
 
 
@@ -208,9 +209,12 @@ def wins_cell(standing: Standing) -> TableCell:
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
     """A value with its interval, if it has one."""
-    known = math.isfinite(interval.low) and math.isfinite(interval.high)
-    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if known else ""
+    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if _has_interval(interval) else ""
     return TableCell(f"{interval.value:{digits}}", small, interval.value, emphasis)
+
+
+def _has_interval(interval: Interval) -> bool:
+    return math.isfinite(interval.low) and math.isfinite(interval.high)
 
 
 def skipped_cell(rows: Sequence[RunRow]) -> TableCell:

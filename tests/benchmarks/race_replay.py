@@ -34,7 +34,7 @@ Grid = dict[str, Errors]
 def recorded(folders: list[Path]) -> Grid:
     """ATE in metres of every configuration on the blocks that all of them ran on."""
     grid: Grid = {}
-    for run in load_runs([RunStore(folder) for folder in folders], get_protocol("tum-rgbd/v1")).runs:
+    for run in load_runs([RunStore(folder) for folder in folders], get_protocol("tum-rgbd/v1"), trials=True).runs:
         row = run.row
         if row.score_m is not None:
             grid.setdefault(row.variant_key, {})[Block(row.sequence, offset=row.offset, seed=row.seed)] = row.score_m

@@ -1,8 +1,10 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
 import json
+import re
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from cli_errors import one_line
@@ -63,8 +65,6 @@ def test_bench_has_limits(cli, walk, tmp_path):
 
 
 def test_sheet_and_video_of_a_stored_run_are_made(cli, walk, tmp_path):
-    from pathlib import Path
-
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
     folder = Path(row["folder"])
     assert row["status"] == "ok", row
@@ -79,6 +79,43 @@ def test_sheet_and_video_of_a_stored_run_are_made(cli, walk, tmp_path):
     assert cli("run", "never-move", walk, "--sheet")[0] == 0
     assert "no sheet.png: the tracker offers neither keyframes nor a map" in cli("runs", "show")[1]
     assert json.loads(cli("run", "never-move", walk, "--sheet", "--json")[1])[0]["from_store"] is True
+
+
+def test_a_map_that_cannot_be_had_is_said_and_no_success(cli, walk):
+    for options in ((), ("--json",)):
+        code, _, err = cli("run", "never-move", walk, "--save-map", *options)
+        assert code == 3 and err.startswith("no map.npz: tracker 'never-move' cannot save its map")
+        assert err.count("\n") == 1
+    code, out, err = cli("run", "orb-slam2", walk, "--save-map")
+    assert code == 0 and err == "" and "map.npz" in out
+
+
+def test_a_run_that_was_lost_is_no_success(cli, walk):
+    toys = Path(__file__).parents[1] / "envs" / "envs_toys.py"
+    code, out, _ = cli("run", f"{toys}:SPEC", walk, "--set", "mode=lost", "--set", "at=1", "--json")
+    assert json.loads(out)[0]["status"] == "lost" and code == 3
+
+
+def test_show_counts_frames_that_were_initialising_and_closed_loops(cli, walk):
+    (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
+    out = cli("runs", "show")[1]
+    assert "initialising" not in out and re.search(r"^loops closed +0$", out, re.MULTILINE), out
+    folder = Path(row["folder"])
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(record | {"n_initialising": 3}))
+    heading, *lines = (folder / "frames.csv").read_text().splitlines()
+    at = heading.split(",").index("stat_loops")
+    cells = lines[-1].split(",")
+    last = ",".join([*cells[:at], "2.0", *cells[at + 1 :]])
+    (folder / "frames.csv").write_text("\n".join([heading, *lines[:-1], last, ""]))
+    out = cli("runs", "show")[1]
+    assert re.search(r"^initialising +3$", out, re.MULTILINE)
+    assert re.search(r"^loops closed +2$", out, re.MULTILINE)
+    (folder / "frames.csv").write_text("damaged")
+    code, out, _ = cli("runs", "show")
+    assert code == 0 and "loops" not in out
+    cli("run", "never-move", walk)
+    assert "loops" not in cli("runs", "show")[1]
 
 
 def test_info_tells_a_program_what_it_may_set(cli):

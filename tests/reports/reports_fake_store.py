@@ -74,6 +74,8 @@ def add_run(
     masks="",
     settings=None,
     final_frames=None,
+    study="",
+    given="",
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -101,7 +103,7 @@ def add_run(
         ok[n // 4 :] = False
     record = RunRecord(
         kind=kind, run_id=run_id, status=status, reason=reason,
-        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked),
+        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked, given=given),
         overrides=overrides or {}, seed=seed, device="cpu",
         sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
                               content=content or "", block=digest(block, 16) if block else "", noise=noise,
@@ -113,7 +115,7 @@ def add_run(
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
         started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
-        mask_iou=mask_iou, segmentation=masks, command=list(command), settings=settings or {},
+        mask_iou=mask_iou, segmentation=masks, command=list(command), settings=settings or {}, study=study,
     )  # fmt: skip
     with store.work_folder(run_id) as work:
         if ok.any() and online:

@@ -6,6 +6,10 @@ import pytest
 from reports_fake_store import add_run
 
 from dynslam_bench.cli.app import start
+from dynslam_bench.core.errors import ReportError
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports import build_report
+from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.runs.storage.store import RunStore
 
 
@@ -48,6 +52,44 @@ def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
     code, _, error = cli("report", "results", "--reference", "our")
     assert code == 1
     assert "no run of the reference 'our' (did you mean 'ours'" in error
+
+
+def test_intervals_are_named_where_there_are_any(cli, tmp_path):
+    store = RunStore(tmp_path / "results")
+    for at in range(5):
+        add_run(store, "orb-slam2", f"s/{at}")
+        add_run(store, "ours", f"s/{at}", error=0.02)
+        said = cli("report", "results", "--reference", "orb-slam2")[1] if at in (3, 4) else ""
+        assert "Geometric mean of the ATE over that of orb-slam2" in said or at < 3
+        assert ("with 95 % intervals" in said) is (at == 4), "four sequences are too few"
+
+
+def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "orb-slam2", "s/a", study="mine")
+    add_run(store, "orb-slam2", "s/a", error=0.001, overrides={"features": 500}, study="mine")
+    with pytest.raises(ReportError, match="all 1 runs that studies made"):
+        only = RunStore(tmp_path / "only")
+        add_run(only, "orb-slam2", "s/a", overrides={"features": 500}, study="mine")
+        load_runs([only], get_protocol("tum-rgbd/v1"))
+    paths = build_report(store, tmp_path / "report", picture_seconds=0)
+    text = paths.markdown.read_text()
+    assert paths.trials == 1 and "Left out: 1 runs that studies made with settings of their own" in text
+    assert "features=500" not in text and "--trials" not in paths.html.read_text().split("The commands that")[1]
+    shown = build_report(store, tmp_path / "shown", picture_seconds=0, trials=True)
+    assert shown.trials == 0 and "features=500" in shown.markdown.read_text()
+    assert "Left out" not in shown.markdown.read_text()
+    assert "--trials" in shown.html.read_text().split("The commands that")[1]
+
+
+def test_trials_of_studies_are_a_switch(cli, tmp_path):
+    store = RunStore(tmp_path / "results")
+    add_run(store, "orb-slam2", "s/a")
+    add_run(store, "orb-slam2", "s/a", overrides={"features": 500}, study="mine")
+    code, out, _ = cli("report", "results", "-o", "without")
+    assert code == 0 and "features=500" not in out and "Left out: 1 runs that studies made" in out
+    code, out, _ = cli("report", "results", "-o", "with", "--trials")
+    assert code == 0 and "features=500" in out and "Left out" not in out
 
 
 def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):

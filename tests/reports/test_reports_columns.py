@@ -1,4 +1,4 @@
-"""What is one column of a table: the same frames of the same recording, under a name of its own."""
+"""What one column of a table is, the same frames of the same recording, and what columns and rows are called."""
 
 from reports_fake_store import add_run
 from reports_rows import PROTOCOL, row, rows_of
@@ -6,6 +6,7 @@ from reports_rows import PROTOCOL, row, rows_of
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import name_columns, shortened
+from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.runs.storage.store import RunStore
 
@@ -87,3 +88,18 @@ def test_names_lose_what_all_share():
     assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
     assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
     assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}
+
+
+def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tmp_path):
+    store = RunStore(tmp_path / "r")
+    given = "/home/me/mine.py:SPEC"
+    add_run(store, "mine", "s/a", overrides={"loop": "True"}, settings={"loop": True}, given=given)
+    add_run(store, "mine", "s/b", overrides={"loop": True}, settings={"loop": True}, given=given)
+    add_run(store, "a", "s/a", overrides={"masks": "oracle"})
+    add_run(store, "a", "s/c", overrides={"masks": "oracle"})
+    add_run(store, "b", "s/a", overrides={"masks": "oracle"})
+    rows = [run.row for run in load_runs([store], PROTOCOL).runs]
+    assert sorted(make_board(rows).labels.values()) == ["a", "b", "mine · loop=true"]
+    (mine,) = (each for each in rows if (each.tracker, each.sequence) == ("mine", "s/a"))
+    assert run_command(mine) == f"dynslam-bench run {given} s/a --set loop=true"
+    assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))

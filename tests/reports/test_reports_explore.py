@@ -163,6 +163,21 @@ def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
     assert gaps == 2  # the lost frame breaks the line
 
 
+def test_angles_that_only_the_alignment_made_are_called_unreliable(browser, tmp_path, monkeypatch):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "ours", "s/a")
+    add_run(store, "imported", "s/a", kind="imported")
+    captions = []
+    for least in (10.0, -1.0):  # no uncertainty is as small as the second
+        monkeypatch.setattr("dynslam_bench.reports.model.row.RELIABLE_DEG", least)
+        made = build_report(store, tmp_path / str(least), picture_seconds=0)
+        browser.open(made.run, anchor="#" + run_of(made, "ours", "s/a"))
+        browser.until("one('#poses')")
+        captions.append(browser.run("one('#poses').parentElement.querySelector('figcaption').textContent"))
+    assert "truth in grey." in captions[0] and "unreliable" not in captions[0]
+    assert "‡ Rotation is unreliable: the path hardly determines the alignment's rotation" in captions[1]
+
+
 def test_the_slider_moves_image_track_and_cursor(browser, report):
     open_page(browser, report, "run", 1400)
     state = "[one('#looks .caption').textContent, one('#over-time .cursor').outerHTML]"

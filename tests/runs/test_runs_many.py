@@ -49,6 +49,16 @@ def test_equal_specs_are_made_once(store: RunStore, toy_folder: str) -> None:
     assert kinds(events) == {"finished": 1, "started": 1} and records[0] == records[1]
 
 
+def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(store: RunStore, toy_folder: str) -> None:
+    (made,) = run_many(specs(toy_folder, range(1), study="mine"), results=store)
+    assert made.study == "mine"
+    assert run_many(specs(toy_folder, range(1), study="other"), results=store) == [made]
+    (asked,) = run_many(specs(toy_folder, range(1)), results=store)
+    assert asked.study == "" and asked.run_id == made.run_id
+    assert run_many(specs(toy_folder, range(1), study="mine"), results=store) == [asked]
+    assert store.get(made.run_id) == asked
+
+
 def test_one_failure_stops_nothing_and_is_made_again_only_on_request(store: RunStore, toy_folder: str) -> None:
     wanted = [*specs(toy_folder, range(1), settings={"mode": "segfault"}), *specs(toy_folder, range(2))]
     assert [record.status for record in run_many(wanted, results=store)] == ["crashed", "ok", "ok"]

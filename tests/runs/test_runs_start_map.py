@@ -78,7 +78,7 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
     assert make_board([row]).reference is None
     name = f"map={begun_in.digest[:8]}"
     assert name in make_labels([row])[row.variant_key], "named though no other variant stands beside it"
-    assert f"--map {file}" in run_command(row) and "backend.map.localisation_only=True" in run_command(row)
+    assert f"--map {file}" in run_command(row) and "backend.map.localisation_only=true" in run_command(row)
     for said in (run_row(found, None)["settings"], runs_frame([(found, None)])["settings"][0]):
         assert name in said
 

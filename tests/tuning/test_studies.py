@@ -54,6 +54,7 @@ def test_a_study_finds_the_known_optimum_and_says_so(sequences: list[str], tmp_p
     assert not summary.improves, "two held-out sequences prove nothing"
     assert not summary.importances, "fourteen trials are too few"
     page = write_page(tuner, summary).read_text()
+    assert page.count("may differ from 1 though no setting was changed") >= 2, "at the figure and at the table"
     assert "Use them" not in page and "Not recommended" in page
     assert "would need 30 complete trials, there are 14" in page
     assert "from which nothing follows for others" in page and "https://" not in page.split("<script>")[0]
@@ -91,6 +92,10 @@ def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> N
     assert {event.run_id for event in told if event.kind == "finished"} == stored  # those of the default among them
     frames = [event.partial["frames_done"] for event in told if event.kind == "progress" and event.partial]
     assert frames and min(frames) > 0
+    records = [RunStore(tmp_path).read_whole(run_id) for run_id in stored]
+    assert {record.study for record in records} == {"toy"}
+    assert "study" not in records[0].identity
+    assert {record.tracker.given for record in records} == {TRACKER}, "its id, toy, names it to nobody"
 
 
 def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_path: Path) -> None:

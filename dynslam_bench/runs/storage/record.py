@@ -21,7 +21,11 @@ LOST_COVERAGE = 0.5
 
 
 class TrackerInfo(Record):
-    """The tracker, as its spec described it; see `TrackerSpec`."""
+    """The tracker, as its spec described it; see `TrackerSpec`.
+
+    Beside that `given`: what it was named by where its id alone does not find it, ``/path/file.py:Attr`` or
+    ``module:Attr``; empty for an id, and in older records.
+    """
 
     id: str
     label: str
@@ -34,6 +38,7 @@ class TrackerInfo(Record):
     citation: str = ""
     remarks: str = ""
     sensors: Literal["rgbd", "rgb"] = "rgbd"
+    given: str = ""
 
 
 class SequenceInfo(Record):
@@ -161,6 +166,7 @@ class RunRecord(Record):
         provenance: For imported trajectories: where it came from.
         place: Folder of the sequence where it was named by its path; empty for an id.
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
+        study: Study that made it and nobody else asked for; empty for any other run, and in older records.
         notes: Anything a reader should know, one line each.
     """
 
@@ -210,6 +216,7 @@ class RunRecord(Record):
     provenance: str = ""
     place: str = ""
     stamps_match: bool = True
+    study: str = ""
     notes: list[str] = Field(default_factory=list)
 
     def normalised(self) -> RunRecord:
@@ -223,10 +230,14 @@ class RunRecord(Record):
 
     @property
     def asked(self) -> dict[str, Any]:
-        """The settings that were asked for; in place of a map's path the digest of its content, as ``map``."""
+        """The settings that were asked for; in place of a map's path the digest of its content, as ``map``.
+
+        Values are those that the run had, however they were spelled: ``"1"`` and ``1.0`` are one.
+        """
+        asked = {name: self.settings.get(name, value) for name, value in self.overrides.items()}
         if self.start_map is None:
-            return dict(self.overrides)
-        named = {name: value for name, value in self.overrides.items() if not name.startswith("backend.map.")}
+            return asked
+        named = {name: value for name, value in asked.items() if not name.startswith("backend.map.")}
         alone = {"backend.map.localisation_only": True} if self.start_map.localisation_only else {}
         return named | {"map": self.start_map.digest[:8]} | alone
 

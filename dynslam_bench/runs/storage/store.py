@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,18 @@ class RunStore:
         Raises:
             DynslamError: It cannot be written.
         """
-        changed = record.model_copy(update={"tracker": record.tracker.model_copy(update={"label": label})})
+        return self._rewrite(record, tracker=record.tracker.model_copy(update={"label": label}))
+
+    def leave_study(self, record: RunRecord) -> RunRecord:
+        """Make a study's run an ordinary one, since it was asked for without the study; everything else of it stays.
+
+        Raises:
+            DynslamError: It cannot be written.
+        """
+        return self._rewrite(record, study="")
+
+    def _rewrite(self, record: RunRecord, **changes: Any) -> RunRecord:
+        changed = record.model_copy(update=changes)
         write_atomic(self.folder(record.run_id) / RUN_FILE, changed.to_json())
         return changed
 

@@ -63,7 +63,7 @@ function timeOf(run) {
   if (!run.frames.t && !run.track.t) return [];
   const share = run.frames.share ? `, and the share of the image that shows people (${run.frames.share_source})` : "";
   return [section("s-time", "Over time", figure("over-time", `Errors frame by frame${share}; features and matches where the tracker tells them. Lines have gaps where frames were lost.`),
-    ...(run.track.xyz ? [figure("poses", "Position, and rotation from the first true pose; the truth in grey.")] : []))];
+    ...(run.track.xyz ? [figure("poses", `Position, and rotation from the first true pose; the truth in grey.${run.track.doubt ? ` ${run.track.doubt}` : ""}`)] : []))];
 }
 
 function spreadOf(run) {
