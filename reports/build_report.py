@@ -99,11 +99,9 @@ def build_report(
     protocol = get_protocol(protocol)
     output = Path(output).expanduser().absolute()
     stores = open_stores(runs)
-    count = helpers_for(sum(len(store.ids()) for store in stores))
     setup: dict[str, Any] = {"protocol": protocol.model_dump_json(), "output": str(output)}
     setup |= {"picture_seconds": picture_seconds, "most_frames": most_frames}
-    hired: AbstractContextManager[Crew | None] = Crew(count, setup) if count else nullcontext()
-    with hired as crew:
+    with _helpers(stores, setup) as crew:
         if crew is not None:  # what only this process needs is loaded while it waits for them
             Thread(target=import_module, args=("scipy.stats",), daemon=True).start()
         loaded = load_runs(stores, protocol, on_progress, crew, reference, trials=trials)
@@ -118,6 +116,12 @@ def build_report(
         draft = _drafted(board, protocol, loaded, explored, again, crew)
     on_progress(0, None, "writing")
     return _write(draft, board, output, _data(board, protocol, title), loaded.trials)
+
+
+def _helpers(stores: Sequence[RunStore], setup: dict[str, Any]) -> AbstractContextManager[Crew | None]:
+    """As many helpers as the runs are worth; None for none."""
+    count = helpers_for(sum(len(store.ids()) for store in stores))
+    return Crew(count, setup) if count else nullcontext()
 
 
 def _data(board: Board, protocol: Protocol, title: str) -> ReportData:

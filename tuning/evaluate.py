@@ -102,9 +102,8 @@ def evaluate(
         return stop[0] or (cancelled is not None and cancelled())
 
     def one(block: Block) -> Outcome:
-        spec = block.run_spec(
-            tracker, settings=dict(settings), threads=threads, cache=cache, data_root=data_root, study=study
-        )
+        how = {"threads": threads, "cache": cache, "data_root": data_root, "study": study}
+        spec = block.run_spec(tracker, settings=dict(settings), **how)
         if ended():
             raise CancelledError(str(block))
         (record,) = run_many([spec], results=store, protocol=held, cancelled=ended, on_event=on_run)

@@ -14,7 +14,7 @@ from .output import complain, progress, write, write_fields, write_json, write_t
 from .run_rows import show_rows
 
 if TYPE_CHECKING:
-    from dynslam_bench.runs import RunStore
+    from dynslam_bench.runs import RunRecord, RunStore
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
@@ -59,9 +59,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Show everything about a run."""
-    from dynslam_bench.core.toml import setting_text
     from dynslam_bench.runs import RunStore, score
-    from dynslam_bench.runs.storage.run_index import part_words
 
     store = RunStore(results)
     record = store.read(run)
@@ -69,35 +67,7 @@ def show(
     if as_json:
         write_json({"record": record, "metrics": metrics, "folder": store.folder(record.run_id)})
         return
-    facts: dict[str, Any] = {
-        "run": record.run_id,
-        "folder": store.folder(record.run_id),
-        "status": record.status,
-        "reason": record.reason,
-        "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
-        "sequence": record.sequence.id,
-        "part": part_words(record),
-        "frames": record.n_frames,
-        "tracked": record.n_tracked,
-        "lost": record.n_lost,
-        "initialising": record.n_initialising or None,
-        "coverage": record.coverage,
-        "repeat": record.repeat,
-        "masks": record.segmentation,
-        "device": record.device,
-        "threads": record.threads,
-        "started": record.started,
-        "wall_s": record.wall_s,
-        "peak_memory_mb": record.peak_memory_mb,
-        "keyframes": record.keyframes,
-        "map_points": record.map_points,
-        "maps": record.maps,
-        "loops closed": closed_loops(store, record.run_id),
-        "overrides": [f"{name}={setting_text(value)}" for name, value in record.overrides.items()],
-        "notes": record.notes,
-        "command": " ".join(record.command),
-    }
-    write_fields(facts)
+    write_fields(run_facts(store, record))
     if record.timings:
         write()
         rows = [
@@ -114,6 +84,42 @@ def show(
         write_table(("metric", "value"), sorted(evaluation.metrics.items()))
         for line in evaluation.diagnostics:
             write(f"  {line}")
+
+
+def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
+    """What is known of a run, by name; empty values are not shown."""
+    from dynslam_bench.core.toml import setting_text
+    from dynslam_bench.runs.storage.run_index import part_words
+
+    return {
+        "run": record.run_id,
+        "folder": store.folder(record.run_id),
+        "status": record.status,
+        "reason": record.reason,
+        "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
+        "sequence": record.sequence.id,
+        "part": part_words(record),
+        "frames": record.n_frames,
+        "tracked": record.n_tracked,
+        "lost": record.n_lost,
+        "initialising": record.n_initialising or None,
+        "coverage": record.coverage,
+        "repeat": record.repeat,
+        "masks": record.segmentation,
+        "device": record.device,
+        "threads": record.threads,
+        "study": record.study,
+        "started": record.started,
+        "wall_s": record.wall_s,
+        "peak_memory_mb": record.peak_memory_mb,
+        "keyframes": record.keyframes,
+        "map_points": record.map_points,
+        "maps": record.maps,
+        "loops closed": closed_loops(store, record.run_id),
+        "overrides": [f"{name}={setting_text(value)}" for name, value in record.overrides.items()],
+        "notes": record.notes,
+        "command": " ".join(record.command),
+    }
 
 
 def closed_loops(store: RunStore, run_id: str) -> int | None:

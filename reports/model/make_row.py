@@ -78,12 +78,12 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         mask_iou=record.mask_iou,
         segmentation=record.segmentation,
         seen_in_training=seen_in_training(record.segmentation, sequence.id),
-        study=record.study if record.asked else "",
+        study=_trial_of(record),
         started=record.started,
         log=log_of(store, record.run_id),
         command=command_line(record.command),
         machine=machine_words(record),
-        notes=[*record.notes, *(evaluation.diagnostics if evaluation is not None else [])],
+        notes=_notes(record, evaluation),
     )
 
 
@@ -108,6 +108,17 @@ def _counts(record: RunRecord, final: Evaluation | None) -> dict[str, Any]:
     if final is not None and final.n_tracked is not None and final.coverage is not None:
         counts |= {"n_tracked": final.n_tracked, "coverage": final.coverage}
     return counts
+
+
+def _trial_of(record: RunRecord) -> str:
+    """The study that made a run with settings of its own; empty for its runs with the default settings, and others."""
+    return record.study if record.asked else ""
+
+
+def _notes(record: RunRecord, evaluation: Evaluation | None) -> list[str]:
+    """What a reader should know of a run: whose trial it is, its own remarks, those of its evaluation."""
+    trial = [f"trial of the study '{_trial_of(record)}'"] if _trial_of(record) else []
+    return [*trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
 
 
 def log_of(store: RunStore, run_id: str) -> str:

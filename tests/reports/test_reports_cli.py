@@ -79,6 +79,7 @@ def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
     shown = build_report(store, tmp_path / "shown", picture_seconds=0, trials=True)
     assert shown.trials == 0 and "features=500" in shown.markdown.read_text()
     assert "Left out" not in shown.markdown.read_text()
+    assert "trial of the study &#39;mine&#39;" in shown.html.read_text()
     assert "--trials" in shown.html.read_text().split("The commands that")[1]
 
 
