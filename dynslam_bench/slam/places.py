@@ -42,7 +42,6 @@ def likeness(world: Map, keyframes: NDArray[np.int64], seen: Observations) -> ND
     """
     world.pieces.renew(world.kf_alive, world.kf_id, world.kf_count, world.kf_words.view(np.uint16)[:, :, ::EVERY])
     own = np.ascontiguousarray(seen.words).view(np.uint16)[:, ::EVERY]
-    held = world.kf_point >= 0
+    score, points = world.pieces.score(world.kf_point, keyframes, own)
     world.space.rest("kf_words", "kf_point")
-    points = np.count_nonzero(held[keyframes], axis=1)
-    return np.asarray(world.pieces.score(held, keyframes, own) / np.sqrt(np.maximum(points, 1)))
+    return np.asarray(score / np.sqrt(np.maximum(points, 1)))

@@ -352,10 +352,10 @@ class Map:
 
     def _reserve(self, points: Slots, more: int) -> None:
         """Make room for so many more observations of each of the points; what they leave is used again."""
-        needed = self.n_obs[points] + more
-        short = np.unique(points[needed > self.obs_room[points]])
-        if not len(short):
+        full = self.n_obs[points] + more > self.obs_room[points]
+        if not full.any():
             return
+        short = np.unique(points[full])
         rooms = np.maximum(2 * self.obs_room[short], FEWEST_ROOM)
         if more > 1:
             rooms = np.maximum(rooms, self.n_obs[short] + more)

@@ -62,22 +62,23 @@ class PieceIndex:
                 self._pieces[slot, :count] = pieces[slot, :count]
                 _put_in(self._first, self._next, self._pieces, slot, int(count))
 
-    def score(self, held: NDArray[np.bool_], slots: NDArray[np.int64], own: Pieces) -> NDArray[np.float64]:
-        """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame.
+    def score(
+        self, kf_point: Ints, slots: NDArray[np.int64], own: Pieces
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame, and its points.
 
         A piece weighs the logarithm of how much rarer it is than all of the frame's pieces together.
 
         Args:
-            held: Of each slot and feature whether it observes a point ``[S, F]``: others do not count.
+            kf_point: Of each slot and feature the point that it observes ``[S, F]``; those with -1 do not count.
             slots: Of the keyframes.
             own: The frame's pieces ``[N, P]``.
         """
         values = [np.unique(own[:, place]) for place in range(own.shape[1])]
         place = np.repeat(np.arange(len(values)), [len(each) for each in values])
-        row = np.full(len(self._ids), -1, np.int32)
-        row[slots] = np.arange(len(slots))
+        row, points = _rows(kf_point, slots, self._counts, self._next.shape[1])
         lists = self._first, self._next.reshape(-1, self._next.shape[2])
-        return np.asarray(_score(*lists, held, row, place, np.concatenate(values), len(slots)))
+        return _score(*lists, row, place, np.concatenate(values), len(slots)), points
 
 
 @kernel
@@ -110,21 +111,33 @@ def _take_out(first: Ints, after: Ints, pieces: Pieces, slot: int, count: int) -
 
 
 @kernel
+def _rows(
+    kf_point: Ints, slots: NDArray[np.int64], counts: NDArray[np.int64], room: int
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Of each feature of the index the row of its keyframe among those asked for, -1 without a point; their points."""
+    row, points = np.full(len(counts) * room, -1, np.int32), np.zeros(len(slots), np.int64)
+    for number in range(len(slots)):
+        slot = slots[number]
+        for feature in range(counts[slot]):
+            if kf_point[slot, feature] >= 0:
+                row[slot * room + feature] = number
+                points[number] += 1
+    return row, points
+
+
+@kernel
 def _score(
-    first: Ints, after: Ints, held: NDArray[np.bool_], row: Ints,
-    places: NDArray[np.int64], values: Pieces, rows: int,
-) -> NDArray[np.float64]:  # fmt: skip
-    features = len(after) // len(row)
+    first: Ints, after: Ints, row: NDArray[np.int32], places: NDArray[np.int64], values: Pieces, rows: int
+) -> NDArray[np.float64]:
     ends, found, shared = np.zeros(len(values), np.int64), np.zeros(1 << 12, np.int32), 0
     for k in range(len(values)):
         place = places[k]
         node = first[place, values[k]]
         while node >= 0:
-            slot = node // features
-            if row[slot] >= 0 and held[slot, node - slot * features]:
+            if row[node] >= 0:
                 if shared == len(found):
                     found = np.concatenate((found, np.zeros(shared, np.int32)))
-                found[shared] = row[slot]
+                found[shared] = row[node]
                 shared += 1
             node = after[node, place]
         ends[k] = shared
