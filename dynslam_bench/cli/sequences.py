@@ -37,9 +37,9 @@ def list_(
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
     if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
-        asked, pattern = pattern, f"{pattern.rstrip('/')}/*"  # a whole folder
+        folder = f"{pattern.rstrip('/')}/*"
+        pattern = folder if any(fnmatch.fnmatch(each.id, folder) for each in everything) else pattern
     if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
-        pattern = asked
         raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, [each.id for each in everything]))
     found = [
         each

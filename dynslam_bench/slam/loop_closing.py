@@ -143,8 +143,8 @@ class LoopCloser:
         self.rescaled, self.misfit = {}, False
         self._note_way(slot)
         for dropped, heir, relative in self.mapper.dropped if self._ties else ():
-            ids = (int(self.world.kf_id[each]) for each in (dropped, heir))
-            self._ties = inherited(self._ties, *ids, relative)
+            gone, stands = (int(self.world.kf_id[each]) for each in (dropped, heir))
+            self._ties = inherited(self._ties, gone, stands, relative)
         loop = self._verified(slot, seen)
         if loop is None:
             self._row.clear()

@@ -32,7 +32,7 @@ from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
 from dynslam_bench.slam.localisation.observation import observe  # noqa: E402
-from dynslam_bench.slam.localisation.relocalisation import locate  # noqa: E402
+from dynslam_bench.slam.localisation.relocalisation import located  # noqa: E402
 from dynslam_bench.slam.places import most_alike  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
@@ -102,7 +102,8 @@ def main() -> int:
             start = time.process_time()
             chosen = most_alike(world, world.keyframes, seen, searched)
             rng = np.random.default_rng(index)
-            pose = locate(world, chosen, seen, settings.relocalisation, rng, settings.relocalisation.min_inliers)
+            least = settings.relocalisation.min_inliers
+            pose = next(located(world, chosen, seen, settings.relocalisation, rng, least), None)
             times.append(time.process_time() - start)
             if pose is None or pose.estimate.count < settings.relocalisation.min_inliers or len(times) == 1:
                 continue

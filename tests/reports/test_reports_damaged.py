@@ -12,7 +12,7 @@ from test_reports_browser import add_frames
 from dynslam_bench.reports import build_report
 from dynslam_bench.reports.figures.leaderboard import mask_figure, repeat_figure
 from dynslam_bench.reports.figures.style import log_axis
-from dynslam_bench.reports.html.run_frames import read_tables
+from dynslam_bench.reports.html.run_frames import exact_shares, read_tables
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.reports.tables.runs import repeatability
@@ -127,3 +127,12 @@ def test_an_old_import_goes_to_no_other_camera_than_the_runs_of_its_frames(tmp_p
     assert "camera" not in place and "s/a" in place
     paths = build_report(store, tmp_path / "report", picture_seconds=0)
     assert {each["tracker"] for each in rows_of(paths.csv["runs"])} == {"a", "elsewhere"}
+
+
+def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
+    """What the masks show of a frame is known if any run saw the frame, not only the first one of the sequence."""
+    store = RunStore(tmp_path / "r")
+    for name, count in (("crashed", 30), ("whole", 60)):
+        add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
+    runs = sorted(load_runs([store], PROTOCOL).runs, key=lambda run: run.row.tracker)
+    assert [*exact_shares(runs)] == [*range(60)]

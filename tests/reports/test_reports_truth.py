@@ -11,7 +11,6 @@ from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
 from dynslam_bench.reports.html.explore_data import FrameSums, summarise
-from dynslam_bench.reports.html.run_frames import exact_shares
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
@@ -395,12 +394,3 @@ def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
     assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
     assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
     assert {run.row.tracker: run.row.failed for run in load_runs([store], PROTOCOL).runs} == dict.fromkeys(rows, False)
-
-
-def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
-    """What the masks show of a frame is known if any run saw the frame, not only the first one of the sequence."""
-    store = RunStore(tmp_path / "r")
-    for name, count in (("crashed", 30), ("whole", 60)):
-        add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
-    runs = sorted(load_runs([store], PROTOCOL).runs, key=lambda run: run.row.tracker)
-    assert [*exact_shares(runs)] == [*range(60)]
