@@ -14,6 +14,7 @@ from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.localisation.lookalikes import Sight, ambiguous
 from dynslam_bench.slam.localisation.motion_model import MotionState
 from dynslam_bench.slam.localisation.observation import observe
+from dynslam_bench.slam.localisation.reach import Reach
 from dynslam_bench.slam.mapping.islands import Islands
 from dynslam_bench.slam.monocular import MonocularBackend
 from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
@@ -225,6 +226,14 @@ def test_a_frame_is_ambiguous_where_its_features_are_found_in_two_places(alike, 
     assert not ambiguous(backend.world, seen, {0: here}, everywhere[:4], settings, 0), "nothing else is looked at"
     near = lambda island, T_cam_world: not here.contradicts(Sight(T_cam_world, 1.0, 3.0))  # noqa: E731
     assert not ambiguous(backend.world, seen, {0: here}, everywhere, settings, 0, near), "it cannot have got there"
+
+
+def test_every_frame_of_a_lost_camera_is_followed(monkeypatch):
+    """Also where nothing at all is recognised: how far it has turned is known only from image to image."""
+    asked, since = [], Reach.since
+    monkeypatch.setattr(Reach, "since", lambda self, *known: (asked.append(known), since(self, *known))[1])
+    _, states, _ = drive(RingWorld(), [*range(15), *range(60, 70)])
+    assert (states[15:] == "lost").all() and len(asked) == 9, "of the tenth, the first, tracking knows itself"
 
 
 @pytest.mark.parametrize(("alike", "found"), [(0.0, True), (0.5, False), (1.0, False)])

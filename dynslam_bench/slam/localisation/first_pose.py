@@ -49,7 +49,7 @@ class Before:
         reference: Slot of the keyframe that shares most points with the last tracked frame.
         keyframes: Slots of the keyframes near which the frame may have been taken.
         lost: Whether it was lost since then; else it was tracked in the frame before.
-        since: Tells what is known of the time since then.
+        since: Tells what is known of the time since then, the same each time; asked of every frame of a lost camera.
         close_m: Depth below which a feature's depth is trusted, metres.
         seed: Of the sequence's random draws.
         frame: Index of the frame that comes.
@@ -100,6 +100,8 @@ def first_pose(
         settings: Of tracking and relocalisation.
     """
     best: tuple[Matches, PoseEstimate] | None = None
+    if before.lost:
+        before.since()  # follows the turn from image to image, whatever is found
     for matches in _from_last_frame(world, seen, before, settings.tracking):
         estimate = solve(world, seen, matches, before.prediction, rounds=3)
         if estimate.count >= ENOUGH_FIRST // 2 and (best is None or estimate.count > best[1].count):
@@ -109,35 +111,25 @@ def first_pose(
                 return _agreed(*best, before.reference)
             break
     if before.lost and best is not None:
-        guess = _there(world, islands, seen, Relocalised(before.reference, *best), before, settings, before.since())
+        guess = _there(world, islands, seen, Relocalised(before.reference, *best), before, settings)
         if guess is not None:
             return guess
     least = ENOUGH_FIRST // 2 if best is None or before.lost else best[1].count + 1
     found = _from_keyframes(world, islands, seen, before, settings, least)
-    if found is not None or best is None or before.lost:
-        return found
-    T_cam_world, since = best[1].T_cam_world, before.since()
-    return (
-        _agreed(*best, before.reference)
-        if since.may_be(islands, before.last.T_cam_world, since.island, T_cam_world)
-        else None
-    )
+    if found is None and best is not None and not before.lost and _within_reach(islands, before, best[1]):
+        return _agreed(*best, before.reference)
+    return found
 
 
 def _there(
-    world: Map,
-    islands: Islands,
-    seen: Observations,
-    found: Relocalised,
-    before: Before,
-    settings: BackendSettings,
-    since: Lost,
+    world: Map, islands: Islands, seen: Observations, found: Relocalised, before: Before, settings: BackendSettings
 ) -> FirstPose | None:
     """The pose at a keyframe's place, if the camera can have got there, and what was mapped around that is there.
 
     A place may only have something in common with another.
     """
-    there, may_be = int(world.kf_island[found.keyframe]), partial(since.may_be, islands, before.last.T_cam_world)
+    there = int(world.kf_island[found.keyframe])
+    may_be = partial(before.since().may_be, islands, before.last.T_cam_world)
     if not may_be(there, found.estimate.T_cam_world):
         return None
     matches = found.matches.select(found.estimate.inliers)
@@ -149,6 +141,12 @@ def _there(
     if before.lost and ambiguous(world, seen, known, before.keyframes, settings, before.seed, may_be):
         return None
     return FirstPose(place.T_cam_world, place.matches, found.keyframe, relocalised=True)
+
+
+def _within_reach(islands: Islands, before: Before, found: PoseEstimate) -> bool:
+    """Whether the camera can have got to a pose on the island where it was tracked last."""
+    since = before.since()
+    return since.may_be(islands, before.last.T_cam_world, since.island, found.T_cam_world)
 
 
 def _agreed(matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool = False) -> FirstPose:
@@ -172,7 +170,7 @@ def _from_keyframes(
 
     Each has to be one that the camera can have got to, and its place to be there; the first that is counts.
     """
-    s, since = settings.relocalisation, before.since()
+    s = settings.relocalisation
     rng = stream(before.seed, "relocalisation", before.frame)
     for alike in (True,) if before.lost else (False, True):
         keyframes = most_alike(world, before.keyframes, seen, s.searched) if alike else [before.reference]
@@ -180,9 +178,9 @@ def _from_keyframes(
             if found.estimate.count < least:
                 continue
             if alike:
-                there = _there(world, islands, seen, found, before, settings, since)
+                there = _there(world, islands, seen, found, before, settings)
                 if there is not None:
                     return there
-            elif since.may_be(islands, before.last.T_cam_world, since.island, found.estimate.T_cam_world):
+            elif _within_reach(islands, before, found.estimate):
                 return _agreed(found.matches, found.estimate, found.keyframe, relocalised=True)
     return None
