@@ -37,7 +37,7 @@ class MapOutputs:
 
     Attributes:
         keyframes: All keyframes.
-        ids: int64 ``[M]`` ids of the points.
+        ids: int64 ``[M]`` ids of the points; of maps that never met the first one none: where they lie is unknown.
         positions: float64 ``[M, 3]`` world coordinates, metres.
         colours: uint8 ``[M, 3]`` red, green, blue.
         observations: int64 ``[M]``, keyframes that observe each point.

@@ -50,7 +50,7 @@ def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> KeptMap:
     apart = int(np.count_nonzero(numbers))
     met = (
         f"{maps} maps that never met: {apart} of {len(numbers)} keyframes lie in others than the first, whose place "
-        "in it is unknown; frames tracked there count as lost"
+        "in it is unknown; frames tracked there count as lost, and no points of it are in map.ply"
     )
     return KeptMap(outputs, counts, (*not_saved, *([met] if maps > 1 else [])))
 

@@ -54,14 +54,18 @@ class MapViews:
     def points(self, island: int) -> tuple[NDArray[np.int64], Array]:
         """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points of an island."""
         if island not in self._clouds:
-            world, points = self._world, self._world.points
-            points = points[world.kf_island[world.obs_kf[world.obs_at[points]]] == island]
-            self._clouds[island] = world.id[points], world.position[points]
+            points = self._of(island)
+            self._clouds[island] = self._world.id[points], self._world.position[points]
         return self._clouds[island]
 
-    def outputs(self) -> MapOutputs:
-        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
+    def _of(self, island: int) -> NDArray[np.int64]:
+        """Slots of the points of an island."""
         world, points = self._world, self._world.points
+        return points[world.kf_island[world.obs_kf[world.obs_at[points]]] == island]
+
+    def outputs(self) -> MapOutputs:
+        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet; no points of unjoined islands."""
+        world, points = self._world, self._of(0)
         records = tuple(_record(world, slot) for slot in world.keyframes.tolist())
         observations = world.n_obs[points].astype(np.int64)
         return MapOutputs(records, world.id[points], world.position[points], world.rgb[points], observations)

@@ -187,7 +187,7 @@ class _Canvas:
 
 
 def _draw_map(outputs: MapOutputs, plane: Array) -> Image:
-    poses = [record.T_world_cam for record in outputs.keyframes]
+    poses = [record.T_world_cam for record in outputs.keyframes if not record.map]
     centres = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
     flat = outputs.positions @ plane
     canvas = _Canvas(centres @ plane, flat)
