@@ -210,17 +210,23 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             options: ``sequence`` and ``settings`` replace those of the constructor from this episode on.
 
         Raises:
-            DynslamError: Unknown option, or a new sequence whose images do not fit the observation space; settings and
-                sequence stay as they were, and no episode runs.
-            TrackerError: The tracker cannot be built or broke its contract.
+            DynslamError: Unknown option, or a new sequence whose images do not fit the observation space.
+            TrackerError: The tracker cannot be built or broke its contract. Whatever fails before frame 0 is tracked,
+                settings and sequence stay as they were, and no episode runs.
         """
         super().reset(seed=seed)
-        self.episode = Episode()
-        self._apply_options(options or {})
-        tracker = self._ready_tracker()
-        if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
-            tracker.configure(self.settings)  # type: ignore[attr-defined]
-        tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
+        self.episode, self._final = Episode(), None
+        before = {name: vars(self)[name] for name in ("settings", "_actions", "sequence", "_source")}
+        try:
+            self._apply_options(options or {})
+            tracker = self._ready_tracker()
+            if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
+                tracker.configure(self.settings)  # type: ignore[attr-defined]
+            tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
+        except Exception:
+            vars(self).update(before)
+            self.close()
+            raise
         self._errors = OnlineError(
             self.sequence.ground_truth if self.tracker_spec.metric else None, self.protocol.max_dt
         )
@@ -249,8 +255,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.episode.over = terminated or truncated
         info = frame_info(self.episode.outcomes[-1])
         if self.episode.over:
-            info["episode_metrics"] = self.episode_metrics()
-            info["protocol"] = self.protocol.id
+            info |= {"episode_metrics": self.episode_metrics(), "protocol": self.protocol.id}
         return self._observe(), float(reward), terminated, truncated, info
 
     def drop_frames(self, count: int) -> float:
@@ -270,11 +275,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             raise DynslamError(f"cannot drop {count} frames, {left} are left before the last one")
         total = 0.0
         for _ in range(count):
-            index = self.episode.next_index
-            stamp = float(self.sequence.timestamps[index])
+            stamp = float(self.sequence.timestamps[self.episode.next_index])
             error = self._errors.update(stamp, None, False)
             reward = self._reward(error)
-            self.episode.add(FrameOutcome(index, stamp, "dropped", None, {}, {}, error, reward))
+            self.episode.add(FrameOutcome(self.episode.next_index, stamp, "dropped", None, {}, {}, error, reward))
             total += reward
         return total
 
@@ -334,21 +338,17 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         unknown = sorted(set(options) - {"sequence", "settings"})
         if unknown:
             raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
-        before = self.settings, self._actions, self.sequence, self._source
-        try:
-            if "settings" in options:
-                changes = options["settings"]
-                complete = isinstance(changes, Settings)
-                self._use_settings(changes if complete else apply_overrides(self.settings, changes or {}))
-                if preprocessing_of(self.settings) != preprocessing_of(before[0]):
-                    options = {"sequence": self._source, **options}
-            if "sequence" in options:
-                self._use_sequence(options["sequence"])
-                if self._observation == "rgbd":
-                    check_same_size(before[2].camera, self.sequence.camera)
-        except DynslamError:
-            self.settings, self._actions, self.sequence, self._source = before
-            raise
+        preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
+        if "settings" in options:
+            changes = options["settings"]
+            complete = isinstance(changes, Settings)
+            self._use_settings(changes if complete else apply_overrides(self.settings, changes or {}))
+            if preprocessing_of(self.settings) != preprocessing:
+                options = {"sequence": self._source, **options}
+        if "sequence" in options:
+            self._use_sequence(options["sequence"])
+            if self._observation == "rgbd":
+                check_same_size(camera, self.sequence.camera)
 
     def _ready_tracker(self) -> Tracker:
         """The tracker for the current settings and sequence; built anew only if one of them changed."""

@@ -112,7 +112,7 @@ def _rows(source: Path | str | RunStore, protocol: Protocol) -> list[RunRow]:
         path = Path(source).expanduser()
         return ReportData.read(path if path.is_file() else path / REPORT_FILE).rows
     stores = open_stores(source if isinstance(source, RunStore) else [Path(source)])
-    return [run.row for run in load_runs(stores, protocol).runs]
+    return [run.row for run in load_runs(stores, protocol, trials=True).runs]
 
 
 def _is_report(source: Path | str | RunStore) -> bool:

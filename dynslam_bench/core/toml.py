@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,8 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def setting_text(value: Any) -> str:
-    """A setting's value for people and for ``--set``: spelled as in TOML (``true``, not ``True``), without quotes."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    """A setting's value for people and for ``--set``: ``true``, ``null``, a table in JSON; a text without quotes."""
+    return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -105,7 +105,7 @@ class RgbdBackend:
         parts = self.world, self.mapper, self._islands, self.settings, self.seed
         self.loops = LoopCloser(*parts, scale_is_known=self.uses_depth)
         self._surroundings = Surroundings(self.world, self.settings)
-        self._views = MapViews(self.world)
+        self._views = MapViews(self.world, self.mapper)
         self._ready = True
 
     # ------------------------------------------------------------------ one frame

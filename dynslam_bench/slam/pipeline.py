@@ -142,6 +142,7 @@ class SlamPipeline:
         if not self._backend.uses_depth:
             frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
         clock = StageClock(self._cached)
+        self._backend.mapper.resume()  # filters see the map as it was before a `finalize`
         seen = self._see(frame, camera, clock)
         culled = self._cull(seen, self._known(seen, camera), clock)
         located = self._backend.track(seen, culled.keep, culled.weight)

@@ -9,23 +9,26 @@ from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import KeyframeView
 from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
 
+from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
 
 Array = NDArray[np.float64]
 
 
 class MapViews:
-    """Keyframes and points of a map, looked up anew only after a keyframe: nothing else changes the map.
+    """Keyframes and points of a map, looked up anew only after a keyframe: little else changes the map.
 
     Args:
         world: The map.
+        mapper: Who may have refined it for the end of a run, which a run that goes on takes back.
     """
 
-    def __init__(self, world: Map) -> None:
+    def __init__(self, world: Map, mapper: LocalMapper) -> None:
         self._world = world
+        self._mapper = mapper
         self._depth_images: dict[int, NDArray[np.float32]] = {}
-        self._views: dict[tuple[int, int], tuple[KeyframeView, ...]] = {}
-        self._clouds: dict[int, tuple[NDArray[np.int64], Array]] = {}
+        self._views: dict[tuple[int, int, bool], tuple[KeyframeView, ...]] = {}
+        self._clouds: dict[tuple[int, bool], tuple[NDArray[np.int64], Array]] = {}
 
     def renew(self, slot: int, depth: NDArray[np.float32], dropped: list[int], depth_images: int) -> None:
         """A keyframe was made.
@@ -46,22 +49,24 @@ class MapViews:
 
     def keyframes(self, limit: int, island: int) -> tuple[KeyframeView, ...]:
         """The newest keyframes of an island, newest first, at most `limit`: where others lie is unknown there."""
-        if (limit, island) not in self._views:
+        key = limit, island, self._mapper.refined
+        if key not in self._views:
             newest = self._world.island(island)[::-1][: max(limit, 0)].tolist()
-            self._views[limit, island] = tuple(self._keyframe(slot) for slot in newest)
-        return self._views[limit, island]
+            self._views[key] = tuple(self._keyframe(slot) for slot in newest)
+        return self._views[key]
 
     def points(self, island: int) -> tuple[NDArray[np.int64], Array]:
         """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points of an island."""
-        if island not in self._clouds:
+        key = island, self._mapper.refined
+        if key not in self._clouds:
             points = self._of(island)
-            self._clouds[island] = self._world.id[points], self._world.position[points]
-        return self._clouds[island]
+            self._clouds[key] = self._world.id[points], self._world.position[points]
+        return self._clouds[key]
 
     def _of(self, island: int) -> NDArray[np.int64]:
         """Slots of the points of an island."""
         world, points = self._world, self._world.points
-        return points[world.kf_island[world.obs_kf[world.obs_at[points]]] == island]
+        return np.asarray(points[world.kf_island[world.obs_kf[world.obs_at[points]]] == island])
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet; no points of unjoined islands."""

@@ -101,14 +101,14 @@ class Board:
         return self._by_key[key][0]
 
     def no_better_than_still(self, key: str, sequence: str) -> bool:
-        """Whether a tracker that ended well there has, by its median, the error of a camera that never moves, or more.
+        """Whether a tracker's runs that ended well have, by their median, a camera's error that never moves, or more.
 
         Controls make no claim: never.
         """
         cell, still = self.cells[key].get(sequence), self.never_move.get(sequence)
-        if cell is None or cell.median is None or still is None or not cell.success:
+        if cell is None or still is None or not cell.succeeded or self.first(key).provenance == "control":
             return False
-        return cell.median >= (1 - 1e-9) * still and self.first(key).provenance != "control"
+        return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * still
 
     def ranked_order(self) -> list[str]:
         """Ranked trackers from the best to the worst."""

@@ -69,7 +69,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         held_ate_m=held_error(store, record, protocol, evaluation, still),
         never_move_m=still,
-        **_counts(record, scored.final if which == "final" else None),
+        **_counts(record, scored.final if which == "final" and record.kind == "run" else None),
         epipolar_skipped=record.epipolar_skipped,
         cached=bool(record.identity.get("cache")),
         frame_ms=None if record.frame_time_s is None else 1000 * record.frame_time_s,
@@ -96,9 +96,11 @@ def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple
     if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
         return which, record.status, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
     due = record.n_frames - record.n_dropped
-    if evaluation is not None and evaluation.n_tracked is not None and not failed:
+    if record.kind == "run" and which == "final" and not record.failed and evaluation and evaluation.n_tracked:
         if evaluation.n_tracked < LOST_COVERAGE * due:
-            return which, "lost", True, f"the {which} trajectory has poses of {evaluation.n_tracked} of {due} frames"
+            return which, "lost", True, f"the final trajectory has poses of {evaluation.n_tracked} of {due} frames"
+        if evaluation.n_tracked >= due:  # frames that were lost when they came were found later
+            return which, "ok", False, ""
     return which, record.status, failed, record.reason
 
 

@@ -160,7 +160,7 @@ def without_scale_words(count: int, protocol: Protocol) -> str:
 def trial_words(count: int) -> str:
     """Why trials of studies are in no table, and which option shows them."""
     return (
-        f"{count} runs that studies made with settings of their own, tried out on these very sequences; "
+        f"{count} runs that studies made with settings of their own, by which such settings are chosen; "
         "'report --trials' shows them"
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from dynslam_bench.envs import SlamEnv, TrackerContractError
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol, get_protocol
 from dynslam_bench.geometry import se3
+from dynslam_bench.slam import pipeline
 
 QUIET = {"noise.enabled": False}
 MOTION_M = float(np.hypot(STEP_M, 0.002))
@@ -283,7 +285,28 @@ def test_coverage_is_that_of_the_trajectory_that_is_scored(monkeypatch: pytest.M
         assert (metrics["tracked_frames"], metrics["coverage"]) == (tracked, tracked / 12)
 
 
-def test_a_reset_that_fails_ends_the_episode_and_changes_nothing() -> None:
+def test_asking_for_the_final_trajectory_changes_nothing_of_what_filters_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all of the map refined at the end, which a run that goes on takes back before anybody looks."""
+    shown, whole = [], pipeline.FilterState
+    monkeypatch.setattr(pipeline, "FilterState", lambda **known: (shown.append(known), whole(**known))[1])
+    settings = {"backend.bundle_adjustment.full": True}
+    runs = []
+    for asks in (True, False):
+        shown.clear()
+        env = SlamEnv("synthetic/fast_walking@100?frames=14", "orb-slam2", settings=settings)
+        env.reset(seed=0)
+        for _ in range(13):
+            if asks:
+                env.final_trajectory()
+            env.step(env.neutral_action)
+        runs.append([(each["map_points"][1], [view.T_world_cam for view in each["keyframes"]]) for each in shown])
+    for (points, poses), (others, theirs) in zip(*runs, strict=True):
+        assert np.array_equal(points, others) and np.array_equal(poses, theirs)
+    assert len(runs[0][-1][1]) > 1, "keyframes that a refinement moves"
+
+
+def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path) -> None:
+    (damaged := tmp_path / "damaged.npz").write_bytes(b"no map")
     env = SlamEnv(ToySequence(12), "emfoa-oft-no-masks")
     env.reset(seed=0)
     settings, sequence = env.settings, env.sequence
@@ -292,10 +315,11 @@ def test_a_reset_that_fails_ends_the_episode_and_changes_nothing() -> None:
         ({"settings": _only_localising(settings)}, "needs a map"),
         ({"settings": {"epipolar.threshold_px": 1.25}, "sequence": "no/such"}, "no/such"),
         ({"colour": 1}, "unknown reset option"),
+        ({"settings": {"backend.map.file": str(damaged)}}, "damaged.npz"),
     ):
         with pytest.raises(DynslamError, match=words):
             env.reset(options=options)
-        assert (env.settings, env.sequence) == (settings, sequence)
+        assert (env.settings, env.sequence) == (settings, sequence) and env.final_trajectory() is None
         with pytest.raises(DynslamError, match="before reset"):
             env.step(env.neutral_action)
     with pytest.raises(SettingsError, match="needs a map"):

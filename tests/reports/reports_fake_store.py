@@ -74,6 +74,7 @@ def add_run(
     masks="",
     settings=None,
     final_frames=None,
+    final_whole=False,
     study="",
     given="",
 ):
@@ -121,9 +122,10 @@ def add_run(
         if ok.any() and online:
             (work / "trajectory_online.txt").write_text(format_tum(Trajectory(stamps[ok], poses[ok])))
         if final_error is not None:
+            kept = ok | final_whole
             better = truth.T_world_cam[nearest] @ se3.exp(drift * final_error / error)
             (work / "trajectory_final.txt").write_text(
-                format_tum(Trajectory(stamps[ok], better[ok]).select(final_frames or slice(None)))
+                format_tum(Trajectory(stamps[kept], better[kept]).select(final_frames or slice(None)))
             )
         (work / "log.txt").write_text("a log\n")
         store.publish(work, record)

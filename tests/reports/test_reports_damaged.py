@@ -136,3 +136,28 @@ def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
         add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
     runs = sorted(load_runs([store], PROTOCOL).runs, key=lambda run: run.row.tracker)
     assert [*exact_shares(runs)] == [*range(60)]
+
+
+def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
+    """Under a protocol of the final trajectory, coverage and success are those of what is scored."""
+    store = RunStore(tmp_path / "r")
+    for name, kept in (("whole", None), ("thin", [0, 1, 2, 3])):
+        add_run(store, name, "s/a", error=0.01, final_error=0.005, final_frames=kept)
+    protocol = PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
+    rows = {run.row.tracker: run.row for run in load_runs([store], protocol).runs}
+    assert (rows["whole"].coverage, rows["whole"].failed) == (1.0, False)
+    thin = rows["thin"]
+    assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
+    assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
+    assert {run.row.tracker: run.row.failed for run in load_runs([store], PROTOCOL).runs} == dict.fromkeys(rows, False)
+
+
+def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final_trajectory(tmp_path):
+    store, protocol = RunStore(tmp_path / "r"), PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
+    add_run(store, "found", "s/a", error=0.01, status="lost", final_error=0.005, final_whole=True)
+    add_run(store, "sparse", "s/a", error=0.01, kind="imported", lost=[at for at in range(120) if at % 5])
+    rows = {run.row.tracker: run.row for run in load_runs([store], protocol).runs}
+    assert (rows["found"].status, rows["found"].failed, rows["found"].coverage) == ("ok", False, 1.0)
+    rows = {run.row.tracker: run.row for run in load_runs([store], PROTOCOL).runs}
+    assert rows["found"].failed and rows["found"].status == "lost"
+    assert not rows["sparse"].failed, "a file of keyframes says what it covers, and that no more was asked for"

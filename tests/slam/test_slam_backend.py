@@ -78,6 +78,12 @@ def test_finalize_with_all_of_the_map_refined_may_be_asked_at_any_time(room):
     keep = np.ones(2000, bool), np.ones(2000, np.float32)
     for index, pose in enumerate(room.path(60)):
         frame = room.see(pose, index)
+        for backend in (asked, quiet):  # what filters look at, as the pipeline does
+            backend.mapper.resume()
+        views = [(backend.keyframe_views(3), backend.map_points()) for backend in (asked, quiet)]
+        assert np.array_equal(views[0][1][1], views[1][1][1])
+        for one, other in zip(views[0][0], views[1][0], strict=True):
+            assert np.array_equal(one.T_world_cam, other.T_world_cam)
         outcomes = [backend.track(frame, *(each[: len(frame)] for each in keep)) for backend in (asked, quiet)]
         assert outcomes[0].state == outcomes[1].state
         assert outcomes[0].state != "ok" or np.array_equal(outcomes[0].T_world_cam, outcomes[1].T_world_cam)
@@ -86,6 +92,7 @@ def test_finalize_with_all_of_the_map_refined_may_be_asked_at_any_time(room):
             first, second = asked.finalize(), asked.finalize()
             assert np.array_equal(first.T_world_cam, second.T_world_cam)
             assert not np.array_equal(before, asked.outputs().positions), "files show the refined map"
+            assert np.array_equal(asked.map_points()[1], asked.outputs().positions), "and so does who asks now"
     finals = [backend.finalize().T_world_cam for backend in (asked, quiet)]
     assert len(finals[0]) > 40 and np.array_equal(*finals)
 

@@ -174,7 +174,7 @@ class RunStore:
         return self._rewrite(record, study="")
 
     def _rewrite(self, record: RunRecord, **changes: Any) -> RunRecord:
-        changed = record.model_copy(update=changes)
+        changed = (self.get(record.run_id) or record).model_copy(update=changes)
         write_atomic(self.folder(record.run_id) / RUN_FILE, changed.to_json())
         return changed
 

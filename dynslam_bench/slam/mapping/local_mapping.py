@@ -199,6 +199,11 @@ class LocalMapper:
         if self._solve(whole(world), self.settings.bundle_adjustment.full_iterations) is not None:
             world.refresh(points)
 
+    @property
+    def refined(self) -> bool:
+        """Whether the map is as `adjust_all` left it."""
+        return self._unrefined is not None
+
     def resume(self) -> None:
         """The run goes on: the map is again what it was before `adjust_all`."""
         if self._unrefined is None:
