@@ -88,7 +88,7 @@ def show(
 
 def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
     """What is known of a run, by name; empty values are not shown."""
-    from dynslam_bench.core.toml import setting_text
+    from dynslam_bench.core.toml import assignments
     from dynslam_bench.runs.storage.run_index import part_words
 
     return {
@@ -116,7 +116,7 @@ def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
         "map_points": record.map_points,
         "maps": record.maps,
         "loops closed": closed_loops(store, record.run_id),
-        "overrides": [f"{name}={setting_text(value)}" for name, value in record.overrides.items()],
+        "overrides": assignments(record.overrides),
         "notes": record.notes,
         "command": " ".join(record.command),
     }

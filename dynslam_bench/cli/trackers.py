@@ -97,9 +97,9 @@ def info(
 
 def _assigned(values: Mapping[str, Any]) -> str:
     """Settings as ``--set`` takes them."""
-    from dynslam_bench.core.toml import setting_text
+    from dynslam_bench.core.toml import assignments
 
-    return ", ".join(f"{name}={setting_text(value)}" for name, value in values.items())
+    return ", ".join(assignments(values))
 
 
 def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:

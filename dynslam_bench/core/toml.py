@@ -1,9 +1,10 @@
-"""Read TOML on every supported Python."""
+"""Read TOML on every supported Python, and write settings as ``--set`` takes them."""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,11 @@ def read_settings(path: Path) -> dict[str, Any]:
 def setting_text(value: Any) -> str:
     """A setting's value for people and for ``--set``: ``true``, ``null``, a table in JSON; a text without quotes."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def assignments(values: Mapping[str, Any]) -> list[str]:
+    """Settings as ``name=value``, in their order."""
+    return [f"{name}={setting_text(value)}" for name, value in values.items()]
 
 
 def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

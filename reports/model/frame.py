@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core.toml import assignments
 
 from .row import RunRow
 
@@ -66,7 +66,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
 
 def _own(row: RunRow, columns: Mapping[str, str], labels: Mapping[str, str]) -> tuple[str, str, str]:
     """What a row alone does not know, under the names `_OWN`."""
-    settings = "; ".join(f"{name}={setting_text(value)}" for name, value in row.variant.items())
+    settings = "; ".join(assignments(row.variant))
     return labels[row.variant_key], columns[row.column_id], settings
 
 

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 import dynslam_bench
 from dynslam_bench.core.records import digest
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core.toml import assignments
 from dynslam_bench.evaluation.protocol import Protocol
 
 from .line_file import add_lines, read_line_file, write_line_file
@@ -66,7 +66,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "offset": record.offset,
         "noise": record.sequence.noise,
         "repeat": record.repeat,
-        "settings": ", ".join(f"{name}={setting_text(value)}" for name, value in record.asked.items()),
+        "settings": ", ".join(assignments(record.asked)),
         "status": record.status,
         "ate_rmse_m": errors.get("ate_rmse_m"),
         "never_move_m": errors.get("never_move_ate_rmse_m"),

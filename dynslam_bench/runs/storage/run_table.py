@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core.toml import assignments
 
 from .record import MetricRecord, RunRecord
 
@@ -66,7 +66,7 @@ def _line(record: RunRecord, scored: MetricRecord | None) -> dict[str, Any]:
         "tracker": record.tracker.id,
         "label": record.tracker.label or record.tracker.id,
         "provenance": record.tracker.provenance,
-        "settings": "; ".join(f"{name}={setting_text(value)}" for name, value in record.asked.items()),
+        "settings": "; ".join(assignments(record.asked)),
         "sequence": record.sequence.id,
         "split": record.sequence.split,
         "noise": record.sequence.noise,
