@@ -40,8 +40,8 @@ def likeness(world: Map, keyframes: NDArray[np.int64], seen: Observations) -> ND
 
     The weights of what it shares with the frame, over the root of its points: a crowd has more in common by chance.
     """
-    world.pieces.renew(world.kf_alive, world.kf_id, world.kf_count, world.kf_words.view(np.uint16)[:, :, ::EVERY])
+    world.pieces.renew(world.kf_alive, world.kf_id, world.kf_point, world.kf_words.view(np.uint16)[:, :, ::EVERY])
     own = np.ascontiguousarray(seen.words).view(np.uint16)[:, ::EVERY]
-    score, points = world.pieces.score(world.kf_point, keyframes, own)
+    score, points = world.pieces.score(keyframes, own)
     world.space.rest("kf_words", "kf_point")
     return np.asarray(score / np.sqrt(np.maximum(points, 1)))

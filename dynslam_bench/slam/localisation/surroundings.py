@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mapping.map import Map
+from ..mapping.map_kernels import distinct
 from ..settings import BackendSettings
 
 Slots = NDArray[np.int64]
@@ -74,8 +75,7 @@ def apart(world: Map, keyframe: int, away: int) -> Slots:
     Those of other islands always are.
     """
     near, _ = world.covisible(keyframe)
-    table = world.kf_point[near]
-    further, _ = world.covisible_of(np.unique(table[table >= 0]))
+    further, _ = world.covisible_of(_observed(world, near))
     return _long_ago(world, keyframe, away, np.concatenate([near, further]))
 
 
@@ -102,5 +102,4 @@ def _long_ago(world: Map, keyframe: int, away: int, connected: Slots) -> Slots:
 
 def _observed(world: Map, keyframes: Slots) -> Slots:
     """Slots of the points that keyframes observe, ascending."""
-    points = np.unique(world.kf_point[keyframes])
-    return points[points >= 0].astype(np.int64)
+    return distinct(world.kf_point[keyframes], world.alive.size)

@@ -16,6 +16,7 @@ from ..localisation.observation import Observations
 from ..settings import BackendSettings
 from .bundles import Bundle, around, whole
 from .map import Map
+from .map_kernels import distinct
 from .triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -143,8 +144,7 @@ class LocalMapper:
         for other in neighbours.tolist():
             own = world.kf_point[slot, :n]
             self.fuse_into(other, np.unique(own[own >= 0]).astype(np.int64))
-        theirs = world.kf_point[neighbours]
-        self.fuse_into(slot, np.unique(theirs[theirs >= 0]).astype(np.int64))
+        self.fuse_into(slot, distinct(world.kf_point[neighbours], world.alive.size))
         own = world.kf_point[slot, :n]
         world.refresh(np.unique(own[own >= 0]).astype(np.int64))
 

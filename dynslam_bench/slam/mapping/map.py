@@ -236,8 +236,7 @@ class Map:
             factor: What lengths in the island's world are multiplied by before it is moved.
         """
         slots = np.flatnonzero(self.kf_alive & (self.kf_island == island))
-        table = self.kf_point[slots]
-        points = np.unique(table[table >= 0]).astype(np.int64)
+        points = kernels.distinct(self.kf_point[slots], self.alive.size)
         self.kf_pose[slots, :3, 3] *= factor
         for slot in slots.tolist():
             self.set_pose(slot, self.kf_pose[slot] @ se3.inverse(T_new_old))

@@ -121,6 +121,26 @@ def covisibility(obs_kf: Ints, obs_at: Slots, n_obs: Ints, points: Ints, slots: 
 
 
 @kernel
+def distinct(table: Table, most: int) -> Slots:
+    """Points below `most` that a table ``[K, F]`` of observations names, each once, ascending; -1 is none."""
+    named, count, least, last = np.zeros(most, np.bool_), 0, most, -1
+    for k in range(table.shape[0]):
+        for f in range(table.shape[1]):
+            p = table[k, f]
+            if p >= 0 and not named[p]:
+                named[p] = True
+                count += 1
+                least, last = min(least, p), max(last, p)
+    points = np.empty(count, np.int64)
+    at = 0
+    for p in range(least, last + 1):
+        if named[p]:
+            points[at] = p
+            at += 1
+    return points
+
+
+@kernel
 def refresh(
     points: Slots, position: Array, normal: Array, far: Array, words: Any, obs_kf: Ints, obs_ft: Ints, obs_at: Slots,
     n_obs: Ints, kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,

@@ -15,17 +15,24 @@ VALUES = 1 << 16
 """Values of a piece."""
 EVERY = 4
 """Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
-ROOM = 256
-"""Features are given room in steps of so many."""
 SLOTS = 640
 """Keyframes that there is room for at once: as many as are kept by default, and some that come and go."""
+BLOCK = 8
+"""Numbers in a block of a list: the block that goes on, and keyframes. It is half a line of the processor's cache, so
+that a list is read in as few places of the memory as can be."""
+CHANGED = 0.25
+"""A keyframe that has gained or lost this share of its points is taken up anew."""
 
 Pieces = NDArray[np.uint16]
 Ints = NDArray[np.int32]
+Slots = NDArray[np.int64]
 
 
 class PieceIndex:
-    """Lists of features by their descriptors' pieces; keyframes that came and went are seen to when it is asked."""
+    """Lists of keyframes by the pieces of their descriptors: once for each feature that observes a point.
+
+    Keyframes that came and went, and those whose points are others by now, are seen to when it is asked.
+    """
 
     def __init__(self) -> None:
         self._begin(0, 0, 0)
@@ -35,117 +42,137 @@ class PieceIndex:
         self._counts = np.zeros(slots, np.int64)
         self._pieces = np.full((slots, features, places), 0, np.uint16)  # in memory from now on: it does not grow
         self._first = np.full((places, VALUES), -1, np.int32)
-        self._next = np.full((slots, features, places), -1, np.int32)
+        self._blocks = np.full((places * VALUES, BLOCK), -1, np.int32)
+        self._free = np.arange(len(self._blocks), dtype=np.int32)
+        self._freed = len(self._free)
 
-    def renew(
-        self, alive: NDArray[np.bool_], ids: NDArray[np.int64], counts: NDArray[np.int64], pieces: Pieces
-    ) -> None:
+    def renew(self, alive: NDArray[np.bool_], ids: Slots, kf_point: Ints, pieces: Pieces) -> None:
         """Take up the keyframes of now.
 
         Args:
             alive: Of each slot, whether a keyframe is there ``[S]``.
             ids: Of each slot, its keyframe's ``[S]``.
-            counts: Features of each ``[S]``.
+            kf_point: Of each slot and feature the point that it observes ``[S, F]``; those with -1 do not count.
             pieces: Pieces of their descriptors ``[S, F, P]``.
         """
         slots, features, places = pieces.shape
         if slots > len(self._ids) or features > self._pieces.shape[1] or places != self._pieces.shape[2]:
-            self._begin(max(slots, SLOTS), -(-features // ROOM) * ROOM, places)
+            self._begin(max(slots, SLOTS), features, places)
         known = np.full(len(self._ids), -1, np.int64)
         known[:slots] = np.where(alive, ids, -1)
-        for slot in np.flatnonzero(known != self._ids).tolist():
-            if self._ids[slot] >= 0:
-                _take_out(self._first, self._next, self._pieces, slot, int(self._counts[slot]))
-            self._ids[slot] = known[slot]
-            if known[slot] >= 0:
-                count = self._counts[slot] = counts[slot]
-                self._pieces[slot, :count] = pieces[slot, :count]
-                _put_in(self._first, self._next, self._pieces, slot, int(count))
+        changed = known != self._ids
+        changed[:slots] |= np.abs(_observed(kf_point, alive) - self._counts[:slots]) > CHANGED * self._counts[:slots]
+        for slot in np.flatnonzero(changed).tolist():
+            old = self._pieces[slot, : self._counts[slot]]
+            self._freed = _take_out(self._first, self._blocks, self._free, self._freed, old, slot)
+            rows = np.flatnonzero(kf_point[slot] >= 0) if known[slot] >= 0 else np.zeros(0, np.int64)
+            self._ids[slot], self._counts[slot] = known[slot], len(rows)
+            if not len(rows):
+                continue
+            self._pieces[slot, : len(rows)] = pieces[slot, rows]
+            self._make_room(len(rows) * places)
+            new = self._pieces[slot, : len(rows)]
+            self._freed = _put_in(self._first, self._blocks, self._free, self._freed, new, slot)
 
-    def score(
-        self, kf_point: Ints, slots: NDArray[np.int64], own: Pieces
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _make_room(self, blocks: int) -> None:
+        """See that so many blocks are free."""
+        if self._freed >= blocks:
+            return
+        had = len(self._blocks)
+        self._blocks = np.concatenate([self._blocks, np.full_like(self._blocks, -1)])
+        self._free = np.concatenate([self._free[: self._freed], np.arange(had, 2 * had, dtype=np.int32)])
+        self._free, self._freed = np.resize(self._free, 2 * had), len(self._free)
+
+    def score(self, slots: Slots, own: Pieces) -> tuple[NDArray[np.float64], Slots]:
         """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame, and its points.
 
         A piece weighs the logarithm of how much rarer it is than all of the frame's pieces together.
 
         Args:
-            kf_point: Of each slot and feature the point that it observes ``[S, F]``; those with -1 do not count.
             slots: Of the keyframes.
             own: The frame's pieces ``[N, P]``.
         """
         values = [np.unique(own[:, place]) for place in range(own.shape[1])]
         place = np.repeat(np.arange(len(values)), [len(each) for each in values])
-        row, points = _rows(kf_point, slots, self._counts, self._next.shape[1])
-        lists = self._first, self._next.reshape(-1, self._next.shape[2])
-        return _score(*lists, row, place, np.concatenate(values), len(slots)), points
+        row = np.full(len(self._ids), -1, np.int32)
+        row[slots] = np.arange(len(slots), dtype=np.int32)
+        lists = self._first, self._blocks, place, np.concatenate(values)
+        return _score(*lists, row, len(slots)), self._counts[slots]
 
 
 @kernel
-def _put_in(first: Ints, after: Ints, pieces: Pieces, slot: int, count: int) -> None:
-    features, places = pieces.shape[1], pieces.shape[2]
-    for feature in range(count):
-        for place in range(places):
-            value = pieces[slot, feature, place]
-            after[slot, feature, place] = first[place, value]
-            first[place, value] = slot * features + feature
+def _observed(kf_point: Ints, alive: NDArray[np.bool_]) -> Slots:
+    """How many points the keyframe of each slot observes."""
+    count = np.zeros(len(alive), np.int64)
+    for slot in range(len(alive)):
+        if alive[slot]:
+            for feature in range(kf_point.shape[1]):
+                count[slot] += kf_point[slot, feature] >= 0
+    return count
 
 
 @kernel
-def _take_out(first: Ints, after: Ints, pieces: Pieces, slot: int, count: int) -> None:
-    features, places = pieces.shape[1], pieces.shape[2]
-    for feature in range(count):
-        gone = slot * features + feature
-        for place in range(places):
-            value = pieces[slot, feature, place]
-            node = first[place, value]
-            if node == gone:
-                first[place, value] = after[slot, feature, place]
-                continue
-            while node >= 0:
-                following = after[node // features, node % features, place]
-                if following == gone:
-                    after[node // features, node % features, place] = after[slot, feature, place]
-                    break
-                node = following
+def _put_in(first: Ints, blocks: Ints, free: Ints, freed: int, pieces: Pieces, slot: int) -> int:
+    """List a keyframe; how many blocks are free then. A list begins with the block that has room, if one has."""
+    for place in range(pieces.shape[1]):
+        for feature in range(pieces.shape[0]):
+            value = pieces[feature, place]
+            head = first[place, value]
+            if head < 0 or blocks[head, BLOCK - 1] >= 0:
+                freed -= 1
+                blocks[free[freed], 0] = head
+                head = first[place, value] = free[freed]
+            at = 1
+            while blocks[head, at] >= 0:
+                at += 1
+            blocks[head, at] = slot
+    return freed
 
 
 @kernel
-def _rows(
-    kf_point: Ints, slots: NDArray[np.int64], counts: NDArray[np.int64], room: int
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Of each feature of the index the row of its keyframe among those asked for, -1 without a point; their points."""
-    row, points = np.full(len(counts) * room, -1, np.int32), np.zeros(len(slots), np.int64)
-    for number in range(len(slots)):
-        slot = slots[number]
-        for feature in range(counts[slot]):
-            if kf_point[slot, feature] >= 0:
-                row[slot * room + feature] = number
-                points[number] += 1
-    return row, points
+def _take_out(first: Ints, blocks: Ints, free: Ints, freed: int, pieces: Pieces, slot: int) -> int:
+    """Take a keyframe from the lists; how many blocks are free then. The last in the first block fills the gap."""
+    for place in range(pieces.shape[1]):
+        for feature in range(pieces.shape[0]):
+            value = pieces[feature, place]
+            head = first[place, value]
+            last = BLOCK - 1
+            while blocks[head, last] < 0:
+                last -= 1
+            block, found = head, False
+            while not found:
+                for at in range(1, BLOCK):
+                    if blocks[block, at] == slot:
+                        blocks[block, at] = blocks[head, last]
+                        found = True
+                        break
+                block = blocks[block, 0]
+            blocks[head, last] = -1
+            if last == 1:
+                first[place, value] = blocks[head, 0]
+                free[freed] = head
+                freed += 1
+    return freed
 
 
 @kernel
-def _score(
-    first: Ints, after: Ints, row: NDArray[np.int32], places: NDArray[np.int64], values: Pieces, rows: int
-) -> NDArray[np.float64]:
-    ends, found, shared = np.zeros(len(values), np.int64), np.zeros(1 << 12, np.int32), 0
+def _score(first: Ints, blocks: Ints, places: Slots, values: Pieces, row: Ints, rows: int) -> NDArray[np.float64]:
+    score, own, shared = np.zeros(rows), np.zeros(len(values), np.int64), 0
     for k in range(len(values)):
-        place = places[k]
-        node = first[place, values[k]]
-        while node >= 0:
-            if row[node] >= 0:
-                if shared == len(found):
-                    found = np.concatenate((found, np.zeros(shared, np.int32)))
-                found[shared] = row[node]
-                shared += 1
-            node = after[node, place]
-        ends[k] = shared
-    score, begin = np.zeros(rows), 0
+        block = first[places[k], values[k]]
+        while block >= 0:
+            for at in range(1, BLOCK):
+                slot = blocks[block, at]
+                own[k] += slot >= 0 and row[slot] >= 0
+            block = blocks[block, 0]
+        shared += own[k]
     for k in range(len(values)):
-        if ends[k] > begin:
-            weight = np.log(shared / (ends[k] - begin))
-            for at in range(begin, ends[k]):
-                score[found[at]] += weight
-        begin = ends[k]
+        block = first[places[k], values[k]] if own[k] else -1
+        weight = np.log(shared / max(own[k], 1))
+        while block >= 0:
+            for at in range(1, BLOCK):
+                slot = blocks[block, at]
+                if slot >= 0 and row[slot] >= 0:
+                    score[row[slot]] += weight
+            block = blocks[block, 0]
     return score
