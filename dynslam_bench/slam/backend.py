@@ -18,7 +18,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .localisation.camera_motion import CameraMotion
-from .localisation.first_pose import Before, first_pose
+from .localisation.first_pose import Before, FirstPose, first_pose, pose_at_home, tracked_at
 from .localisation.localised import Localised
 from .localisation.observation import Observations, observe
 from .localisation.reach import Reach
@@ -188,7 +188,12 @@ class RgbdBackend:
         told = partial(self._reach.at_most, *known, prediction) if self._tracked else partial(self._reach.since, *known)
         where = last, prediction, self._reference, around, not self._tracked, cache(told)
         before = Before(*where, self.mapper.close_m, self.seed, frame.index)
+        home = pose_at_home(self.world, self._islands, seen, before, self.settings)
         first = first_pose(self.world, self._islands, seen, before, self.settings)
+        if first is None and home is not None:
+            first, home, self._tracked = home, None, False
+            self._reach.left(last)
+            self.motion.forget()
         if first is None:
             return self._lost(frame, raw, last, prediction)
         points = self._surroundings.points(first.keyframe, first.matches.point)
@@ -208,8 +213,10 @@ class RgbdBackend:
             beginning, self._first = self._first, None
             if beginning is not None and speeds is not None:
                 return self._begin_again(frame, raw, beginning, speeds, fit.count)
-            spent = self._keyframe_if_wanted(frame, taken, fit)
+            spent = self._keyframe_if_wanted(frame, taken, fit, home)
             found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
+            if home is not None and self._island and self.loops.at_home:
+                found = self._at_home(taken, home, found)
         return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)
 
     @property
@@ -220,12 +227,9 @@ class RgbdBackend:
     def _nowhere(self, frame: FrameBundle, seen: Observations) -> Tracked:
         """What stands for the last tracked frame before the camera is found in a loaded map: it shows nothing."""
         check_descriptors(self.world, seen, frame.index)
-        return self._showing_nothing(frame, np.eye(4))
-
-    def _showing_nothing(self, frame: FrameBundle, T_cam_world: Array) -> Tracked:
         none, unsure = np.zeros(len(frame), bool), np.zeros(len(frame), np.float32)
         nothing = observe(frame, none, unsure, self.camera, self._scales, self.settings.tracking)
-        return Tracked(nothing, np.zeros(0, np.int64), T_cam_world, frame.timestamp)
+        return Tracked(nothing, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
     def _lost(self, frame: FrameBundle, seen: Observations, last: Tracked, prediction: Array) -> Localised:
         """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
@@ -240,6 +244,15 @@ class RgbdBackend:
         begins = enough and self._grows and self.settings.loop_closing.enabled
         begun = self._begin_island(frame, seen, last) if begins else None
         return begun or self._localised(None if self._last is None else prediction)
+
+    def _at_home(self, tracked: Tracked, home: FirstPose, found: Localised) -> Localised:
+        """A camera on an island is in the first map, too: there its pose counts, and it may go on there."""
+        self.history.see_from(self.world, home.keyframe, home.T_cam_world)
+        if self.loops.leaves:
+            self._last, self._reference = tracked_at(self.world, tracked, home), home.keyframe
+            self.motion.forget()
+            self.state = self._state()
+        return replace(found, T_world_cam=se3.inverse(home.T_cam_world), state="ok")
 
     def _anywhere(self) -> NDArray[np.int64]:
         """Slots of the keyframes where a lost camera may be: how other islands lie to its own is unknown."""
@@ -281,12 +294,15 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ keyframes
 
-    def _keyframe_if_wanted(self, frame: FrameBundle, tracked: Tracked, fit: MapFit) -> dict[str, float]:
-        """Make the tracked frame a keyframe if the rule says so, and note its pose; what that took, by stage."""
+    def _keyframe_if_wanted(
+        self, frame: FrameBundle, tracked: Tracked, fit: MapFit, home: FirstPose | None
+    ) -> dict[str, float]:
+        """Make the tracked frame a keyframe if the rule or a join wants it, note its pose; what that took, by stage."""
         spent: dict[str, float] = {}
         pose = fit.estimate.T_cam_world
-        if self._grows and self._keyframes.wants(self.world, tracked, frame.index, self._reference):
-            spent = self._make_keyframe(frame, tracked)
+        wanted = home is not None or self._keyframes.wants(self.world, tracked, frame.index, self._reference)
+        if self._grows and wanted:
+            spent = self._make_keyframe(frame, tracked, home)
             if self.settings.bundle_adjustment.enabled or self.settings.loop_closing.enabled:
                 pose = tracked.T_cam_world
                 self.motion.relocated(pose)
@@ -295,7 +311,7 @@ class RgbdBackend:
         self.state = self._state()
         return spent
 
-    def _make_keyframe(self, frame: FrameBundle, tracked: Tracked) -> dict[str, float]:
+    def _make_keyframe(self, frame: FrameBundle, tracked: Tracked, home: FirstPose | None = None) -> dict[str, float]:
         pose, at = tracked.T_cam_world, (frame.index, frame.timestamp, self._island)
         slot, spent = self.mapper.insert(tracked.seen, tracked.point, pose, *at)
         self._reference = slot
@@ -304,7 +320,7 @@ class RgbdBackend:
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             before = self.world.kf_pose[slot].copy()
-            self.loops.close(slot, tracked.seen)
+            self.loops.close(slot, tracked.seen, home)
             self.history.rescale(self.loops.rescaled)
             if slot in self.loops.rescaled:  # what a loop turns with depth is within the motion's noise
                 self.motion.carried(before, self.world.kf_pose[slot], self.loops.rescaled[slot])
@@ -319,27 +335,12 @@ class RgbdBackend:
 
     def _localised(self, T_cam_world: Array | None, spent: dict[str, float] | None = None) -> Localised:
         """A frame's outcome with the state and the map as they are now; `spent` on a keyframe, if it became one."""
-        return Localised(
-            T_world_cam=None if T_cam_world is None else se3.inverse(T_cam_world),
-            state=self.state,
-            matches=0,
-            inliers=0,
-            residual_px=0.0,
-            relocalised=False,
-            keyframe=bool(spent),
-            map_points=self.world.point_count,
-            keyframes=self.world.keyframe_count,
-            maps=self.world.map_count,
-            loops=len(self.loops.closed),
-            timings=spent or {},
-        )
+        return Localised.of(self.world, self.state, T_cam_world, len(self.loops.closed), spent or {})
 
     # ------------------------------------------------------------------ what others may see
 
     def predict(self, timestamp: float) -> Array | None:
-        """The motion model's camera-to-world pose at a time; None while lost, and when nothing is known yet.
-
-        After a gap that nothing is assumed about this is the last tracked pose.
+        """The motion model's camera-to-world pose at a time, after a long gap the last tracked one; None while lost.
 
         Args:
             timestamp: The stamp of the frame to come, seconds.
@@ -350,14 +351,13 @@ class RgbdBackend:
         return se3.inverse(self.motion.predicted(self._last, regular, self.settings.motion))
 
     def motion_covariance(self, timestamp: float) -> Array | None:
-        """How far the camera's motion since the last frame may be from the predicted one.
+        """Covariance ``[6, 6]`` of the camera's motion since the last frame, about the predicted one.
+
+        It is of (position in the world in metres, rotation in the camera frame in radians); None while lost, when
+        nothing is known yet, and after a gap that nothing is assumed about.
 
         Args:
             timestamp: The stamp of the frame to come, seconds.
-
-        Returns:
-            Covariance ``[6, 6]`` of (position in the world in metres, rotation in the camera frame in radians); None
-            while lost, when nothing is known yet, and after a gap that nothing is assumed about.
         """
         if self._last is None:
             return None

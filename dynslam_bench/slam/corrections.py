@@ -52,3 +52,32 @@ class Correction:
         turned = se3.rotation_angle(self.T_now_before @ se3.inverse(other.T_now_before))
         scaled = abs(np.log(self.scale / other.scale))
         return bool(apart < AGREE_M and np.degrees(turned) < AGREE_DEG and scaled < AGREE_SCALE)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A place that was recognised.
+
+    Attributes:
+        keyframe: Slot, at that time, of the keyframe that was seen again.
+        frame: Index of that keyframe's frame.
+        T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
+        inliers: Points that fit it.
+        share: How many of the keyframe's own points in view are among them, of one.
+        joins: Whether the place lies on another island of the map.
+        moved_m: How far the newest keyframe is from where it was believed to be.
+        turned_deg: By how much it is turned, degrees.
+        scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
+        fits: Whether the island could come to lie so; without depth its lengths may have drifted apart on the way.
+    """
+
+    keyframe: int
+    frame: int
+    T_cam_world: Array
+    inliers: int
+    share: float
+    joins: bool
+    moved_m: float
+    turned_deg: float
+    scale: float
+    fits: bool = True

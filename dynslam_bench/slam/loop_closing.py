@@ -16,7 +16,7 @@ Lengths are metres; without depth they are in units of the first map's median de
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +25,18 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 
 from .bundle.pose_graph import Edge, inherited, optimise_poses, rescaled, spread_scale, within
-from .corrections import Correction
+from .corrections import Correction, Loop
+from .localisation.first_pose import FirstPose
 from .localisation.lookalikes import Sight, ambiguous
 from .localisation.observation import Observations
-from .localisation.recognition import Recognised, around, points_around, recognise
+from .localisation.recognition import Recognised, around, imprecision, points_around, recognise
 from .localisation.relocalisation import match_keyframe, ransac_pose
 from .localisation.surroundings import not_held
 from .localisation.tracking import Matches
 from .mapping.islands import Islands
 from .mapping.local_mapping import LocalMapper
 from .mapping.map import Map
+from .mapping.map_kernels import distinct
 from .places import likeness
 from .settings import BackendSettings
 
@@ -55,37 +57,12 @@ MOST_SCALE = 3.0
 """Factor by which scale may have drifted, at most, where it is free."""
 FIRM = 100.0
 """Weight of a loop's tie where scale is free: what is left open between two visits would bend both."""
+PATIENCE = 5
+"""Frames after which a camera leaves an island for the first map, if that could not be joined by then."""
+FIRMLY = 0.4
+"""So imprecise, at most, is a pose by which maps are joined (`localisation.recognition`)."""
 SCALE_POINTS = 20
 """So many features with a point of both visits are needed to tell the scale."""
-
-
-@dataclass(frozen=True)
-class Loop:
-    """A place that was recognised.
-
-    Attributes:
-        keyframe: Slot, at that time, of the keyframe that was seen again.
-        frame: Index of that keyframe's frame.
-        T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
-        inliers: Points that fit it.
-        share: How many of the keyframe's own points in view are among them, of one.
-        joins: Whether the place lies on another island of the map.
-        moved_m: How far the newest keyframe is from where it was believed to be.
-        turned_deg: By how much it is turned, degrees.
-        scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
-        fits: Whether the island could come to lie so; without depth its lengths may have drifted apart on the way.
-    """
-
-    keyframe: int
-    frame: int
-    T_cam_world: Array
-    inliers: int
-    share: float
-    joins: bool
-    moved_m: float
-    turned_deg: float
-    scale: float
-    fits: bool = True
 
 
 class LoopCloser:
@@ -119,8 +96,8 @@ class LoopCloser:
         self.rescaled: dict[int, float] = {}
         """By what the last call of `close` rescaled the surroundings of keyframes, by their slots; with depth by 1, and
         of those alone that it moved to another map."""
-        self.misfit = False
-        """Whether the last call of `close` found an island's camera in an older map, which the island cannot join."""
+        self.at_home = self.leaves = False
+        """Whether an island's camera was in the first map by the last call of `close`, and is to go on there."""
         self._seed = seed
         self._scale_is_known = scale_is_known
         self._way: dict[int, float] = {}
@@ -128,24 +105,26 @@ class LoopCloser:
         self._short_cuts: list[tuple[float, float]] = []
         self._last_pose: Array | None = None
         self._row: list[Correction] = []
+        self._met: dict[int, int] = {}
         self._ties: list[Edge] = []
 
-    def close(self, slot: int, seen: Observations) -> bool:
+    def close(self, slot: int, seen: Observations, home: FirstPose | None = None) -> bool:
         """Look for a loop at a new keyframe; correct and fuse the map if enough keyframes in a row agree on one.
 
         Args:
             slot: The keyframe.
             seen: Its features.
+            home: Its pose in the first map, if the camera is on an island and was found there.
 
         Returns:
             Whether a loop was closed; every pose and point may have changed then.
         """
-        self.rescaled, self.misfit = {}, False
+        self.rescaled, self.at_home, self.leaves = {}, False, False
         self._note_way(slot)
         for dropped, heir, relative in self.mapper.dropped if self._ties else ():
             gone, stands = (int(self.world.kf_id[each]) for each in (dropped, heir))
             self._ties = inherited(self._ties, gone, stands, relative)
-        loop = self._verified(slot, seen)
+        loop = self._verified(slot, seen) if home is None else self._at_home(slot, seen, home)
         if loop is None:
             self._row.clear()
             return False
@@ -155,13 +134,12 @@ class LoopCloser:
         self._row.append(correction)
         if len(self._row) < self.settings.loop_closing.confirmations:
             return False
-        if loop.joins and self._ambiguous(slot, seen, loop):
-            self._row.clear()
-            return False
         loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
         self._row.clear()
         if not loop.fits:
-            self.misfit = True
+            self.leaves = self.at_home = home is not None and bool(self.world.kf_alive[loop.keyframe])
+            return False
+        if loop.joins and home is None and self._ambiguous(slot, seen, loop):
             return False
         if loop.joins:
             self._join(slot, loop)
@@ -225,6 +203,26 @@ class LoopCloser:
         place = recognise(world, candidate, seen, matches.select(inliers), pose, self.settings.tracking)
         if len(place.matches) < s.min_inliers or place.share < s.min_share:
             return None
+        loop = self._loop(slot, candidate, place)
+        if loop is None or (loop.joins and imprecision(world, seen, place, rng) > FIRMLY):
+            return None
+        return loop if self._believable(slot, loop) else None
+
+    def _at_home(self, slot: int, seen: Observations, home: FirstPose) -> Loop | None:
+        """The place in the first map where an island's camera was found, if it tells well enough how the two lie."""
+        s, island = self.settings.loop_closing, int(self.world.kf_island[slot])
+        loop = self._loop(slot, home.keyframe, Recognised(home.T_cam_world, home.matches, home.share))
+        if loop is None or (loop.fits and self._ambiguous(slot, seen, loop)):
+            return None
+        waited = int(self.world.kf_frame[slot]) - self._met.setdefault(island, int(self.world.kf_frame[slot]))
+        well = loop.inliers >= s.min_inliers and loop.share >= s.join_share and home.imprecision <= FIRMLY
+        self.at_home = loop.fits and bool(self.world.kf_alive[home.keyframe])
+        self.leaves = self.at_home and not well and waited >= PATIENCE
+        return loop if well else None
+
+    def _loop(self, slot: int, candidate: int, place: Recognised) -> Loop | None:
+        """What a place asks for; None where too little tells the scale."""
+        world = self.world
         scale = 1.0 if self._scale_is_known else self._scale(slot, place)
         if scale is None:
             return None
@@ -233,9 +231,7 @@ class LoopCloser:
         turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
         back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
         loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned, scale)
-        if joins:
-            loop = replace(loop, fits=self._fits(slot, loop))
-        return loop if self._believable(slot, loop) else None
+        return replace(loop, fits=self._fits(slot, loop)) if joins else loop
 
     def _scale(self, slot: int, place: Recognised) -> float | None:
         """How many times as deep points lie by the first visit as by this one; None where too few tell."""
@@ -256,9 +252,7 @@ class LoopCloser:
             return False
         if loop.joins:
             here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
-            if np.radians(loop.turned_deg) > self.islands.slack(here, there):
-                return False
-            return loop.fits or (not self._scale_is_known and self._may_be_there(slot, loop))
+            return loop.fits and np.radians(loop.turned_deg) <= self.islands.slack(here, there)
         way = self._way_to(loop.keyframe)
         if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
             return False
@@ -269,12 +263,6 @@ class LoopCloser:
         younger, _, move = self._moves(slot, loop)
         share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
         return self.islands.may_lie(younger, move.moved, share * self._way_around(slot, loop))
-
-    def _may_be_there(self, slot: int, loop: Loop) -> bool:
-        """Whether the camera can have got from the island to a place of the first map, as where it is lost."""
-        here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
-        now = se3.inverse(loop.T_cam_world)[:3, 3]
-        return not there and self.islands.within(here, there, self.world.kf_centre[slot], now, 0.0)
 
     def _ambiguous(self, slot: int, seen: Observations, loop: Loop) -> bool:
         """Whether the keyframe looks like two places: nothing but what is seen tells how islands lie together."""
@@ -327,8 +315,7 @@ class LoopCloser:
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
         self.islands.carried(int(world.kf_island[slot]), before[slots], after, scales[slots])
-        seen = np.unique(world.kf_point[slots])
-        points = seen[seen >= 0].astype(np.int64)
+        points = distinct(world.kf_point[slots], world.alive.size)
         reference = world.obs_kf[world.obs_at[points]]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
         local *= scales[reference, None]

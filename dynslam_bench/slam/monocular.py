@@ -19,7 +19,6 @@ from .mapping.first_map import FirstMap, FirstViews, View, put
 from .monocular_settings import MonocularBackendSettings
 
 Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
 
 
 class MonocularBackend(RgbdBackend):
@@ -51,7 +50,6 @@ class MonocularBackend(RgbdBackend):
     def reset(self, camera: Camera, seed: int) -> None:
         """Forget everything: a new sequence begins."""
         super().reset(camera, seed)
-        self._misfits: set[int] = set()
         self._views_so_far = FirstViews()
 
     def _initialise(self, frame: FrameBundle, seen: Observations) -> Localised:
@@ -80,21 +78,6 @@ class MonocularBackend(RgbdBackend):
         T_first_world = last.T_cam_world.copy()
         T_first_world[:3] = start.T_cam_first[:3, :3].T @ self._reach.turned(last)[:3]
         return self._begin_from_two(start, T_first_world, spent)
-
-    def _anywhere(self) -> Slots:
-        """Not on an island whose lengths have drifted apart."""
-        slots = super()._anywhere()
-        return slots[~np.isin(self.world.kf_island[slots], list(self._misfits))]
-
-    def _make_keyframe(self, frame: FrameBundle, tracked: Tracked) -> dict[str, float]:
-        """Where the keyframe shows a place of the first map, but the island cannot join it, the camera leaves it."""
-        spent = super()._make_keyframe(frame, tracked)
-        if self.loops.misfit:
-            self._misfits.add(self._island)
-            self._tracked, self._last = False, self._showing_nothing(frame, tracked.T_cam_world)
-            self._reach.left(tracked)
-            self.motion.forget()
-        return spent
 
     def _begin_from_two(self, start: FirstMap, T_first_world: Array, spent: dict[str, float]) -> Localised:
         """The two views become keyframes; the second, which is the frame at hand, is tracked."""

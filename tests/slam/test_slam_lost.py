@@ -112,7 +112,7 @@ def test_without_depth_a_map_of_its_own_is_joined_with_its_unit_of_length():
     assert way[joined] == pytest.approx(lap, abs=15) and (states[joined:] == "ok").all()
     assert [each.maps for each in found[100:joined]] == [2] * (joined - 100) and found[-1].maps == 1
     (loop,) = backend.loops.closed
-    assert loop.joins and loop.fits and loop.frame < 20 and abs(np.log(loop.scale)) > 0.1
+    assert loop.joins and loop.fits and loop.frame < 20 and abs(np.log(loop.scale)) > 0.05
     final = backend.finalize()
     assert len(way) - len(final) <= 20 + 17, "what was driven on the island is in the final trajectory"
     true = poses[[way[round(stamp * 30)] for stamp in final.timestamps]]

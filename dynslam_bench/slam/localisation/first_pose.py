@@ -6,7 +6,7 @@ All functions are pure: they read the map and never change it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,7 +22,7 @@ from .lookalikes import ambiguous, sight
 from .observation import Observations
 from .pose import PoseEstimate
 from .reach import Lost
-from .recognition import recognise
+from .recognition import imprecision, recognise
 from .relocalisation import Relocalised, located
 from .tracking import ENOUGH_FIRST, Matches, Tracked, match_last_frame, solve
 
@@ -32,7 +32,7 @@ Slots = NDArray[np.int64]
 TRUSTED_FIRST = 50
 TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a first pose from the last frame trusted by itself."""
-MANY = 100
+MANY = 60
 MANY_SHARE = 0.75
 """So many points that fit a place let this much of the share of what should be in view suffice (`docs/backend.md`)."""
 WIDE = 2.5
@@ -75,12 +75,16 @@ class FirstPose:
         matches: The matches that agree.
         keyframe: Slot of a keyframe nearby: the one that they are with, or else the last frame's reference.
         relocalised: Whether the camera was lost before, or they are a keyframe's.
+        share: Of the keyframe's own points that should be in view so much is, of one; NaN if nobody asked.
+        imprecision: How badly they tell the pose (`recognition.imprecision`); NaN if nobody asked.
     """
 
     T_cam_world: Array
     matches: Matches
     keyframe: int
     relocalised: bool
+    share: float = np.nan
+    imprecision: float = np.nan
 
 
 def first_pose(
@@ -121,6 +125,27 @@ def first_pose(
     return found
 
 
+def pose_at_home(
+    world: Map, islands: Islands, seen: Observations, before: Before, settings: BackendSettings
+) -> FirstPose | None:
+    """A pose in the first map, of a camera that is tracked on an island: under the conditions of one that is lost.
+
+    Arguments as of `first_pose`.
+    """
+    if before.lost or not world.kf_island[before.reference]:
+        return None
+    lost = replace(before, keyframes=world.island(0), lost=True)
+    found = _from_keyframes(world, islands, seen, lost, settings, ENOUGH_FIRST // 2)
+    return found if found is not None and len(found.matches) >= settings.relocalisation.min_inliers else None
+
+
+def tracked_at(world: Map, tracked: Tracked, found: FirstPose) -> Tracked:
+    """A tracked frame as it is tracked at another place."""
+    point = np.full(len(tracked.seen), -1, np.int64)
+    point[found.matches.feature] = np.where(world.alive[found.matches.point], found.matches.point, -1)
+    return replace(tracked, point=point, T_cam_world=found.T_cam_world)
+
+
 def _there(
     world: Map, islands: Islands, seen: Observations, found: Relocalised, before: Before, settings: BackendSettings
 ) -> FirstPose | None:
@@ -137,10 +162,13 @@ def _there(
     many = len(place.matches) >= MANY
     if place.share < (MANY_SHARE if many else 1.0) * settings.relocalisation.min_share:
         return None
+    imprecise = imprecision(world, seen, place, stream(before.seed, "halves", before.frame)) if before.lost else 0.0
+    if imprecise > 1:
+        return None
     known = {there: sight(place)}
     if before.lost and ambiguous(world, seen, known, before.keyframes, settings, before.seed, may_be):
         return None
-    return FirstPose(place.T_cam_world, place.matches, found.keyframe, relocalised=True)
+    return FirstPose(place.T_cam_world, place.matches, found.keyframe, True, place.share, imprecise)
 
 
 def _within_reach(islands: Islands, before: Before, found: PoseEstimate) -> bool:

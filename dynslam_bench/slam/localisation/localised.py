@@ -9,6 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.result import TrackingState
+from dynslam_bench.geometry import se3
+
+from ..mapping.map import Map
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +36,7 @@ class Localised:
         timings: Seconds of ``tracking``, ``mapping``, ``bundle_adjustment`` and ``loop_closing``, where they worked.
     """
 
-    T_world_cam: NDArray[np.float64] | None
+    T_world_cam: Array | None
     state: TrackingState
     matches: int
     inliers: int
@@ -43,3 +48,31 @@ class Localised:
     maps: int
     loops: int
     timings: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls, world: Map, state: TrackingState, T_cam_world: Array | None, loops: int, timings: Mapping[str, float]
+    ) -> Localised:
+        """A frame's outcome with the map as it is now, before its matches are counted.
+
+        Args:
+            world: The map.
+            state: Of tracking.
+            T_cam_world: World-to-camera pose ``[4, 4]``, if there is one.
+            loops: How many were closed so far.
+            timings: What a keyframe took, if the frame became one.
+        """
+        return cls(
+            T_world_cam=None if T_cam_world is None else se3.inverse(T_cam_world),
+            state=state,
+            matches=0,
+            inliers=0,
+            residual_px=0.0,
+            relocalised=False,
+            keyframe=bool(timings),
+            map_points=world.point_count,
+            keyframes=world.keyframe_count,
+            maps=world.map_count,
+            loops=loops,
+            timings=timings,
+        )

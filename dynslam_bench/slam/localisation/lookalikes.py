@@ -60,8 +60,7 @@ class Sight:
 
 def sight(place: Recognised) -> Sight:
     """What a place that was recognised gives."""
-    depth = se3.transform(place.T_cam_world, place.matches.position)[:, 2]
-    return Sight(place.T_cam_world, place.share, float(np.median(depth)))
+    return Sight(place.T_cam_world, place.share, place.depth)
 
 
 def ambiguous(

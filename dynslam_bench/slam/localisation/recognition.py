@@ -12,8 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.geometry import se3
+
 from ..mapping.map import Map
+from ..mapping.map_kernels import distinct
 from ..settings import TrackingSettings
+from .motion_model import pose_covariance
 from .observation import Observations
 from .tracking import Matches, match_map, solve
 
@@ -26,6 +30,14 @@ WIDEN = 2.0
 """Factor on the search windows: the first pose rests on few matches."""
 ROUNDS = 6
 """So often, at most, the pose is fitted anew to what it let find: a small patch tells its surroundings alone well."""
+
+INNER = 0.85
+"""Share of the matches, those nearest their middle in the image, that have to tell the pose by themselves."""
+DILUTED = 0.1
+"""Dilution of precision at most: how uncertain the camera's place is, in median depths, by one match's worth of what
+these tell."""
+HALVES, APART = 12, 0.01
+"""Halves of the matches that are asked, and how far apart, in median depths, they may place the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +53,11 @@ class Recognised:
     T_cam_world: Array
     matches: Matches
     share: float
+
+    @property
+    def depth(self) -> float:
+        """Median depth of what is seen."""
+        return float(np.median(se3.transform(self.T_cam_world, self.matches.position)[:, 2]))
 
 
 def recognise(
@@ -70,7 +87,33 @@ def recognise(
     if seen.mask is not None:
         in_view = in_view[~_behind(seen.mask, uv)]
     share = float(np.isin(in_view, fitting.point).mean()) if len(in_view) else 0.0
-    return Recognised(estimate.T_cam_world, fitting, share if np.isfinite(estimate.T_cam_world).all() else 0.0)
+    share = share if np.isfinite(estimate.T_cam_world).all() else 0.0
+    return Recognised(estimate.T_cam_world, fitting, share)
+
+
+def imprecision(world: Map, seen: Observations, place: Recognised, rng: np.random.Generator) -> float:
+    """How badly what was recognised tells from where it is seen; one poster far away does not. Up to 1 is precise.
+
+    How many matches there are says nothing of that: what was mapped a little bent is so for all of them. So they have
+    to lie well; and a few far off the others, right or wrong, must not settle the pose, so that any half tells it.
+
+    Args:
+        world: The map.
+        seen: The frame's features.
+        place: Where they were recognised.
+        rng: Draws the halves.
+    """
+    matches, T_cam_world = place.matches, place.T_cam_world
+    xy, count = seen.xy[matches.feature], len(matches)
+    off = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
+    inner = solve(world, seen, matches.select(off <= np.quantile(off, INNER)), T_cam_world)
+    covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
+    diluted = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(HALVES)]
+    centres = se3.inverse(np.array([solve(world, seen, half, T_cam_world).T_cam_world for half in halves]))[:, :3, 3]
+    apart = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
+    worst = float(max(diluted / DILUTED, apart / APART) / place.depth)
+    return worst if np.isfinite(worst) else np.inf
 
 
 def _behind(mask: NDArray[np.bool_], uv: Array) -> NDArray[np.bool_]:
@@ -88,5 +131,4 @@ def around(world: Map, keyframe: int) -> Slots:
 
 def points_around(world: Map, keyframe: int) -> Slots:
     """Slots of the points that these observe, ascending."""
-    table = world.kf_point[around(world, keyframe)]
-    return np.unique(table[table >= 0]).astype(np.int64)
+    return distinct(world.kf_point[around(world, keyframe)], world.alive.size)

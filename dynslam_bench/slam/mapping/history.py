@@ -50,6 +50,11 @@ class History:
         self._information[self.count] = information
         self.count += 1
 
+    def see_from(self, world: Map, reference: int, T_cam_world: Array) -> None:
+        """The newest frame's pose is known from another keyframe, with its world."""
+        self._reference[self.count - 1] = reference
+        self._relative[self.count - 1] = T_cam_world @ se3.inverse(world.kf_pose[reference])
+
     def inherit(self, dropped: int, heir: int, T_dropped_heir: Array) -> None:
         """Re-anchor the frames of a removed keyframe."""
         rows = np.flatnonzero(self._reference[: self.count] == dropped)
