@@ -10,6 +10,7 @@ from ring_world import RingWorld
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
+from dynslam_bench.slam import loop_closing
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.localisation.lookalikes import Sight, ambiguous
 from dynslam_bench.slam.localisation.motion_model import MotionState
@@ -78,6 +79,25 @@ def test_a_map_of_its_own_is_joined_when_the_camera_comes_round():
     index = [way[round(stamp * 10)] for stamp in final.timestamps]
     true = se3.transform(se3.inverse(lap_poses[0]), lap_poses[index][:, :3, 3])
     assert np.linalg.norm(final.positions - true, axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize("patient", [False, True])
+def test_an_island_that_is_not_joined_is_left_where_the_camera_is_in_the_first_map(monkeypatch, patient):
+    """What is seen never suffices to join them here; the camera's own pose is known from the first frame on."""
+    if patient:
+        monkeypatch.setattr(loop_closing, "PATIENCE", 10**6)
+    world, lap = RingWorld(), 4 * QUARTER
+    way = [*range(25), *[None] * 20, *range(60, lap + 20)]
+    closing = {"loop_closing.enabled": True, "loop_closing.join_share": 1.0}
+    backend, states, errors = drive(world, way, **closing)
+    back = 45 + int(np.flatnonzero(states[45:] == "ok")[0])
+    assert way[back] == pytest.approx(lap, abs=15) and (states[back:] == "ok").all() and errors[back:].max() < 0.2
+    assert not backend.loops.closed and backend.world.map_count == 2
+    assert backend.outputs().keyframes[-1].map == (1 if patient else 0)
+    final = backend.finalize()
+    assert len(final) == np.count_nonzero(states == "ok"), "nothing of the island's, where it lies is unknown"
+    poses = world.lap(lap + 20, STEP)[[way[round(stamp * 10)] for stamp in final.timestamps]]
+    assert np.linalg.norm(final.positions - (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3], axis=1).max() < 0.3
 
 
 def drive_without_depth(world, way, step):

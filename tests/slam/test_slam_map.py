@@ -9,6 +9,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.localisation.observation import observe
 from dynslam_bench.slam.mapping.map import Map
+from dynslam_bench.slam.mapping.map_kernels import distinct
 from dynslam_bench.slam.mapping.triangulation import triangulate
 from dynslam_bench.slam.settings import MappingSettings, TrackingSettings
 
@@ -40,6 +41,14 @@ def test_points_and_keyframes_say_the_same_after_a_walk(room, tracked):
     begin, end = world.obs_at[points], world.obs_at[points] + world.obs_room[points]
     order = np.argsort(begin)
     assert (end[order][:-1] <= begin[order][1:]).all() and (world.n_obs[points] <= world.obs_room[points]).all()
+
+
+@pytest.mark.parametrize("named", [0, 1, 50, 400])
+def test_points_that_a_table_names_are_found_once(named):
+    rng = np.random.default_rng(named)
+    table = np.where(rng.random((7, 90)) < 0.5, rng.integers(0, max(named, 1), (7, 90)), -1).astype(np.int32)
+    table[:, : 90 if named == 0 else 0] = -1
+    np.testing.assert_array_equal(distinct(table, 500), np.unique(table[table >= 0]))
 
 
 def test_one_point_that_many_keyframes_see_costs_the_others_nothing(room):

@@ -6,7 +6,7 @@ import pytest
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.localisation.observation import observe
 from dynslam_bench.slam.mapping.map import Map
-from dynslam_bench.slam.mapping.piece_index import EVERY
+from dynslam_bench.slam.mapping.piece_index import CHANGED, EVERY, PieceIndex
 from dynslam_bench.slam.places import likeness, most_alike
 from dynslam_bench.slam.settings import TrackingSettings
 
@@ -108,3 +108,31 @@ def test_the_index_counts_what_is_there_after_keyframes_came_and_went(room, seed
             features, looked = seen(room, rng.uniform(0, 6), 1000 + number), looked + 1
             np.testing.assert_allclose(likeness(world, asked, features), counted(world, asked, features), rtol=1e-9)
     assert looked > 8
+
+
+@pytest.mark.parametrize("values", [1 << 16, 300])
+def test_the_index_has_room_for_any_number_of_pieces(values):
+    """More than there was room for at first; of all values, or crowded on few."""
+    rng, slots, features = np.random.default_rng(0), 640, 1200
+    pieces = rng.integers(0, values, (slots, features, 1)).astype(np.uint16)
+    kf_point = np.where(rng.random((slots, features)) < 0.9, 7, -1).astype(np.int32)
+    index, ids, own = PieceIndex(), np.arange(slots), rng.integers(0, values, (500, 1)).astype(np.uint16)
+    index.renew(np.ones(slots, bool), ids, kf_point, pieces)
+    score, points = index.score(ids, own)
+    np.testing.assert_array_equal(points, (kf_point >= 0).sum(axis=1))
+    held = np.array([np.bincount(pieces[k, kf_point[k] >= 0, 0], minlength=values) for k in ids])[:, np.unique(own)]
+    every = held.sum(axis=0)
+    weight = np.log(every.sum() / np.maximum(every, 1))
+    np.testing.assert_allclose(score, held @ weight, rtol=1e-9)
+    index.renew(np.zeros(slots, bool), ids, kf_point, pieces)
+    assert not index.score(ids, own)[0].any(), "all went"
+
+
+def test_a_keyframe_is_taken_up_anew_when_many_of_its_points_are_others():
+    pieces, ids, alive = np.arange(100, dtype=np.uint16).reshape(1, 100, 1), np.zeros(1, np.int64), np.ones(1, bool)
+    index, kf_point = PieceIndex(), np.full((1, 100), 3, np.int32)
+    most = round(100 * CHANGED)
+    for gone, counted in ((0, 100), (most, 100), (most + 1, 99 - most), (60, 40)):
+        kf_point[0, :gone] = -1
+        index.renew(alive, ids, kf_point, pieces)
+        assert index.score(ids, pieces[0])[1] == counted

@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from point_world import PointWorld, track_all
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.recognition import recognise
+from dynslam_bench.slam.localisation.recognition import Recognised, imprecision, recognise
 from dynslam_bench.slam.localisation.relocalisation import match_keyframe
+from dynslam_bench.slam.localisation.tracking import solve
 from dynslam_bench.slam.settings import TrackingSettings
 
 FIRST = np.eye(4)
@@ -58,3 +60,25 @@ def test_what_people_hide_is_not_expected_to_be_seen():
     without = recognised(backend, seen_in(backend, frame, outside), patch, FIRST)
     behind = recognised(backend, seen_in(backend, replace(frame, mask=mask), outside), patch, FIRST)
     assert without.share < 0.4 < 0.8 < behind.share and len(behind.matches) == len(without.matches)
+
+
+@pytest.mark.parametrize(
+    ("half", "beside", "tells"), [(60, 0, False), (60, 4, False), (60, 24, True), (90, 0, False), (250, 0, True)]
+)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_one_patch_does_not_tell_from_where_it_is_seen_nor_do_a_few_matches_beside_it(half, beside, tells, seed):
+    """Eighty matches each, from a square of twice `half` in an image of 640 x 480, and `beside` of them around it."""
+    room, backend = PointWorld(count=30_000), RgbdBackend()
+    backend.reset(room.camera, 0)
+    track_all(backend, [room.see(FIRST, 0, depthless=0.0, limit=4000)])
+    pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
+    frame = room.see(pose, 1, noise_px=1.0, limit=4000)
+    seen = seen_in(backend, frame, np.ones(len(frame), bool))
+    every, rng = match_keyframe(backend.world, 0, seen, 60), np.random.default_rng(seed)
+    off = np.abs(seen.xy[every.feature] - [260, 200]).max(axis=1)
+    patch, around = rng.permutation(np.flatnonzero(off < half)), rng.permutation(np.flatnonzero(off > 150))
+    few = every.select(np.sort(np.concatenate([patch[: 80 - beside], around[:beside]])))
+    found = solve(backend.world, seen, few, se3.inverse(pose))
+    place = Recognised(found.T_cam_world, few.select(found.inliers), 0.5)
+    assert len(place.matches) > 60
+    assert (imprecision(backend.world, seen, place, np.random.default_rng(0)) <= 1) == tells
