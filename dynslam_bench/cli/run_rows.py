@@ -34,6 +34,8 @@ WHERE_SAID = {
 """Columns that are there only if a run has something to say in them."""
 SPARE = ("not moving (m)", "masks", "repeat", "coverage", "settings", "ms/frame", "part", "from the store")
 """Columns that give way on a narrow terminal, the first one first."""
+LONG_WAY_M = 20.0
+"""A way along which drift may have come in that only a closed loop gives back (docs/backend.md, Loops)."""
 
 
 def show_runs(
@@ -91,4 +93,19 @@ def seen_note(records: Sequence[RunRecord]) -> str:
         f"{len(seen)} of {len(records)} runs have masks of a network that was trained on their scene, the first on "
         f"{seen[0]}: a best case, which reports mark and do not rank; instances 100-199 are held out, e.g. "
         f"{seen[0].partition('?')[0].partition('@')[0]}@100"
+    )
+
+
+def drift_note(records: Sequence[RunRecord], store: RunStore) -> str:
+    """One line on runs that went a long way and were to close no loops; empty without any."""
+    asked = [r for r in records if r.settings.get("backend.loop_closing.enabled") is False]
+    tracks = [(r, store.trajectory(r.run_id)) for r in asked if r.tracker.sensors == "rgbd"]
+    ways = [(r.sequence.id, track.path_length_m) for r, track in tracks if track is not None]
+    long = [(name, way) for name, way in ways if way > LONG_WAY_M]
+    if not long:
+        return ""
+    return (
+        f"{len(long)} of {len(records)} runs went more than {LONG_WAY_M:.0f} m, the first {long[0][1]:.0f} m on "
+        f"{long[0][0]}, without loop closing: what drifts on such a way stays, with every frame ok; loops are closed "
+        "with --set backend.loop_closing.enabled=true"
     )

@@ -46,7 +46,7 @@ from .options import (
 )
 from .output import SOME_RUNS_FAILED, note, progress
 from .panels import MEASURE
-from .run_rows import seen_note, show_pictures, show_runs
+from .run_rows import drift_note, seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.core.records import Record
@@ -266,8 +266,9 @@ def finish(
     records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
     missing = show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
-    if seen := seen_note(records):
-        note(seen)
+    for caution in (seen_note(records), drift_note(records, store)):
+        if caution:
+            note(caution)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)

@@ -155,7 +155,7 @@ class LoopCloser:
 
     def _note_way(self, slot: int) -> None:
         pose, number = self.world.kf_pose[slot].copy(), int(self.world.kf_id[slot])
-        for begun in range(max(self._way, default=number - 1) + 1, number):  # the first two views of an island
+        for begun in range(next(reversed(self._way), number - 1) + 1, number):  # the first two views of an island
             self._way[begun] = self._walked
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)

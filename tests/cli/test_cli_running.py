@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from cli_errors import one_line
 
-from dynslam_bench.cli import output
+from dynslam_bench.cli import output, run_rows, running
 from dynslam_bench.cli.output import progress
 
 
@@ -94,6 +94,24 @@ def test_a_run_that_was_lost_is_no_success(cli, walk):
     toys = Path(__file__).parents[1] / "envs" / "envs_toys.py"
     code, out, _ = cli("run", f"{toys}:SPEC", walk, "--set", "mode=lost", "--set", "at=1", "--json")
     assert json.loads(out)[0]["status"] == "lost" and code == 3
+
+
+def test_people_who_watch_are_told_of_a_long_way_without_loop_closing(cli, walk, monkeypatch):
+    notes: list[str] = []
+    monkeypatch.setattr(running, "note", notes.append)
+
+    def told(tracker, *settings):
+        notes.clear()
+        assert cli("run", tracker, walk, "--frames", "0:6", *settings)[0] in (0, 3)
+        return [text for text in notes if "without loop closing" in text]
+
+    assert not told("orb-slam2"), "its way is short"
+    monkeypatch.setattr(run_rows, "LONG_WAY_M", 0.001)
+    (text,) = told("orb-slam2")
+    assert text.startswith("1 of 1 runs went more than 0 m, the first 0 m on folder/walk, without")
+    assert not told("orb-slam2", "--set", "backend.loop_closing.enabled=true")
+    assert not told("orb-slam2-mono"), "its unit of length is not known"
+    assert not told("constant-velocity"), "it has no loops to close"
 
 
 def test_show_counts_frames_that_were_initialising_and_closed_loops(cli, walk):

@@ -113,7 +113,7 @@ def test_the_index_counts_what_is_there_after_keyframes_came_and_went(room, seed
 @pytest.mark.parametrize("values", [1 << 16, 300])
 def test_the_index_has_room_for_any_number_of_pieces(values):
     """More than there was room for at first; of all values, or crowded on few."""
-    rng, slots, features = np.random.default_rng(0), 640, 1200
+    rng, slots, features = np.random.default_rng(0), 640, 2400
     pieces = rng.integers(0, values, (slots, features, 1)).astype(np.uint16)
     kf_point = np.where(rng.random((slots, features)) < 0.9, 7, -1).astype(np.int32)
     index, ids, own = PieceIndex(), np.arange(slots), rng.integers(0, values, (500, 1)).astype(np.uint16)

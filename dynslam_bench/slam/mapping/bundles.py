@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..bundle.schur import BundleProblem
 from ..settings import BundleAdjustmentSettings
 from .map import Map
+from .map_kernels import distinct
 
 Slots = NDArray[np.int64]
 
@@ -42,9 +43,7 @@ def around(world: Map, slot: int, settings: BundleAdjustmentSettings) -> Bundle 
     variable = variable[world.kf_id[variable] > 0]
     if not len(variable):
         return None
-    table = world.kf_point[variable]
-    counts = np.bincount(table[table >= 0].astype(np.int64), minlength=world.alive.size)
-    points = np.flatnonzero(counts)
+    points = distinct(world.kf_point[variable], world.alive.size)
     further, _ = world.covisible_of(points)
     further = further[~np.isin(further, variable)][: settings.fixed]
     if not len(further):

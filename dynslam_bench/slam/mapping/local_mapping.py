@@ -27,7 +27,7 @@ TENDER = 3
 """So many keyframes after its own a point may still go because it is seldom found."""
 RECENT = 4
 """Of as many keyframes as may be kept, the newest that stay: one in so many."""
-COMPARED = 64
+COMPARED = 16
 """Keyframes of which the most redundant one goes where there are too many; others are compared the next time."""
 
 

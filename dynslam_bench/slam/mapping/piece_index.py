@@ -42,7 +42,7 @@ class PieceIndex:
         self._counts = np.zeros(slots, np.int64)
         self._pieces = np.full((slots, features, places), 0, np.uint16)  # in memory from now on: it does not grow
         self._first = np.full((places, VALUES), -1, np.int32)
-        self._blocks = np.full((places * VALUES, BLOCK), -1, np.int32)
+        self._blocks = np.full((2 * places * VALUES, BLOCK), -1, np.int32)
         self._free = np.arange(len(self._blocks), dtype=np.int32)
         self._freed = len(self._free)
 
@@ -75,13 +75,15 @@ class PieceIndex:
             self._freed = _put_in(self._first, self._blocks, self._free, self._freed, new, slot)
 
     def _make_room(self, blocks: int) -> None:
-        """See that so many blocks are free."""
+        """See that so many blocks are free; there are a quarter more then, if not more are asked for."""
         if self._freed >= blocks:
             return
-        had = len(self._blocks)
-        self._blocks = np.concatenate([self._blocks, np.full_like(self._blocks, -1)])
-        self._free = np.concatenate([self._free[: self._freed], np.arange(had, 2 * had, dtype=np.int32)])
-        self._free, self._freed = np.resize(self._free, 2 * had), len(self._free)
+        had, more = len(self._blocks), max(len(self._blocks) // 4, blocks)
+        self._blocks = np.concatenate([self._blocks, np.full((more, BLOCK), -1, np.int32)])
+        free = np.zeros(had + more, np.int32)
+        free[: self._freed] = self._free[: self._freed]
+        free[self._freed : self._freed + more] = np.arange(had, had + more)
+        self._free, self._freed = free, self._freed + more
 
     def score(self, slots: Slots, own: Pieces) -> tuple[NDArray[np.float64], Slots]:
         """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame, and its points.
