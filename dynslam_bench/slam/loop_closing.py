@@ -56,7 +56,7 @@ NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
 MOST_SCALE = 3.0
 """Factor by which scale may have drifted, at most, where it is free."""
 FIRM = 100.0
-"""Weight of a loop's tie where scale is free: what is left open between two visits would bend both."""
+"""Weight of a loop's tie, where neighbours' ties weigh 1: what it leaves open between two visits bends both."""
 PATIENCE = 5
 """Frames after which a camera leaves an island for the first map, if that could not be joined by then."""
 FIRMLY = 0.4
@@ -297,8 +297,7 @@ class LoopCloser:
     def _correct(self, slot: int, loop: Loop) -> None:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
         world = self.world
-        weight = 1.0 if self._scale_is_known else FIRM
-        tie = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=weight)
+        tie = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=FIRM)
         older = within(world.kf_id[world.keyframes], self._ties)
         self._ties = [*older, tie]
         small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG
