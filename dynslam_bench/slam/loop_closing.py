@@ -51,6 +51,8 @@ TURN_M = 3.0
 """Metres of way that a turn by one radian counts as: it renews the view as much as walking past a wall 3 m away."""
 TURN_DEPTHS = 1.0
 """The same without depth: the wall is as far away as what the first map showed."""
+STRETCH = 100.0
+"""Way along which drift adds up; of a longer one each such stretch drifts by itself, so that the root of it counts."""
 NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
 """A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
 MOST_SCALE = 3.0
@@ -276,9 +278,10 @@ class LoopCloser:
         return ambiguous(world, seen, known, elsewhere, self.settings, self._seed)
 
     def _way_to(self, slot: int) -> float:
-        """The way along which drift can have come in since a keyframe: walked and turned, or over a closed loop."""
+        """The way whose drift adds up since a keyframe: walked and turned, or over a closed loop."""
         then = self._way_at(slot)
-        return min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
+        way = min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
+        return min(way, float(np.sqrt(STRETCH * way)))
 
     def _way_around(self, slot: int, loop: Loop) -> float:
         """The way from where one island meets another back to where it left it, in the older one's unit of length."""

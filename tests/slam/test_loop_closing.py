@@ -9,6 +9,7 @@ from ring_world import RingWorld
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
+from dynslam_bench.slam import loop_closing
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, inherited, optimise_poses, spread_scale
 from dynslam_bench.slam.corrections import Correction
@@ -142,6 +143,16 @@ def test_frames_of_a_rescaled_keyframe_move_with_it(lap_without_depth):
 def test_corridors_that_look_the_same_are_not_taken_for_one():
     backend, _, errors = drive(RingWorld(alike=0.5), 70, closing=True)
     assert not backend.loops.closed and errors.max() < 0.2
+
+
+@pytest.mark.parametrize(("stretch", "closed"), [(100.0, True), (0.001, False)])
+def test_of_a_way_of_many_stretches_the_root_may_be_drift(monkeypatch, stretch, closed):
+    """The same lap, counted as one stretch and as thousands, that each drift by themselves."""
+    monkeypatch.setattr(loop_closing, "STRETCH", stretch)
+    world = RingWorld(side=9.0)
+    lap = int(np.ceil((4 * (world.side - 2) + 2 * np.pi) / STEP))
+    backend, _, _ = drive(world, lap + 6, closing=True)
+    assert bool(backend.loops.closed) == closed
 
 
 def test_it_changes_nothing_where_no_place_is_seen_again():
