@@ -304,10 +304,7 @@ class LoopClosingSettings(Settings):
         0.3, ge=0, le=1, description="share of the candidate's own points in view that must be among them"
     )
     join_inliers: int = Field(
-        100,
-        ge=10,
-        le=10000,
-        description="the same where the first map's camera sees another's place, which no drift bounds",
+        100, ge=10, le=10000, description="the same where the first map's camera sees another, which no drift bounds"
     )
     join_share: float = Field(0.5, ge=0, le=1, description="the same share where two maps would be joined")
     confirmations: int = Field(3, ge=1, le=20, description="keyframes in a row that must agree on the correction")
