@@ -107,7 +107,7 @@ class LoopCloser:
         self._short_cuts: list[tuple[float, float]] = []
         self._last_pose: Array | None = None
         self._row: list[Correction] = []
-        self._met: dict[int, int] = {}
+        self._met: int | None = None
         self._ties: list[Edge] = []
 
     def close(self, slot: int, seen: Observations, home: FirstPose | None = None) -> bool:
@@ -127,6 +127,7 @@ class LoopCloser:
             gone, stands = (int(self.world.kf_id[each]) for each in (dropped, heir))
             self._ties = inherited(self._ties, gone, stands, relative)
         loop = self._verified(slot, seen) if home is None else self._at_home(slot, seen, home)
+        self._met = self._met if self.at_home else None
         if loop is None:
             self._row.clear()
             return False
@@ -139,7 +140,7 @@ class LoopCloser:
         loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
         self._row.clear()
         if not loop.fits:
-            self.leaves = self.at_home = home is not None and bool(self.world.kf_alive[loop.keyframe])
+            self.leaves = self.at_home = home is not None
             return False
         if loop.joins and home is None and self._ambiguous(slot, seen, loop):
             return False
@@ -212,14 +213,17 @@ class LoopCloser:
 
     def _at_home(self, slot: int, seen: Observations, home: FirstPose) -> Loop | None:
         """The place in the first map where an island's camera was found, if it tells well enough how the two lie."""
-        s, island = self.settings.loop_closing, int(self.world.kf_island[slot])
+        s, world, frame = self.settings.loop_closing, self.world, int(self.world.kf_frame[slot])
         loop = self._loop(slot, home.keyframe, Recognised(home.T_cam_world, home.matches, home.share))
-        if loop is None or (loop.fits and self._ambiguous(slot, seen, loop)):
+        if loop is None or not world.kf_alive[home.keyframe]:
             return None
-        waited = int(self.world.kf_frame[slot]) - self._met.setdefault(island, int(self.world.kf_frame[slot]))
+        if (loop.fits or self._scale_is_known) and self._ambiguous(slot, seen, loop):
+            return None
         well = loop.inliers >= s.min_inliers and loop.share >= s.join_share and home.imprecision <= FIRMLY
-        self.at_home = loop.fits and bool(self.world.kf_alive[home.keyframe])
-        self.leaves = self.at_home and not well and waited >= PATIENCE
+        self.at_home = loop.fits
+        if self.at_home and self._met is None:
+            self._met = frame
+        self.leaves = self._met is not None and self.at_home and not well and frame - self._met >= PATIENCE
         return loop if well else None
 
     def _loop(self, slot: int, candidate: int, place: Recognised) -> Loop | None:
@@ -254,7 +258,7 @@ class LoopCloser:
             return False
         if loop.joins:
             here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
-            return loop.fits and np.radians(loop.turned_deg) <= self.islands.slack(here, there)
+            return loop.fits and bool(np.radians(loop.turned_deg) <= self.islands.slack(here, there))
         way = self._way_to(loop.keyframe)
         if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
             return False
@@ -338,7 +342,7 @@ class LoopCloser:
         slots = world.island(younger)
         world.move_island(younger, move.T_now_before, older, move.scale)
         self._note_scales(slots, np.full(len(slots), move.scale))
-        self._ties.append(self._edge(loop.keyframe, slot, world.kf_pose[slot]))
+        self._ties.append(replace(self._edge(loop.keyframe, slot, world.kf_pose[slot]), weight=FIRM))
 
     def _note_scales(self, slots: Slots, scales: Array) -> None:
         """Lengths around keyframes were multiplied."""

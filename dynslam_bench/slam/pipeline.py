@@ -222,7 +222,8 @@ class SlamPipeline:
 
     def _remember(self, seen: FrameBundle, culled: Culled, located: Localised) -> None:
         tracked = located.state == "ok"
-        self._previous = Remembered(seen, culled.keep, culled.image, located.T_world_cam if tracked else None)
+        known = tracked and self._backend.state == "ok"  # on an island what is predicted is of another world
+        self._previous = Remembered(seen, culled.keep, culled.image, located.T_world_cam if known else None)
         self._keyframe_due = not tracked or located.keyframe
 
     def _stats(self, seen: FrameBundle, culled: Culled, located: Localised) -> dict[str, float]:

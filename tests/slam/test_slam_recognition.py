@@ -82,3 +82,12 @@ def test_one_patch_does_not_tell_from_where_it_is_seen_nor_do_a_few_matches_besi
     place = Recognised(found.T_cam_world, few.select(found.inliers), 0.5)
     assert len(place.matches) > 60
     assert (imprecision(backend.world, seen, place, np.random.default_rng(0)) <= 1) == tells
+
+
+@pytest.mark.parametrize("count", [0, 4, 6, 11])
+def test_a_few_matches_tell_nothing(count):
+    room, backend = mapped()
+    frame = room.see(FIRST, 1)
+    seen = seen_in(backend, frame, np.ones(len(frame), bool))
+    few = match_keyframe(backend.world, 0, seen, 60).select(np.arange(count))
+    assert imprecision(backend.world, seen, Recognised(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf

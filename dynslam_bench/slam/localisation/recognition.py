@@ -36,6 +36,8 @@ INNER = 0.85
 DILUTED = 0.1
 """Dilution of precision at most: how uncertain the camera's place is, in median depths, by one match's worth of what
 these tell."""
+FEWEST = 12
+"""Matches at least: a half of fewer tells no pose."""
 HALVES, APART = 12, 0.01
 """Halves of the matches that are asked, and how far apart, in median depths, they may place the camera."""
 
@@ -105,8 +107,12 @@ def imprecision(world: Map, seen: Observations, place: Recognised, rng: np.rando
     """
     matches, T_cam_world = place.matches, place.T_cam_world
     xy, count = seen.xy[matches.feature], len(matches)
+    if count < FEWEST or not np.isfinite(T_cam_world).all():
+        return np.inf
     off = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
     inner = solve(world, seen, matches.select(off <= np.quantile(off, INNER)), T_cam_world)
+    if inner.count < FEWEST // 2 or not np.isfinite(inner.T_cam_world).all():
+        return np.inf
     covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
     diluted = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(HALVES)]

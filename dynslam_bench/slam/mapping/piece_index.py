@@ -15,6 +15,8 @@ VALUES = 1 << 16
 """Values of a piece."""
 EVERY = 4
 """Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
+ROOM = 256
+"""Features are given room in steps of so many."""
 SLOTS = 640
 """Keyframes that there is room for at once: as many as are kept by default, and some that come and go."""
 BLOCK = 8
@@ -57,7 +59,7 @@ class PieceIndex:
         """
         slots, features, places = pieces.shape
         if slots > len(self._ids) or features > self._pieces.shape[1] or places != self._pieces.shape[2]:
-            self._begin(max(slots, SLOTS), features, places)
+            self._begin(max(slots, SLOTS), -(-features // ROOM) * ROOM, places)
         known = np.full(len(self._ids), -1, np.int64)
         known[:slots] = np.where(alive, ids, -1)
         changed = known != self._ids
