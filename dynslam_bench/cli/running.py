@@ -266,7 +266,8 @@ def finish(
     records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
     missing = show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
-    for caution in (seen_note(records), drift_note(records, store)):
+    made = [record for record in records if record.run_id not in reused]  # what is stored already was said then
+    for caution in (seen_note(records), drift_note(made, store)):
         if caution:
             note(caution)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")

@@ -221,9 +221,8 @@ class LoopCloser:
             return None
         well = loop.inliers >= s.min_inliers and loop.share >= s.join_share and home.imprecision <= FIRMLY
         self.at_home = loop.fits
-        if self.at_home and self._met is None:
-            self._met = frame
-        self.leaves = self._met is not None and self.at_home and not well and frame - self._met >= PATIENCE
+        self._met = frame if self._met is None else self._met
+        self.leaves = self.at_home and not well and frame - self._met >= PATIENCE
         return loop if well else None
 
     def _loop(self, slot: int, candidate: int, place: Recognised) -> Loop | None:
