@@ -11,8 +11,8 @@ import importlib.metadata
 import os
 import platform
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache, lru_cache
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 import dynslam_bench
 
+from .code_files import files_below, imported_modules, is_code, program_files
+from .digests import code_files_digest, path_digest
 from .errors import PluginError
 from .records import digest
 from .settings import Settings, flatten, named
@@ -32,55 +34,8 @@ OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-head
 _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
 _OWN = "dynslam_bench"
-_CODE = (".py", ".so", ".pyd")
-_BLOCK = 1 << 20
 _FILE_PREFIXES = ("onnx", "weights", "recorded")
 _LONGEST_PATH = 1000
-
-
-# -- files and folders -------------------------------------------------------------------------------------------------
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content, read again only where size or time of change differ.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    stat = path.stat()
-    return _file_digest(str(path), stat.st_size, stat.st_mtime_ns)
-
-
-def path_digest(path: Path) -> str:
-    """SHA-256 of a file's content, or of the names and contents of all files in a folder, however many there are.
-
-    Raises:
-        OSError: Something cannot be read.
-    """
-    if path.is_file():
-        return file_digest(path)
-    return files_digest((file for file in path.rglob("*") if file.is_file()), path)
-
-
-def files_digest(files: Iterable[Path], root: Path) -> str:
-    """SHA-256 of the contents of files and their names below a root; their order does not matter.
-
-    Raises:
-        OSError: One cannot be read.
-    """
-    whole = hashlib.sha256()
-    for name, file in sorted((file.relative_to(root).as_posix(), file) for file in files):
-        whole.update(f"{name}\0{file_digest(file)}\n".encode())
-    return whole.hexdigest()
-
-
-@lru_cache(maxsize=8192)
-def _file_digest(path: str, size: int, mtime_ns: int) -> str:
-    whole = hashlib.sha256()
-    with Path(path).open("rb") as file:
-        while block := file.read(_BLOCK):
-            whole.update(block)
-    return whole.hexdigest()
 
 
 # -- what settings name ------------------------------------------------------------------------------------------------
@@ -140,7 +95,8 @@ def _texts(name: str, value: object) -> Iterator[tuple[str, str]]:
 def code_digest(entry_point: str, rooms: Sequence[str]) -> str:
     """Digest of the code behind an entry point as it lies on the disk now: this package's rooms and a plug-in's files.
 
-    A plug-in in a file counts with all code of its folder, one in a package with all of its top-level package.
+    A plug-in in a file counts with the code of its folder and the data files that this names, one in a package with all
+    files of its top-level package. Python sources count by their syntax: comments and docstrings change nothing.
 
     Args:
         entry_point: ``module:Attr`` or ``file.py:Attr``.
@@ -153,35 +109,79 @@ def code_digest(entry_point: str, rooms: Sequence[str]) -> str:
 
 
 def plugin_digest(entry_point: str) -> str:
-    """Digest of a plug-in's own files; empty for what this package brings.
+    """Digest of a plug-in's own files and of what they import; empty for what this package brings.
+
+    An imported module counts with the version of its distribution, or with its files where it is installed for
+    development or lies on the path.
 
     Raises:
         PluginError: The files cannot be found or read.
     """
     module = entry_point.rpartition(":")[0]
     top = module.partition(".")[0]
+    if top == _OWN and not module.endswith(".py"):
+        return ""
     try:
         if module.endswith(".py"):
             folder = Path(module).expanduser().resolve().parent
-            return files_digest(_code_below(folder), folder)
-        if top == _OWN:
-            return ""
-        return digest([_folder_code(folder) for folder in _folders_of(top)])
+            files = program_files(folder)
+            return digest([code_files_digest(files, folder), _dependencies(files)])
+        files = [file for place in _folders_of(top) for file in _files_of(place)]
+        return digest([[_whole(place) for place in _folders_of(top)], _dependencies(files)])
     except OSError as error:
         raise PluginError(f"cannot read the code of plug-in '{entry_point}': {error}") from error
+
+
+def _dependencies(files: Sequence[Path]) -> dict[str, str]:
+    """What code imports beside itself, this package and the standard library: versions, or digests of development code.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    found: dict[str, str] = {}
+    waiting = imported_modules(files)
+    while waiting:
+        top = waiting.pop()
+        if top in found or top == _OWN or top in sys.stdlib_module_names:
+            continue
+        try:
+            places = _folders_of(top)
+        except (PluginError, ImportError, ValueError):  # it lies in the plug-in's folder, or is not installed
+            found[top] = ""
+            continue
+        if any(part in ("site-packages", "dist-packages") for part in places[0].parts):
+            found[top] = distribution_of_module(top)[1]
+        else:
+            found[top] = digest([_whole(place) for place in places])
+            waiting |= imported_modules(file for place in places for file in _files_of(place))
+    return found
+
+
+def distribution_of_module(module: str) -> tuple[str, str]:
+    """Name and version of the distribution that a module comes from; empty where it is not known."""
+    names = _distributions().get(module.partition(".")[0], ())
+    return (names[0], distribution_version(names[0])) if names else ("", "")
+
+
+@cache
+def _distributions() -> Mapping[str, Sequence[str]]:
+    return importlib.metadata.packages_distributions()
 
 
 @cache
 def package_digest(rooms: tuple[str, ...]) -> str:
     """Digest of the code of rooms of this package; read once a process, as its modules are."""
     folders = [Path(folder) / room for folder in dynslam_bench.__path__ for room in rooms]
-    return digest([[folder.name, _folder_code(folder)] for folder in folders if folder.is_dir()])
+    codes = {folder: [file for file in files_below(folder) if is_code(file)] for folder in folders if folder.is_dir()}
+    return digest([[folder.name, code_files_digest(files, folder)] for folder, files in codes.items()])
 
 
-def _folder_code(place: Path) -> str:
-    if place.is_file():
-        return files_digest([place], place.parent)
-    return files_digest((file for file in place.rglob("*") if _is_code(file)), place)
+def _files_of(place: Path) -> list[Path]:
+    return [place] if place.is_file() else list(files_below(place))
+
+
+def _whole(place: Path) -> str:
+    return code_files_digest(_files_of(place), place.parent if place.is_file() else place)
 
 
 def _folders_of(top: str) -> list[Path]:
@@ -194,19 +194,6 @@ def _folders_of(top: str) -> list[Path]:
             f"the code of '{top}' cannot be found, so its runs could not be told apart", "is it installed?"
         )
     return [Path(spec.origin)]
-
-
-def _code_below(folder: Path) -> Iterator[Path]:
-    """The code of a folder and of its packages and folders, but for hidden ones and virtual environments."""
-    for entry in sorted(folder.iterdir()):
-        if _is_code(entry):
-            yield entry
-        elif entry.is_dir() and not entry.name.startswith((".", "__")) and not (entry / "pyvenv.cfg").is_file():
-            yield from _code_below(entry)
-
-
-def _is_code(file: Path) -> bool:
-    return file.suffix in _CODE and file.is_file()
 
 
 # -- machine and content -----------------------------------------------------------------------------------------------

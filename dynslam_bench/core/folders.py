@@ -1,8 +1,9 @@
 """Every folder outside the working directory that this package reads or writes, and the variable that moves it.
 
-Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``weights/`` (downloaded
-checkpoints) and ``vocabularies/`` (decompressed ORB vocabularies). Compiled kernels lie where numba puts them: beside
-the source, or in its own folder (``NUMBA_CACHE_DIR``).
+Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``digests/`` (digests of file
+contents, see `core.digests`), ``weights/`` (downloaded checkpoints) and ``vocabularies/`` (decompressed ORB
+vocabularies). Compiled kernels lie where numba puts them: beside the source, or in its own folder
+(``NUMBA_CACHE_DIR``).
 """
 
 from __future__ import annotations
@@ -39,6 +40,11 @@ def find_data_root(argument: str | Path | None = None) -> Path:
 def stage_cache_folder() -> Path:
     """The folder of the stage cache: ``stages/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
     return _named(STAGES_VARIABLE, user_cache()) / "stages"
+
+
+def digest_cache_folder() -> Path:
+    """The folder of remembered digests: ``digests/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
+    return _named(STAGES_VARIABLE, user_cache()) / "digests"
 
 
 def weights_folder() -> Path:

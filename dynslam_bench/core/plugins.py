@@ -1,9 +1,10 @@
 """Guarded discovery of plug-ins: one scheme for trackers, segmenters, features, flows, filters and sequences.
 
 A plug-in is a light *spec* (importable without torch or OpenCV) with an `id` and an `entry_point` ``"module:Attr"``
-that loads the heavy part. Specs are looked up, in this order: ``module:Attr`` or ``file.py:Attr`` of the user, the
-environment variable ``DYNSLAM_BENCH_PLUGINS``, the entry-point groups ``dynslam_bench.<kind>``, the built-in ones. A
-plug-in that fails to load never breaks the rest; the reason is kept and shown by ``trackers doctor``.
+that loads the heavy part. Specs are found by ``module:Attr`` or ``file.py:Attr`` of the user, and by id: the built-in
+ones, those of the environment variable ``DYNSLAM_BENCH_PLUGINS``, and those of the entry-point groups
+``dynslam_bench.<kind>``. No plug-in may take the id of a built-in one. A plug-in that fails to load never breaks the
+rest; the reason is kept and shown by ``trackers doctor``.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ class Registry(Generic[P]):
         if name in found:
             return found[name].spec
         if ":" in name:
-            return self._check(load_object(name), name)
+            return self._not_built_in(self._check(load_object(name), name), name)
         broken = [failure for failure in self._failures if name in failure.source]
         hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, found)
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
@@ -118,21 +119,28 @@ class Registry(Generic[P]):
             except Exception as error:  # a foreign plug-in may raise anything; the reason is kept
                 self._failures.append(Failure(source, _reason(error)))
                 return
-            if spec.id in found:
+            if spec.id in found and found[spec.id].spec != spec:
                 self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {found[spec.id].source}"))
                 return
             found[spec.id] = Found(spec, source)
 
+        for spec in self._builtin():
+            add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
         for target in _environment_targets(self.kind):
             add(lambda target=target: load_object(target), f"{ENVIRONMENT_VARIABLE}: {target}")  # type: ignore[misc]
         for point in sorted(entry_points(group=f"dynslam_bench.{self.kind}"), key=lambda point: point.name):
             distribution = point.dist.name if point.dist else "unknown distribution"
             target = f"{point.module}:{point.attr}"
             add(lambda target=target: load_object(target), f"entry point '{point.name}' of {distribution}")  # type: ignore[misc]
-        for spec in self._builtin():
-            add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
         self._found = found
         return found
+
+    def _not_built_in(self, spec: P, source: str) -> P:
+        """Refuse a plug-in under the id of a built-in one: tables could not tell them apart."""
+        known = self._discover().get(spec.id)
+        if known is not None and known.source == "built in" and known.spec != spec:
+            raise PluginError(f"{source} has the id '{spec.id}', which is built in", "give the plug-in another id")
+        return spec
 
     def _check(self, value: object, source: str) -> P:
         if isinstance(value, self._spec_type):

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import packages_distributions, version
 from typing import Any
 
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.core.errors import RunError, SequenceError, did_you_mean
-from dynslam_bench.core.fingerprint import code_digest, named_digests, path_digest, plugin_digest
+from dynslam_bench.core.digests import contents_digest
+from dynslam_bench.core.errors import PluginError, RunError, SequenceError, did_you_mean
+from dynslam_bench.core.fingerprint import code_digest, distribution_of_module, named_digests, plugin_digest
 from dynslam_bench.core.machine import versions
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
@@ -27,17 +26,19 @@ from dynslam_bench.segmentation.build_segmenter import weights_digest
 from dynslam_bench.segmentation.registry import SEGMENTERS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.part import part_of
+from dynslam_bench.sequences.published.datasets import DATASETS
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
 from .spec import MAP_SETTING, RunSpec
 from .start_map import start_map_of
-from .storage.record import StartMap
+from .storage.record import IDENTITY_SCHEME, StartMap
 
 _ROOMS = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
     *("culling", "slam", "trackers", "envs"),
 )
-"""The rooms whose source a trajectory may depend on."""
+"""The packages whose source a trajectory may depend on."""
+LIBRARIES = ("numpy", "scipy", "opencv", "torch", "numba")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +97,14 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     weights = weights_of(settings, source)
     start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
     by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
-    known = versions()
     part = part_of(sequence, spec.offset)
     identity = {
+        "scheme": IDENTITY_SCHEME,
         "tracker": tracker.id,
         "tracker_version": tracker.version,
         "distribution": distribution_of(tracker),
         "source": source_fingerprint(tracker, settings, source),
-        "requires": {module: _version_of(module) for module in sorted(tracker.requires)},
+        "requires": {module: distribution_of_module(module)[1] for module in sorted(tracker.requires)},
         "settings": flatten(settings) | by_content,
         "segmentation": source,
         "weights": weights,
@@ -121,10 +122,28 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "realtime": spec.realtime,
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
-        "opencv": known.get("opencv", ""),
-        "torch": known.get("torch", ""),
+        "libraries": libraries_of(settings),
+        **sequence_plugin_of(spec.sequence),
     }
     return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
+
+
+def libraries_of(settings: Settings) -> dict[str, str]:
+    """Versions of the libraries that compute with the run's data: another version may give other bits."""
+    known = versions()
+    names = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
+    return {name: known.get(name, "") for name in names}
+
+
+def sequence_plugin_of(sequence: str) -> dict[str, str]:
+    """``sequence_plugin``: digest of the code of the plug-in that reads the sequence; nothing for the readers here.
+
+    Raises:
+        PluginError: Its code cannot be read.
+    """
+    found = next((each.spec for each in DATASETS.all() if each.spec.id == sequence.partition("/")[0]), None)
+    code = "" if found is None else plugin_digest(found.entry_point)
+    return {"sequence_plugin": code} if code else {}
 
 
 def distribution_of(tracker: TrackerSpec) -> str:
@@ -132,8 +151,7 @@ def distribution_of(tracker: TrackerSpec) -> str:
     top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
     if top == "dynslam_bench":
         return f"dynslam-bench {release()}"
-    names = _distributions().get(top, [])
-    return f"{names[0]} {version(names[0])}" if names else ""
+    return " ".join(distribution_of_module(top)).strip()
 
 
 def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, source: str = "") -> str:
@@ -183,11 +201,18 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
     return found
 
 
-def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, list[str]]:
-    """``files``: digests of what the tracker's spec says decides its results beside its settings; else nothing."""
+def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, str]:
+    """``files``: digest of what the tracker's spec says decides its results beside its settings; else nothing.
+
+    Raises:
+        PluginError: One of the files cannot be read.
+    """
     if not tracker.files:
         return {}
-    return {"files": [path_digest(path) for path in load_object(tracker.files)(settings)]}
+    try:
+        return {"files": contents_digest(load_object(tracker.files)(settings))}
+    except OSError as error:
+        raise PluginError(f"cannot read a file of tracker '{tracker.id}': {error}") from error
 
 
 def _check_degradation(strengths: dict[str, float]) -> None:
@@ -196,14 +221,3 @@ def _check_degradation(strengths: dict[str, float]) -> None:
     if unknown:
         raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], known))
     Degradation(seed=0, **strengths)
-
-
-def _version_of(module: str) -> str:
-    """Version of the distribution that a required module comes from; empty where it is not known."""
-    names = _distributions().get(module.partition(".")[0], [])
-    return version(names[0]) if names else ""
-
-
-@cache
-def _distributions() -> dict[str, list[str]]:
-    return {top: list(names) for top, names in packages_distributions().items()}

@@ -102,7 +102,7 @@ def run_one(
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)
-            store.publish(work, record)
+            record = store.publish(work, record)
     return record
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from dynslam_bench.contracts.segmenter import Instances, Segmenter
 from dynslam_bench.contracts.sequence import Frame, MaskSource
+from dynslam_bench.core.digests import path_digest
 from dynslam_bench.core.errors import DynslamError, SegmentationError
-from dynslam_bench.core.fingerprint import path_digest
 from dynslam_bench.core.plugins import load_object
 
 from .masks.postprocess import select

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
 from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.digests import files_state
 from dynslam_bench.core.errors import SequenceError, did_you_mean
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
 from dynslam_bench.core.plugins import load_object
@@ -29,6 +32,11 @@ __all__ = [
     "parse_frames",
     "sequence_ids",
 ]
+
+
+_OPENED: dict[str, tuple[str, Sequence]] = {}
+"""Folders that were opened, with the state of their files then: an unchanged one need not be read again."""
+_MOST_OPENED = 64
 
 
 def sequence_ids() -> list[str]:
@@ -128,13 +136,34 @@ def open_folder(
     Raises:
         SequenceError: It cannot be opened, or its camera is not known.
     """
+    settings = settings or PreprocessingSettings()
+    entry = entry or entry_of(folder.resolve().name)
+    chosen = chosen_camera(folder, camera)
+    wanted = (folder.absolute(), entry and entry.id, str(camera), chosen, settings)
+    try:
+        state, _ = files_state(_all_files(folder))
+    except OSError:  # a file vanished meanwhile; opening it names what is wrong
+        state = ""
+    if state and _OPENED.get(repr(wanted), ("", None))[0] == state:
+        return cast("Sequence", _OPENED[repr(wanted)][1])
+    sequence = _open_folder(folder, entry, camera, chosen, settings)
+    while len(_OPENED) >= _MOST_OPENED:
+        _OPENED.pop(next(iter(_OPENED)))
+    _OPENED[repr(wanted)] = state, sequence
+    return sequence
+
+
+def _open_folder(
+    folder: Path,
+    entry: CatalogueEntry | None,
+    camera: str | Path | Camera | None,
+    chosen: tuple[Camera, float | None] | None,
+    settings: PreprocessingSettings,
+) -> Sequence:
     from .readers.layouts import find_layout, layout_of
     from .readers.recorded import Description, RecordedSequence
 
-    settings = settings or PreprocessingSettings()
-    entry = entry or entry_of(folder.resolve().name)
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
-    chosen = chosen_camera(folder, camera)
     stated = None if chosen is None else chosen[1]
     contents = layout.read(folder, stated or (None if entry is None else entry.fps))
     otherwise = None if entry is None else entry.camera
@@ -152,6 +181,11 @@ def open_folder(
         max_time_difference_s=settings.max_time_difference_s,
         any_depth_size=settings.width is not None,
     )
+
+
+def _all_files(folder: Path) -> Iterator[str]:
+    for parent, _, names in os.walk(folder.absolute()):
+        yield from (os.path.join(parent, name) for name in names)  # noqa: PTH118 - thousands of them
 
 
 def _open_whole(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, EvaluationError
+from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -17,6 +18,11 @@ from .record import MetricRecord, RunRecord
 
 DEFAULT_PROTOCOL = "tum-rgbd/v1"
 Which = Literal["online", "final"]
+
+
+def evaluation_code() -> str:
+    """Digest of the code that metrics are computed by."""
+    return package_digest(("evaluation", "geometry"))
 
 
 def evaluate_run(

@@ -104,7 +104,7 @@ def _take(archive: zipfile.ZipFile, store: RunStore, largest: int) -> RunRecord:
         for name, match in matches.items():
             if match is not None and match[1] == "sequences" and match[2] == record.sequence.part:
                 _write_once(store.root / "sequences" / match[2] / match[3], archive.read(name))
-        store.publish(work, record)
+        record = store.publish(work, record)
     return record
 
 

@@ -7,13 +7,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from dynslam_bench.core.machine import GitRevision, Machine
-from dynslam_bench.core.records import Digest, Record, schema
+from dynslam_bench.core.records import Digest, Record, digest, schema
 from dynslam_bench.evaluation.evaluate import Evaluation
 
 RUN_SCHEMA = 1
 METRIC_SCHEMA = 1
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
+IDENTITY_SCHEME = 2
+"""Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
+_CODE = ("tracker_version", "distribution", "source", "requires", "files")
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
 LOST_COVERAGE = 0.5
@@ -224,6 +227,20 @@ class RunRecord(Record):
         return RunRecord.model_validate_json(self.to_json())
 
     @property
+    def verified(self) -> bool:
+        """Whether its id tells content, code, weights and libraries; runs of older identity schemes do not."""
+        return self.kind == "imported" or self.identity.get("scheme") == IDENTITY_SCHEME
+
+    @property
+    def program(self) -> dict[str, str]:
+        """What made the run beside its settings: code, weights and library versions, by name, as short texts."""
+        identity = self.identity
+        made = {"code": digest([identity.get(name) for name in _CODE], 8)} if self.kind == "run" else {}
+        libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
+        weights = {f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()}
+        return made | libraries | weights | ({} if self.verified else {"identity": "unverified"})
+
+    @property
     def failed(self) -> bool:
         """Whether it did not come to its end."""
         return self.status in FAILED
@@ -278,6 +295,8 @@ class MetricRecord(Record):
         run_id: The run.
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.
+        code: Digest of the evaluation code that computed them.
+        inputs: Digest of the trajectories, the stamps and the ground truth that they were computed from.
         trajectory: Which of the two the protocol asks for.
         online: Evaluation of the online trajectory; None if it cannot be evaluated.
         final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
@@ -288,6 +307,8 @@ class MetricRecord(Record):
     run_id: Digest
     protocol_id: str
     protocol_digest: str
+    code: str = ""
+    inputs: str = ""
     trajectory: Literal["online", "final"] = "online"
     online: Evaluation | None = None
     final: Evaluation | None = None

@@ -1,7 +1,8 @@
 """What a list says of each run, a line each in a file of the store, so that a list need not read the records.
 
 A line joins the file when its run is scored for the first time; `run_list` adds those that are missing. Lines hold for
-one state of the run's record and of its stored errors (time and size of both files). Errors are always replaced by a
+one version of the code that makes them, and for one state (time and size) of the run's record, its stored errors, its
+trajectories and the ground truth. Errors are always replaced by a
 rename, so that none of them need be looked at while their folder has the time that is noted. The file may be deleted at
 any time, and whatever of it is damaged or out of date counts as not there.
 """
@@ -17,7 +18,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-import dynslam_bench
+from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.toml import assignments
 from dynslam_bench.evaluation.protocol import Protocol
@@ -26,9 +27,11 @@ from .line_file import add_lines, read_line_file, write_line_file
 from .record import MetricRecord, RunRecord
 from .states import stamp_if_there
 
+ONLINE, FINAL = "trajectory_online.txt", "trajectory_final.txt"
 Row = dict[str, Any]
-Stamps = tuple[int, int, int, int]
-"""Time and size of a run's record, and of its errors under the protocol: (0, 0) where they are not stored."""
+Stamps = tuple[int, ...]
+"""Time and size of a run's record, of its errors under the protocol, of its online and its final trajectory, and of the
+ground truth; (0, 0) for each that is not there."""
 Line = list[Any]
 
 FIELDS = (
@@ -37,8 +40,9 @@ FIELDS = (
 )
 """Names of a row's values, in order; the values of a line, before which it has its stamps."""
 _LINES: TypeAdapter[list[Line]] = TypeAdapter(list[Line])
-FIRST = 4
-"""Where the values begin in a line; before them stand the stamps."""
+FIRST = 11
+"""Where the values begin in a line; before them stand the stamps and the run's part of its sequence."""
+PART = FIRST - 1
 RUN, STARTED = FIRST + FIELDS.index("run"), FIRST + FIELDS.index("started")
 _LENGTH = FIRST + len(FIELDS)
 _SETTLED_NS = 1_000_000_000
@@ -99,12 +103,26 @@ def part_words(record: RunRecord) -> str:
 
 def index_file(root: Path, protocol: Protocol) -> Path:
     """Where the lines of a store under a protocol lie, as this version writes them."""
-    return root / "index" / f"{protocol.digest()}-{digest([dynslam_bench.__version__, FIRST, *FIELDS])}.jsonl"
+    code = digest([package_digest(("evaluation", "geometry", "runs/storage")), FIRST, *FIELDS])
+    return root / "index" / f"{protocol.digest()}-{code}.jsonl"
+
+
+def input_stamps(runs: str, parts: str, run_id: str, part: str) -> Stamps:
+    """Time and size of the files that a run's errors are computed from.
+
+    Args:
+        runs: Folder of the store's runs.
+        parts: Folder of the store's parts of sequences.
+        run_id: The run.
+        part: Its part of a sequence.
+    """
+    files = (f"{runs}/{run_id}/{ONLINE}", f"{runs}/{run_id}/{FINAL}", f"{parts}/{part}/groundtruth.txt")
+    return tuple(number for file in files for number in stamp_if_there(file))
 
 
 def make_line(stamps: Stamps, record: RunRecord, metrics: MetricRecord | None) -> Line:
     """The line of a run whose files had those stamps before they were read, or when they were written."""
-    return [*stamps, *run_row(record, metrics).values()]
+    return [*stamps, record.sequence.part, *run_row(record, metrics).values()]
 
 
 @dataclass(frozen=True)
@@ -161,4 +179,4 @@ def _text(line: Line) -> str:
 
 def _is_line(line: Line) -> bool:
     """Whether a line of an index that somebody may have made by hand can be sorted and shown."""
-    return len(line) == _LENGTH and isinstance(line[RUN], str) and isinstance(line[STARTED], str)
+    return len(line) == _LENGTH and all(isinstance(line[at], str) for at in (PART, RUN, STARTED))

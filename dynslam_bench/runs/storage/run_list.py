@@ -13,6 +13,7 @@ from .evaluating import DEFAULT_PROTOCOL
 from .run_index import (
     FIELDS,
     FIRST,
+    PART,
     RUN,
     STARTED,
     Line,
@@ -20,11 +21,12 @@ from .run_index import (
     Stamps,
     add_verified,
     index_file,
+    input_stamps,
     make_line,
     read_index,
     write_index,
 )
-from .states import NO_FILE, stamp_if_there, stamp_of
+from .states import stamp_if_there, stamp_of
 from .store import RUN_FILE, RunStore, Unreadable
 
 OnProgress = Callable[[int, int], None]
@@ -57,6 +59,7 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
     kept: list[Line] = []
     unreadable: list[Unreadable] = []
     stored, runs, errors = store.ids(), str(store.runs), str(store.root / "metrics" / protocol.digest())
+    parts = str(store.root / "sequences")
     errors_ns, _ = stamp_if_there(errors)
     as_verified = errors_ns == index.verified_ns != 0
     there = set(stored)
@@ -72,9 +75,11 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
                 stamp_if_there(f"{errors}/{run_id}.json") if line is None or not as_verified else (line[2], line[3])
             )
             stamps = (*stamp_of(f"{runs}/{run_id}/{RUN_FILE}"), *scored)
-            if line is None or (*line[:FIRST],) != stamps:
+            if line is not None:
+                stamps += input_stamps(runs, parts, run_id, line[PART])
+            if line is None or (*line[:PART],) != stamps:
                 is_whole = False
-                line = _read(store, run_id, protocol, stamps)
+                line = _read(store, run_id, protocol, stamps[:4])
             kept.append(line)
         except (DynslamError, OSError) as error:
             is_whole &= run_id not in known
@@ -90,7 +95,8 @@ def _list_runs(store: RunStore, protocol: Protocol, on_progress: OnProgress) -> 
 def _read(store: RunStore, run_id: str, protocol: Protocol, stamps: Stamps) -> Line:
     """The line of a run that is in no index, or has changed since."""
     record = store.read_whole(run_id)
+    inputs = input_stamps(str(store.runs), str(store.root / "sequences"), run_id, record.sequence.part)
     scored = None if record.status == "stopped" else store.score(record, protocol)
-    if stamps[2:] == NO_FILE:  # they have just been written
-        stamps = (*stamps[:2], *stamp_if_there(store.metric_file(run_id, protocol.digest())))
-    return make_line(stamps, record, scored)
+    # errors that were missing or out of date have just been written
+    stamps = (*stamps[:2], *stamp_if_there(store.metric_file(run_id, protocol.digest())))
+    return make_line(stamps + inputs, record, scored)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,14 +21,14 @@ from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunErro
 from dynslam_bench.core.files import replace_folder, sweep_temporary, temporary_folder
 from dynslam_bench.core.locks import claimed
 from dynslam_bench.core.reading import read_lines
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
-from .evaluating import DEFAULT_PROTOCOL, evaluate_run
+from .evaluating import DEFAULT_PROTOCOL, evaluate_run, evaluation_code
 from .record import MetricRecord, RunRecord
-from .run_index import add_to_index, index_file, make_line
+from .run_index import FINAL, ONLINE, add_to_index, index_file, input_stamps, make_line
 from .states import Stamp, check_plain, stamp_if_there, stamp_of
 
 if TYPE_CHECKING:
@@ -130,13 +131,17 @@ class RunStore:
         """
         return claimed(self.runs / f".{run_id}.claim")
 
-    def publish(self, work: Path, record: RunRecord) -> None:
+    def publish(self, work: Path, record: RunRecord) -> RunRecord:
         """Write the record into its work folder and rename that to the run's; replaces an earlier run of the id.
+
+        Returns:
+            The record as it is stored, with a note if the earlier run gave another result.
 
         Raises:
             InfrastructureError: It cannot be written; then nothing has changed.
         """
         target = self.folder(record.run_id)
+        record = self._with_alarm(record, work)
         try:
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
             stamp = stamp_of(work / RUN_FILE)  # which a rename leaves as it is
@@ -147,6 +152,23 @@ class RunStore:
             raise InfrastructureError(f"cannot write {target}: {error.strerror}", "check the free space") from error
         self._published[record.run_id] = stamp
         self._link_latest(target)
+        return record
+
+    def _with_alarm(self, record: RunRecord, work: Path) -> RunRecord:
+        """The record, with a note where an earlier run of its id, which should be equal, gave another trajectory."""
+        earlier = self.get(record.run_id)
+        if earlier is None or not record.tracker.deterministic or record.realtime:
+            return record
+        if earlier.status != "ok" or record.status != "ok":
+            return record
+        if _sha256(work / ONLINE) == _sha256(self.folder(record.run_id) / ONLINE):
+            return record
+        note = (
+            f"an earlier run with this id, started {earlier.started}, gave another trajectory, although tracker "
+            f"'{record.tracker.id}' is declared deterministic"
+        )
+        LOGGER.warning("run %s: %s", record.run_id, note)
+        return record.model_copy(update={"notes": [*record.notes, note]})
 
     def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
         """Keep the stamps of a sequence's frames and its ground truth; done once a part."""
@@ -264,24 +286,38 @@ class RunStore:
         hint = did_you_mean(prefix, known) if known else f"there are no runs in {self.root}"
         raise RunError(f"there is no run '{prefix}'", hint)
 
-    def metrics(self, run_id: str, protocol: Protocol) -> MetricRecord | None:
-        """A run's stored metrics under a protocol; None if it was not scored under it, or they are damaged."""
-        path = self.metric_file(run_id, protocol.digest())
+    def metrics(self, record: RunRecord, protocol: Protocol) -> MetricRecord | None:
+        """A run's stored metrics under a protocol; None if it was not scored under it, or they are damaged.
+
+        Metrics hold for one version of the evaluation code and one content of the trajectories and the ground truth;
+        they count as missing where either has changed since.
+        """
+        path = self.metric_file(record.run_id, protocol.digest())
         if not path.is_file():
             return None
         try:
             found = MetricRecord.read(path)
         except DynslamError as error:
-            LOGGER.warning("run %s is scored again: %s", run_id, error)
+            LOGGER.warning("run %s is scored again: %s", record.run_id, error)
             return None
-        return found if (found.run_id, found.protocol_digest) == (run_id, protocol.digest()) else None
+        wanted = (record.run_id, protocol.digest(), evaluation_code(), self._inputs(record))
+        return found if (found.run_id, found.protocol_digest, found.code, found.inputs) == wanted else None
+
+    def _inputs(self, record: RunRecord) -> str:
+        """Digest of everything that a run's metrics are computed from."""
+        run, part = self.folder(record.run_id), self._part(record.sequence.part)
+        files = (run / ONLINE, run / FINAL, part / "groundtruth.txt", part / "timestamps.txt")
+        contents = [_sha256(file) for file in files]
+        return digest(
+            [contents, record.sequence.id, record.tracker.id, record.tracker.sensors, record.stamps_match], 16
+        )
 
     def score(
         self, record: RunRecord, protocol: Protocol | str = DEFAULT_PROTOCOL, *, again: bool = False
     ) -> MetricRecord:
         """A stored run's metrics under a protocol; see `scoring.score`."""
         protocol = get_protocol(protocol)
-        stored = None if again else self.metrics(record.run_id, protocol)
+        stored = None if again else self.metrics(record, protocol)
         if stored is not None:
             return stored
         part = record.sequence.part
@@ -295,13 +331,16 @@ class RunStore:
         if record.kind == "imported":  # it has only one trajectory
             online = (self.folder(record.run_id) / "trajectory_online.txt").is_file()
             metrics = metrics.model_copy(update={"trajectory": "online" if online else "final"})
+        metrics = metrics.model_copy(update={"code": evaluation_code(), "inputs": self._inputs(record)})
         try:
             self.add_metrics(metrics)
         except DynslamError as error:  # a store that can only be read can be scored all the same
             LOGGER.info("the metrics of run %s are not kept: %s", record.run_id, error)
         stamp = self._published.pop(record.run_id, None)
         if stamp is not None:
-            stamps = (*stamp, *stamp_if_there(self.metric_file(record.run_id, metrics.protocol_digest)))
+            scored = stamp_if_there(self.metric_file(record.run_id, metrics.protocol_digest))
+            parts = str(self.root / "sequences")
+            stamps = (*stamp, *scored, *input_stamps(str(self.runs), parts, record.run_id, record.sequence.part))
             add_to_index(index_file(self.root, protocol), make_line(stamps, record, metrics))
         return metrics
 
@@ -360,6 +399,14 @@ class RunStore:
         latest = self.root / "latest"
         if latest.is_symlink() and not latest.exists():
             latest.unlink(missing_ok=True)
+
+
+def _sha256(file: Path) -> str:
+    """SHA-256 of a file; empty where it cannot be read, which the evaluation then says."""
+    try:
+        return sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+    except OSError:
+        return ""
 
 
 def _checked(name: str, what: str) -> str:

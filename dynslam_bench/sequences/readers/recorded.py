@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, MaskSource
+from dynslam_bench.core.digests import contents_digest
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.harmless import inside
 from dynslam_bench.core.records import digest
@@ -94,12 +95,12 @@ class RecordedSequence:
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
         if contents.paired:
             index = np.arange(len(colour)), np.arange(len(colour))
-            sizes = _file_sizes(folder, colour.files, "colour"), _file_sizes(folder, depth.files, "depth")
+            _check_files(folder, colour.files, "colour")
+            _check_files(folder, depth.files, "depth")
             absent = 0
         else:
             listed = len(colour) + len(depth)
-            (colour, sizes_c), (depth, sizes_d) = _existing(folder, colour, "colour"), _existing(folder, depth, "depth")
-            sizes = sizes_c, sizes_d
+            colour, depth = _existing(folder, colour, "colour"), _existing(folder, depth, "depth")
             absent = listed - len(colour) - len(depth)
             index = associate(colour.stamps, depth.stamps, max_time_difference_s)
         if not len(index[0]):
@@ -113,7 +114,6 @@ class RecordedSequence:
         self._timestamps.flags.writeable = False
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
-        self._sizes = [sizes[0][i] for i in index[0]] + [sizes[1][i] for i in index[1]]
         self._ground_truth = _turned(contents.truth, description.R_body_cam)
         self.dropped = _count(
             colour,
@@ -185,17 +185,21 @@ class RecordedSequence:
         return self._description.split
 
     def digest(self) -> str:
-        """Digest of the camera, the paired files' stamps, names and sizes, and the ground truth."""
+        """Digest of camera, frame rate, stamps, ground truth and the contents of all paired images."""
         return self._digest
 
     @cached_property
     def _digest(self) -> str:
         truth = self._ground_truth
         poses = None if truth is None else [truth.timestamps.tolist(), truth.T_world_cam.tolist()]
-        files = [self._timestamps.tolist(), self._colour, self._depth, self._sizes]
-        special = [value for value in (self._missing_depth, self._furthest_m) if value is not None]
-        camera = repr(self.camera).replace(", readout_s=0.0)", ")")  # a global shutter's digest is older than the field
-        return digest([camera, files, poses, *special])
+        try:
+            images = contents_digest(self.folder / file for file in (*self._colour, *self._depth))
+        except OSError as error:
+            raise SequenceError(
+                f"cannot read {error.filename}: {error.strerror}", "fetch the sequence again"
+            ) from error
+        special = [self._missing_depth, self._furthest_m]
+        return digest([repr(self.camera), self.fps, self._timestamps.tolist(), images, poses, special])
 
     def __len__(self) -> int:
         return len(self._colour)
@@ -240,26 +244,26 @@ class RecordedSequence:
         return faults
 
 
-def _existing(folder: Path, images: ImageList, kind: str) -> tuple[ImageList, list[int]]:
-    """The images whose files are there, and their sizes; a few may be missing, as in some published sequences."""
-    sizes = [_file_size(folder / file) for file in images.files]
-    missing = [file for file, size in zip(images.files, sizes, strict=True) if size is None]
+def _existing(folder: Path, images: ImageList, kind: str) -> ImageList:
+    """The images whose files are there; a few may be missing, as in some published sequences."""
+    missing = {file for file in images.files if _file_size(folder / file) is None}
     if len(missing) > MISSING_TOLERATED * len(images):
-        _refuse(folder, missing, len(images), kind, "missing")
-    there = [i for i, size in enumerate(sizes) if size is not None]
+        _refuse(folder, [file for file in images.files if file in missing], len(images), kind, "missing")
+    there = [i for i, file in enumerate(images.files) if file not in missing]
     kept = replace(images, stamps=images.stamps[there], files=tuple(images.files[i] for i in there))
-    return kept, _file_sizes(folder, kept.files, kind)
+    _check_files(folder, kept.files, kind)
+    return kept
 
 
-def _file_sizes(folder: Path, files: tuple[str, ...], kind: str) -> list[int]:
-    sizes = [_file_size(folder / file) for file in files]
-    missing = [file for file, size in zip(files, sizes, strict=True) if size is None]
+def _check_files(folder: Path, files: tuple[str, ...], kind: str) -> None:
+    """Refuse images that are missing or empty."""
+    sizes = {file: _file_size(folder / file) for file in files}
+    missing = [file for file in files if sizes[file] is None]
     if missing:
         _refuse(folder, missing, len(files), kind, "missing")
-    empty = [file for file, size in zip(files, sizes, strict=True) if size == 0]
+    empty = [file for file in files if sizes[file] == 0]
     if empty:
         _refuse(folder, empty, len(files), kind, "empty (0 bytes)")
-    return [size for size in sizes if size is not None]
 
 
 def _file_size(path: Path) -> int | None:

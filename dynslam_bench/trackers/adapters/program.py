@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import selectors
-import shutil
 import signal
 import subprocess
 import sys
@@ -260,31 +259,6 @@ def end_with_parent() -> Callable[[], object] | None:
         return None
     prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec as little as possible is done
     return lambda: prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
-
-
-def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:
-    """The files that a command names: its program, found as starting it would, and the arguments that are files.
-
-    A rebuilt program or an edited script is another tracker: their content belongs to a run's identity. Libraries and
-    modules that these load are not seen.
-
-    Args:
-        command: Program and arguments.
-        folder: Its working folder; None for the current one.
-    """
-    if not command:
-        return []
-    base = Path() if folder is None else folder
-    program = base / Path(command[0]).expanduser() if os.sep in command[0] else shutil.which(command[0])
-    named = [*([] if program is None else [Path(program)]), *(base / word for word in command[1:] if word)]
-    return list(dict.fromkeys(file.resolve() for file in named if _is_file(file)))
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a word that cannot be a path
-        return False
 
 
 def _describe(code: int) -> str:

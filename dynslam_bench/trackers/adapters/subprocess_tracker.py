@@ -12,6 +12,7 @@ import numpy as np
 from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import DynslamError, TrackerError
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.geometry.camera import Camera
@@ -19,7 +20,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 
 from .answers import read_final_answer, read_track_answer
 from .exchange import ImageExchange
-from .program import Program, files_of_command
+from .program import Program
 from .settings import ProgramSettings, SubprocessSettings
 
 PROTOCOL = 2

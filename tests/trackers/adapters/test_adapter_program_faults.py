@@ -12,11 +12,11 @@ import pytest
 from adapter_programs import GOOD, frame, gone, reset
 
 from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import InfrastructureError, SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.trackers import build_tracker
 from dynslam_bench.trackers.adapters import exchange
-from dynslam_bench.trackers.adapters.program import files_of_command
 from dynslam_bench.trackers.adapters.settings import SubprocessSettings
 
 FAULTS = {
@@ -155,8 +155,8 @@ def test_what_a_program_writes_goes_to_the_log(program, caplog):
 def test_the_files_of_a_command(tmp_path):
     script = tmp_path / "slam.py"
     script.write_text("")
-    python = Path(shutil.which("env")).resolve()
-    assert files_of_command(["env", str(script), "--fast", "", "/no/such\0name"]) == [python, script.resolve()]
+    env = Path(shutil.which("env")).resolve()
+    assert files_of_command(["env", str(script), "--fast", "", "/no/such\0name"]) == [env, script.resolve()]
     assert files_of_command(["./slam.py", "slam.py"], tmp_path) == [script.resolve()]
     assert files_of_command([]) == []
 

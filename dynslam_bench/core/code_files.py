@@ -1,0 +1,190 @@
+"""Which files a program is made of: its code, and the data files beside it that its code names."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
+_TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".yml", ".toml", ".json", ".cfg", ".ini",
+         ".xml")  # fmt: skip
+_LARGEST_TEXT = 1 << 20
+_WORD = re.compile(rb"[\w./~+\-]+")
+_IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([A-Za-z_]\w*)|import[ \t]+([A-Za-z_][\w., \t]*))", re.MULTILINE)
+_SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
+_STORE = ("index", "metrics", "sequences", "latest")
+_RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
+
+
+def is_code(file: Path) -> bool:
+    """Whether a file is Python source or a native library."""
+    return (file.suffix in CODE or ".so." in file.name) and file.is_file()
+
+
+def program_files(folder: Path) -> list[Path]:
+    """The files below a folder that decide what its code does.
+
+    These are all code files, and each other file whose name, or whose suffix, is written in one of the text files among
+    them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``, ``f"{name}.yaml"``. Hidden folders, virtual environments,
+    results folders and recordings are left out.
+
+    Args:
+        folder: For example that of a plug-in's file.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    everything = list(files_below(folder))
+    code = [file for file in everything if is_code(file)]
+    return code + _named(code, [file for file in everything if not is_code(file)])
+
+
+def imported_modules(files: Iterable[Path]) -> set[str]:
+    """Top-level names of the modules that Python sources import.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    found: set[str] = set()
+    for file in files:
+        for single, several in _IMPORT.findall(file.read_bytes()) if file.suffix == ".py" else ():
+            for name in (single or several).decode().split(","):
+                found.add(name.split()[0].partition(".")[0] if name.split() else "")
+    return found - {""}
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """All files below a folder, but for hidden ones, virtual environments, results folders and recordings.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith((".", "__pycache__")):
+            continue
+        if entry.is_file():
+            yield entry
+        elif entry.is_dir() and not _is_left_out(entry):
+            yield from files_below(entry)
+
+
+def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:
+    """The files that decide what a command does.
+
+    These are its program with the libraries it is linked with, the files and folders among its arguments (also behind
+    ``=``), the code of ``python -m MODULE``, all code in the folder of a Python script, and what scripts and
+    configuration files name. Files of the operating system are left out.
+
+    Args:
+        command: Program and arguments.
+        folder: Its working folder; None for the current one.
+    """
+    if not command:
+        return []
+    base = Path() if folder is None else folder
+    first = str(base / Path(command[0]).expanduser()) if os.sep in command[0] else shutil.which(command[0])
+    program = None if first is None else Path(first)
+    found = [] if program is None or not _is_file(program) else [program, *_linked_libraries(program.resolve())]
+    for word in command[1:]:
+        for path in {base / Path(text).expanduser() for text in (word, word.partition("=")[2]) if text}:
+            found += files_below(path) if _is_folder(path) else [path] if _is_file(path) else []
+    if program is not None and program.name.startswith("python") and "-m" in command[:-1]:
+        found += _module_files(command[command.index("-m") + 1], base)
+    named = _with_named_files(found, base)
+    scripts = {file.parent for file in named if file.suffix == ".py" and file.parent not in found}
+    own = [file for script in sorted(scripts) for file in program_files(script)]
+    return list(dict.fromkeys(file.resolve() for file in (*named, *own)))
+
+
+def _module_files(module: str, base: Path) -> list[Path]:
+    """The code of a module in the working folder or on ``PYTHONPATH``, else as this interpreter finds it."""
+    top = module.partition(".")[0]
+    for place in (base, *map(Path, filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))):
+        if (place / top).is_dir():
+            return program_files(place / top)
+        if (place / f"{top}.py").is_file():
+            return program_files(place)
+    spec = find_spec(top)
+    folders = [] if spec is None else list(spec.submodule_search_locations or ())
+    return [file for place in folders for file in files_below(Path(place))]
+
+
+def _linked_libraries(program: Path) -> list[Path]:
+    """The shared libraries of a program that are none of the operating system's, as ``ldd`` finds them."""
+    if _is_of_system(program) or shutil.which("ldd") is None or program.open("rb").read(4) != b"\x7fELF":
+        return []
+    listed = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=False).stdout
+    paths = [Path(match) for match in re.findall(r"=> (/.+) \(0x", listed)]
+    return [path for path in paths if not _is_of_system(path) and path.is_file()]
+
+
+def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
+    """Files, and those that scripts and configurations among them name, relative to themselves or to `base`."""
+    found: dict[Path, None] = {}
+    waiting = list(files)
+    while waiting:
+        file = waiting.pop(0)
+        if file in found:
+            continue
+        found[file] = None
+        for word in sorted(_words(file)):
+            if "." in word or "/" in word:
+                path = Path(word).expanduser() if word.startswith("~/") else Path(word)
+                places = {file.parent / path, base / path}  # an absolute path stays as it is
+                waiting += [place for place in places if not _is_of_system(place) and _is_file(place)]
+    return list(found)
+
+
+def _named(code: list[Path], others: list[Path]) -> list[Path]:
+    """Those of the other files that the code names; what they name in turn counts, too."""
+    found: list[Path] = []
+    waiting = list(code)
+    while waiting and others:
+        words = {word.rpartition("/")[2] for file in waiting for word in _words(file)}
+        waiting = [file for file in others if file.name in words or (file.suffix and file.suffix in words)]
+        others = [file for file in others if file not in set(waiting)]
+        found += waiting
+    return found
+
+
+def _words(file: Path) -> set[str]:
+    """The words of a script or configuration that could be names of files."""
+    try:
+        if file.stat().st_size > _LARGEST_TEXT:
+            return set()
+        with file.open("rb") as opened:
+            if file.suffix not in _TEXT and (file.suffix or opened.read(2) != b"#!"):
+                return set()
+        return {word.decode(errors="replace").rstrip(".") for word in _WORD.findall(file.read_bytes())}
+    except OSError:
+        return set()
+
+
+def _is_of_system(path: Path) -> bool:
+    return str(path).startswith(_SYSTEM)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file() and os.access(path, os.R_OK)
+    except (OSError, ValueError):  # a word that cannot be a path
+        return False
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def _is_left_out(folder: Path) -> bool:
+    """Whether a folder is a virtual environment, a results folder or a recording."""
+    if (folder / "pyvenv.cfg").is_file() or any((folder / name).exists() for name in _RECORDING):
+        return True
+    return (folder / "runs").is_dir() and any((folder / name).exists() for name in _STORE)

@@ -1,0 +1,272 @@
+"""What makes another run: every change of data, program, plug-in, weights or library that could change a result."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from envs_toys import TARGET, write_folder
+
+from dynslam_bench.core import fingerprint
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
+
+PLUGIN = """
+from pathlib import Path
+from dynslam_bench.contracts.tracker import TrackerSpec
+PARAMETERS = Path(__file__).parent / "params" / "slam.yaml"
+SPEC = TrackerSpec("mine", f"{__file__}:build", "mine")
+def build(settings):
+    import helper
+    return helper.make(PARAMETERS.read_text())
+"""
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def edit(path: Path, old: str, new: str) -> Callable[[], None]:
+    """An edit that changes neither size nor time of modification."""
+
+    def change() -> None:
+        stat = path.stat()
+        text = path.read_text()
+        assert old in text and len(old) == len(new)
+        path.write_text(text.replace(old, new))
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+    return change
+
+
+def rescale(path: Path, write_image: Callable[[Path, np.ndarray], None]) -> Callable[[], None]:
+    """Divide a depth image by 5 in place."""
+    return lambda: write_image(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5)
+
+
+def uncompressed(path: Path, image: np.ndarray) -> None:
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+
+
+def sequence(tmp_path: Path) -> Path:
+    folder = write_folder(tmp_path / "toy", 6)
+    for file in (folder / "depth").glob("*.png"):
+        uncompressed(file, cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+    return folder
+
+
+def a_change_of_data(name: str, folder: Path) -> Callable[[], None]:
+    depth, colour = sorted((folder / "depth").iterdir())[3], sorted((folder / "rgb").iterdir())[3]
+    flipped = cv2.imread(str(colour))[::-1] if name == "colour" else None
+    return {
+        "depth": rescale(depth, uncompressed),
+        "colour": lambda: cv2.imwrite(str(colour), flipped),
+        "truth": edit(folder / "groundtruth.txt", "100.1", "100.2"),
+        "stamps": edit(folder / "rgb.txt", "100.066667 rgb", "100.066668 rgb"),
+        "camera": edit(folder / "camera.toml", "fx = ", "fx =1"),
+        "frame rate": edit(folder / "camera.toml", "fps = 30", "fps = 15"),
+    }[name]
+
+
+@pytest.mark.parametrize("name", ["depth", "colour", "truth", "stamps", "camera", "frame rate"])
+def test_changed_data_is_another_run(name: str, tmp_path: Path) -> None:
+    folder = sequence(tmp_path)
+    spec = RunSpec(tracker="never-move", sequence=str(folder))
+    before, change = resolve(spec).run_id, a_change_of_data(name, folder)
+    assert resolve(spec).run_id == before
+    change()
+    assert resolve(spec).run_id != before
+
+
+def test_one_content_has_one_identity_wherever_it_lies(tmp_path: Path) -> None:
+    folder = sequence(tmp_path)
+    copy = shutil.copytree(folder, tmp_path / "copy" / "toy")
+    first, second = (resolve(RunSpec(tracker="never-move", sequence=str(each))) for each in (folder, copy))
+    assert first.run_id == second.run_id
+
+
+def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
+    folder = tmp_path / "plugin"
+    write(folder / "mine.py", PLUGIN)
+    write(folder / "helper.py", "def make(text):\n    return 1  # a note\n")
+    write(folder / "params" / "slam.yaml", "threshold: 1\nweights: net.bin\n")
+    write(folder / "params" / "net.bin", "1111")
+    write(folder / "notes.md", "nothing reads this")
+    write(folder / "results" / "runs" / "x" / "slam.yaml", "an output")
+    write(folder / "results" / "index" / "x", "an output")
+    return RunSpec(tracker=f"{folder / 'mine.py'}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))), folder
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("mine.py", '"mine")', '"ours")'),
+        ("helper.py", "return 1", "return 2"),
+        ("params/slam.yaml", ": 1", ": 2"),
+        ("params/net.bin", "1111", "2222"),
+    ],
+)
+def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_path: Path) -> None:
+    spec, folder = plugin(tmp_path)
+    before = resolve(spec).run_id
+    edit(folder / file, old, new)()
+    assert resolve(spec).run_id != before
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("helper.py", "a note", "a word"),
+        ("helper.py", "def make(text):\n", 'def make(text):\n    """What it does."""\n\n'),
+        ("notes.md", "nothing", "nobody"),
+        ("results/runs/x/slam.yaml", "output", "result"),
+    ],
+)
+def test_comments_docstrings_and_what_no_code_names_change_nothing(
+    file: str, old: str, new: str, tmp_path: Path
+) -> None:
+    spec, folder = plugin(tmp_path)
+    before = resolve(spec).run_id
+    path = folder / file
+    path.write_text(path.read_text().replace(old, new))
+    assert resolve(spec).run_id == before
+
+
+def test_what_a_plug_in_imports_from_elsewhere_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec, folder = plugin(tmp_path)
+    library = write(tmp_path / "elsewhere" / "identity_toy_library" / "__init__.py", "gain = 1\n")
+    monkeypatch.syspath_prepend(str(library.parents[1]))
+    write(folder / "helper.py", "import identity_toy_library, numpy\n")
+    before = resolve(spec).run_id
+    library.write_text("gain = 2\n")
+    after = resolve(spec).run_id
+    assert after != before
+    real = fingerprint.distribution_version
+    monkeypatch.setattr(fingerprint, "distribution_version", lambda name: "0" if name == "numpy" else real(name))
+    assert resolve(spec).run_id != after
+
+
+def a_program(tmp_path: Path) -> Path:
+    """A folder of a program with everything that commands name."""
+    folder = tmp_path / "program"
+    write(folder / "slam.py", 'import part\nopen("beside.json")\n')
+    write(folder / "part.py", "x = 1\n")
+    write(folder / "beside.json", "1111")
+    write(folder / "c.yaml", "vocabulary: voc.bin\n")
+    write(folder / "voc.bin", "1111")
+    write(folder / "maps" / "a.map", "1111")
+    write(folder / "package" / "__init__.py", "")
+    write(folder / "package" / "__main__.py", "x = 1\n")
+    write(folder / "run.sh", "#!/bin/sh\nexec python slam.py\n").chmod(0o755)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("command", "file", "old", "new"),
+    [
+        ("{python} slam.py", "slam.py", "import part", "import  re "),
+        ("{python} slam.py", "part.py", "1", "2"),
+        ("{python} slam.py", "beside.json", "1", "2"),
+        ("{python} slam.py --config=c.yaml", "c.yaml", "voc.", "Voc."),
+        ("{python} slam.py --config c.yaml", "c.yaml", "voc.", "Voc."),
+        ("{python} slam.py --config=c.yaml", "voc.bin", "1", "2"),
+        ("{python} slam.py maps", "maps/a.map", "1", "2"),
+        ("{python} slam.py --maps=maps", "maps/a.map", "1", "2"),
+        ("{python} -m package", "package/__main__.py", "1", "2"),
+        ("{python} -m part", "part.py", "1", "2"),
+        ("./run.sh", "run.sh", "exec", "echo"),
+        ("./run.sh", "part.py", "1", "2"),
+    ],
+)
+def test_a_changed_program_is_another_run(command: str, file: str, old: str, new: str, tmp_path: Path) -> None:
+    folder = a_program(tmp_path)
+    spec = RunSpec(
+        tracker=f"subprocess:{command.format(python=sys.executable)}",
+        sequence=str(write_folder(tmp_path / "toy", 4)),
+        settings={"folder": str(folder)},
+    )
+    before = resolve(spec).run_id
+    assert resolve(spec).run_id == before
+    edit(folder / file, old, new)()
+    assert resolve(spec).run_id != before
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None or shutil.which("ldd") is None, reason="needs gcc and ldd")
+def test_a_rebuilt_shared_library_is_another_run(tmp_path: Path) -> None:
+    folder = tmp_path / "native"
+    write(folder / "part.c", "int part(void) { return 1; }\n")
+    write(folder / "main.c", "int part(void); int main(void) { return part(); }\n")
+    build = f"cd {folder} && gcc -shared -fPIC -o libpart.so part.c"
+    assert os.system(f"{build} && gcc -o slam main.c -L. -lpart -Wl,-rpath,'$ORIGIN'") == 0
+    spec = RunSpec(tracker=f"subprocess:{folder}/slam", sequence=str(write_folder(tmp_path / "toy", 4)))
+    before = resolve(spec).run_id
+    write(folder / "part.c", "int part(void) { return 2; }\n")
+    assert os.system(build) == 0
+    assert resolve(spec).run_id != before
+
+
+def test_libraries_weights_and_own_code_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = str(write_folder(tmp_path / "toy", 4))
+    spec = RunSpec(tracker="orb-slam2", sequence=folder)
+    ids = {resolve(spec).run_id}
+    known = identity.versions()
+    for name in identity.LIBRARIES:
+        monkeypatch.setattr(identity, "versions", lambda name=name: known | {name: "another"})
+        ids.add(resolve(spec).run_id)
+    monkeypatch.undo()
+    monkeypatch.setattr(fingerprint, "package_digest", lambda packages: "another")
+    ids.add(resolve(spec).run_id)
+    monkeypatch.undo()
+    masks = write(tmp_path / "masks" / "000000.png", "1111")
+    masked = RunSpec(tracker="mask-rcnn", sequence=folder, settings={"segmentation.source": f"recorded:{masks.parent}"})
+    assert len(ids) == len(identity.LIBRARIES) + 2
+    before = identity.weights_of(resolve_settings_of(masked), masked.settings["segmentation.source"])
+    edit(masks, "1111", "2222")()
+    assert identity.weights_of(resolve_settings_of(masked), masked.settings["segmentation.source"]) != before
+
+
+def resolve_settings_of(spec: RunSpec):
+    return identity.resolve_settings(identity.TRACKERS.get(spec.tracker), spec.settings)
+
+
+def test_no_plug_in_takes_the_id_of_a_built_in_tracker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = write(tmp_path / "mine.py", PLUGIN.replace('"mine", f', '"orb-slam2", f'))
+    with pytest.raises(PluginError, match="orb-slam2"):
+        resolve(RunSpec(tracker=f"{file}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))))
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"{file}:SPEC")
+    identity.TRACKERS.refresh()
+    try:
+        assert identity.TRACKERS.get("orb-slam2").entry_point.startswith("dynslam_bench.")
+        assert any("orb-slam2" in failure.reason for failure in identity.TRACKERS.failures())
+    finally:
+        monkeypatch.delenv("DYNSLAM_BENCH_PLUGINS")
+        identity.TRACKERS.refresh()
+
+
+def test_one_run_id_with_two_results_is_said(
+    store: RunStore, toy_folder: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6))
+    record = run_one(spec, store)
+    assert run_one(spec, store).notes == record.notes
+    trajectory = store.folder(record.run_id) / "trajectory_online.txt"
+    trajectory.write_text(trajectory.read_text().replace("0.0", "0.1"))
+    (again,) = run_many([spec], results=store, retry=["ok"])
+    assert again.run_id == record.run_id
+    assert any("another trajectory" in note for note in again.notes)
+    assert any(record.run_id in message for message in caplog.messages)
+
+
+def test_runs_of_another_scheme_are_unverified(store: RunStore, toy_folder: str) -> None:
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6)), store)
+    assert record.verified and "identity" not in record.program
+    old = record.model_copy(update={"identity": {k: v for k, v in record.identity.items() if k != "scheme"}})
+    assert not old.verified and old.program["identity"] == "unverified"
