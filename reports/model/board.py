@@ -179,6 +179,7 @@ def make_board(
     _choose_ranked(board, scored)
     wanted = reference or DEFAULT_REFERENCE
     candidates = [k for k in scored if board.first(k).tracker == wanted and "map" not in board.first(k).variant]
+    candidates = [k for k in candidates if board.first(k).is_current and not board.first(k).imported]
     candidates = [k for k in candidates if set(board.common) <= set(_scored(board, k))]
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
@@ -245,7 +246,8 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     neither one more sequence of one tracker nor one run of another takes the ranking away from the rest. A tracker
     without any success is not ranked, nor is one where its network was trained (`Board.competes`).
     """
-    rankable = [key for key in scored if board.first(key).ranked and board.first(key).provenance != "control"]
+    firsts = {key: board.first(key) for key in scored}
+    rankable = [key for key, row in firsts.items() if row.ranked and row.is_current and row.provenance != "control"]
     rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
     has = {key: {name for name in _scored(board, key) if board.competes(key, name)} for key in rankable}
     rankable = [key for key in rankable if has[key]]

@@ -22,7 +22,7 @@ from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import Digest, digest
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.runs.storage.line_file import add_lines, read_line_file, remove_older, write_line_file
-from dynslam_bench.runs.storage.states import NO_FILE, Stamp, folder_state, stamp_if_there
+from dynslam_bench.runs.storage.states import Stamp, folder_state, stamp_if_there
 from dynslam_bench.runs.storage.store import RunStore
 
 from .make_row import log_of, make_row
@@ -145,7 +145,7 @@ class KnownRows:
         Raises:
             DynslamError: It has no valid record.
         """
-        run_state, scored = self._run_state(run_id), self._scored(run_id)  # before anything is read
+        run_state = self._run_state(run_id)  # before anything is read
         record = self.store.read_whole(run_id)
         part = record.sequence.part
         try:
@@ -153,8 +153,7 @@ class KnownRows:
         except DynslamError:  # why the run cannot be evaluated
             part_state = ""
         row = None if record.status == "stopped" else make_row(self.store, record, self._protocol)
-        if scored == NO_FILE:  # they have just been written
-            scored = self._scored(run_id)
+        scored = self._scored(run_id)  # errors that were missing or out of date have just been written
         return KnownRow(run_id, part, run_state, part_state, scored, row)
 
     def _holds(self, known: KnownRow) -> bool:

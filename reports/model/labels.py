@@ -37,6 +37,7 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     for key, row in variants.items():
         shown = {*differing_of[row.tracker], *ALWAYS, *single[row.tracker]}
         parts = [f"{name}={setting_text(value)}" for name, value in sorted(row.variant.items()) if name in shown]
+        parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
         if row.imported and len(kinds[row.tracker]) > 1:
             parts.append("imported")
         base = f"{row.label} <{row.tracker}>" if len(by_label[row.label]) > 1 else row.label

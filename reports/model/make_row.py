@@ -40,6 +40,8 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         given=tracker.given,
         label=tracker.label or tracker.id,
         variant=variant_of(record),
+        program=record.program,
+        deterministic=tracker.deterministic and not record.realtime,
         provenance=tracker.provenance,
         ranked=tracker.ranked and record.start_map is None,
         monocular=tracker.sensors == "rgb",

@@ -71,7 +71,8 @@ def run_command(row: RunRow) -> str:
 
 def _candidates(board: Board) -> list[str]:
     """The trackers that could be ranked."""
-    return [k for k in board.trackers if board.first(k).ranked and board.first(k).provenance != "control"]
+    firsts = {key: board.first(key) for key in board.trackers}
+    return [key for key, row in firsts.items() if row.ranked and row.is_current and row.provenance != "control"]
 
 
 def _settings(row: RunRow) -> list[str]:

@@ -28,6 +28,10 @@ class RunRow(Record):
         given: What the tracker was named by where that is not its id, e.g. ``/path/file.py:Attr``.
         label: Tracker's label.
         variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
+        program: Code, weights and library versions that made it, see `RunRecord.program`.
+        split_by: Those of them in which the runs of this tracker and variant differ: each program is a row of its own.
+        is_current: Whether its identity is verified, and no newer program has made runs of this tracker and variant.
+        deterministic: Whether equal runs should give equal results.
         provenance: How closely the tracker follows its source.
         ranked: Whether its spec lets it be ranked.
         monocular: Whether its scale is unknown: a protocol whose alignment finds none leaves it out.
@@ -86,6 +90,10 @@ class RunRow(Record):
     given: str = ""
     label: str
     variant: dict[str, Any] = Field(default_factory=dict)
+    program: dict[str, str] = Field(default_factory=dict)
+    split_by: dict[str, str] = Field(default_factory=dict)
+    is_current: bool = True
+    deterministic: bool = True
     provenance: str = ""
     ranked: bool = True
     monocular: bool = False
@@ -160,6 +168,12 @@ class RunRow(Record):
     @cached_property
     def variant_key(self) -> str:
         """Tracker and everything that sets its runs apart besides sequence and repeat."""
+        split = json.dumps(self.split_by, sort_keys=True) if self.split_by else ""
+        return f"{self.settings_key}|{split}" if split else self.settings_key
+
+    @property
+    def settings_key(self) -> str:
+        """Tracker and settings, whatever program made the run."""
         return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)
 
     @property

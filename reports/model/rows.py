@@ -79,6 +79,7 @@ class Loaded:
         without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
         trials: How many were left out since they are trials of studies.
         unreadable: Folders without a valid record, with reasons.
+        conflicts: Runs that should be equal and are not, in words.
     """
 
     runs: list[LoadedRun] = field(default_factory=list)
@@ -87,6 +88,7 @@ class Loaded:
     without_scale: int = 0
     trials: int = 0
     unreadable: list[str] = field(default_factory=list)
+    conflicts: list[str] = field(default_factory=list)
 
     @cached_property
     def by_id(self) -> dict[str, LoadedRun]:
@@ -133,8 +135,10 @@ def load_runs(
     )  # fmt: skip
     _join_old_imports(found)
     newest: dict[tuple[object, ...], LoadedRun] = {}
+    loaded.conflicts = _two_results(found)
     for run in sorted(found, key=lambda run: (run.row.started, run.row.run_id)):
-        newest[run.row.variant_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
+        newest[run.row.settings_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
+    _split_programs([run.row for run in newest.values()])
     loaded.superseded = len(found) - len(newest)
     if not newest and loaded.without_scale:
         raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
@@ -205,6 +209,41 @@ def _look_for(
             trackers |= set() if record is None or record.status == "stopped" else {record.tracker.id}
     if trackers:
         check_reference(reference, sorted(trackers))
+
+
+def _split_programs(rows: Sequence[RunRow]) -> None:
+    """Make the runs of each program a row of their own, where several made the runs of one tracker and its settings.
+
+    Runs by an older program are not ranked, nor are those whose identity is not verified, which are always marked.
+    """
+    groups: dict[str, list[RunRow]] = {}
+    for row in rows:
+        groups.setdefault(row.settings_key, []).append(row)
+    for group in groups.values():
+        values: dict[str, set[str]] = {}
+        for row in group:
+            for name, value in row.program.items():
+                values.setdefault(name, set()).add(value)
+        varying = {name for name, found in values.items() if len(found) > 1 or name == "identity"}
+        for row in group:
+            row.split_by = {name: value for name, value in row.program.items() if name in varying}
+        last = max(group, key=lambda row: row.started).split_by
+        for row in group:
+            row.is_current = row.split_by == last and "identity" not in row.split_by
+
+
+def _two_results(runs: Sequence[LoadedRun]) -> list[str]:
+    """Which runs of one id from several stores have different results although they should be equal, in words."""
+    conflicts = []
+    by_id: dict[str, list[RunRow]] = {}
+    for run in runs:
+        by_id.setdefault(run.row.run_id, []).append(run.row)
+    for rows in by_id.values():
+        errors = sorted({row.metrics["ate_rmse_m"] for row in rows if "ate_rmse_m" in row.metrics})
+        if len(errors) > 1 and rows[0].deterministic:
+            found = ", ".join(f"{1000 * error:.3f}" for error in errors)
+            conflicts.append(f"{rows[0].label} on {rows[0].sequence} (run {rows[0].run_id}): ATE {found} mm")
+    return conflicts
 
 
 def _join_old_imports(runs: Sequence[LoadedRun]) -> None:

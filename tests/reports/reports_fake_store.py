@@ -9,7 +9,7 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum
-from dynslam_bench.runs.storage.record import RunRecord, SequenceInfo, StageTime, TrackerInfo
+from dynslam_bench.runs.storage.record import IDENTITY_SCHEME, RunRecord, SequenceInfo, StageTime, TrackerInfo
 from dynslam_bench.runs.storage.store import RunStore
 
 LABELS = {
@@ -77,6 +77,8 @@ def add_run(
     final_whole=False,
     study="",
     given="",
+    identity=None,
+    run_id=None,
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -87,9 +89,9 @@ def add_run(
     part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:16]
     store.prepare()
     store.add_sequence(part, stamps, truth if ground_truth else None)
-    identity = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
+    made_of = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
                 "extra": (offset, noise, content, camera, frames, online, masks)}  # fmt: skip
-    run_id = hashlib.sha256(repr(identity).encode()).hexdigest()[:16]
+    run_id = run_id or hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]
     rng = np.random.default_rng(int(run_id[:8], 16) if copy_of is None else copy_of)
     nearest = np.abs(truth.timestamps[:, None] - stamps).argmin(0)
     drift = np.cumsum(rng.normal(0, 1, (n, 6)), axis=0)
@@ -111,7 +113,8 @@ def add_run(
                               ground_truth=ground_truth,
                               tags=list(tags)),
         frames=frames, offset=offset, place=place, epipolar_skipped=skipped,
-        identity=({"cache": True} if cached else {}) | ({"camera": camera} if camera else {}),
+        identity=({"scheme": IDENTITY_SCHEME} if identity is None else identity)
+        | ({"cache": True} if cached else {}) | ({"camera": camera} if camera else {}),
         n_frames=n, n_processed=n if died_at is None else died_at,
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},

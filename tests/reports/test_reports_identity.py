@@ -1,0 +1,97 @@
+"""A row of a table is one program: code, weights and library versions are never mixed without a word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from reports_fake_store import add_run
+
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports import build_report, load_board
+from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.runs.storage.record import IDENTITY_SCHEME
+from dynslam_bench.runs.storage.store import RunStore
+
+SEQUENCES = ("synthetic/walking_xyz", "synthetic/walking_static")
+
+
+def made_by(**parts: object) -> dict[str, object]:
+    return {"scheme": IDENTITY_SCHEME, **parts}
+
+
+def rows_of(board: Board, tracker: str) -> dict[str, list[str]]:
+    """The sequences that each row of a tracker has runs on, by the row's name."""
+    keys = [key for key in board.labels if board.first(key).tracker == tracker]
+    return {board.labels[key]: sorted(board.cells[key]) for key in keys}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "name"),
+    [
+        ({"source": "1"}, {"source": "2"}, "code"),
+        ({"tracker_version": "1"}, {"tracker_version": "2"}, "code"),
+        ({"files": "1"}, {"files": "2"}, "code"),
+        ({"libraries": {"torch": "2.1"}}, {"libraries": {"torch": "2.2"}}, "torch"),
+        ({"weights": {"coco": "aaaa"}}, {"weights": {"coco": "bbbb"}}, "weights of coco"),
+    ],
+)
+def test_runs_of_two_programs_are_two_rows_and_the_older_is_not_ranked(
+    before: dict[str, object], after: dict[str, object], name: str, tmp_path: Path
+) -> None:
+    store = RunStore(tmp_path / "r")
+    for sequence in SEQUENCES:
+        add_run(store, "orb-slam2", sequence, error=0.02)
+    add_run(store, "mine", SEQUENCES[0], error=0.01, identity=made_by(**before), started="2026-01-01T00:00:00+00:00")
+    add_run(store, "mine", SEQUENCES[1], error=0.50, identity=made_by(**after), started="2026-01-02T00:00:00+00:00")
+    board = load_board(store)
+    rows = rows_of(board, "mine")
+    assert len(rows) == 2 and all(len(sequences) == 1 and f" {name} " in label for label, sequences in rows.items())
+    current = {label: board.first(key).is_current for key, label in board.labels.items()}
+    assert sorted(current[label] for label in rows) == [False, True]
+    assert not any(board.first(key).tracker == "mine" and not board.first(key).is_current for key in board.ranked)
+
+
+def test_a_program_that_ran_everything_again_supersedes_the_older_one(tmp_path: Path) -> None:
+    store = RunStore(tmp_path / "r")
+    for day, source in enumerate("12", start=1):
+        for sequence in SEQUENCES:
+            started = f"2026-01-0{day}T00:00:00+00:00"
+            add_run(store, "mine", sequence, identity=made_by(source=source), started=started)
+    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
+    assert loaded.superseded == 2 and {run.row.started[:10] for run in loaded.runs} == {"2026-01-02"}
+    assert list(rows_of(load_board(store), "mine")) == ["mine"]
+
+
+def test_masks_of_two_networks_on_two_kinds_of_sequences_are_one_row(tmp_path: Path) -> None:
+    store = RunStore(tmp_path / "r")
+    add_run(store, "mine", SEQUENCES[0], identity=made_by(weights={"embedded": "aaaa"}))
+    add_run(store, "mine", "bonn/crowd", identity=made_by(weights={"coco": "bbbb"}))
+    assert list(rows_of(load_board(store), "mine")) == ["mine"]
+
+
+def test_a_run_of_an_older_identity_scheme_is_marked_and_never_the_reference(tmp_path: Path) -> None:
+    store = RunStore(tmp_path / "r")
+    add_run(store, "orb-slam2", SEQUENCES[0], identity={})
+    board = load_board(store)
+    assert list(rows_of(board, "orb-slam2")) == ["orb-slam2 · identity unverified"]
+    assert board.reference is None
+
+
+def test_an_import_is_never_the_reference(tmp_path: Path) -> None:
+    store = RunStore(tmp_path / "r")
+    add_run(store, "orb-slam2", SEQUENCES[0], kind="imported")
+    add_run(store, "mine", SEQUENCES[0])
+    assert load_board(store).reference is None
+
+
+def test_two_results_under_one_id_are_said_on_the_page(tmp_path: Path) -> None:
+    stores = [RunStore(tmp_path / name) for name in "ab"]
+    for store, error in zip(stores, (0.01, 0.3), strict=True):
+        add_run(store, "mine", SEQUENCES[0], error=error, run_id="0123456789abcdef")
+    loaded = load_runs(stores, get_protocol("tum-rgbd/v1"))
+    assert len(loaded.conflicts) == 1 and "0123456789abcdef" in loaded.conflicts[0]
+    page = build_report([store.root for store in stores], tmp_path / "report").html.read_text()
+    assert "0123456789abcdef" in page and "must be equal" in page
+    assert load_runs(stores[:1], get_protocol("tum-rgbd/v1")).conflicts == []
