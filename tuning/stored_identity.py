@@ -36,6 +36,13 @@ def _of(identity: dict[str, Any], key: str) -> Any:
 
 def difference(stored: dict[str, Any], now: dict[str, Any]) -> str:
     """The first thing in which two identities differ, in words."""
+    for key in ("data", "program"):
+        there, here = stored.get(key) or {}, now.get(key) or {}
+        names = [name for name in here if there.get(name) != here[name]]
+        if names and key == "data":
+            return f"data: the content of {', '.join(names[:3])} is not what it was"
+        if names:
+            return f"{names[0]}: {there.get(names[0])} there, {here[names[0]]} here"
     changed = [key for key in now if _of(stored, key) != now[key]]
     first = changed[0] if changed else next(iter(stored.keys() - now.keys()), "content")
     more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""

@@ -18,14 +18,14 @@ from typing import Any, Literal
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-import dynslam_bench
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.harmless import storable
 from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.settings import apply_overrides, flatten
 from dynslam_bench.runs import RunEvent, RunStore
-from dynslam_bench.runs.identity import source_fingerprint
+from dynslam_bench.runs.identity import resolve
+from dynslam_bench.runs.storage.record import program_of
 from dynslam_bench.trackers import TRACKERS
 
 from . import race
@@ -43,8 +43,8 @@ from .study_file import StudySpec
 from .trials import best_trials, errors_in, errors_of
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-CODE = ("version", "source", "parameters")
-"""What of a study's identity tells the code that ran it: must be the same to go on, not to read."""
+MADE_OF = ("parameters", "data", "program")
+"""What of a study's identity tells the data and the program that made it: must be the same to go on, not to read."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
 
@@ -330,7 +330,7 @@ class Tuner:
             raise StudyError(
                 f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name"
             )
-        if not same(stored, identity, but=CODE if self.reading else ()):
+        if not same(stored, identity, but=MADE_OF if self.reading else ()):
             raise StudyError(
                 f"study '{name}' is stored with other {difference(stored, identity)}",
                 f"give the study another name, or delete {self.folder}",
@@ -354,14 +354,22 @@ class Tuner:
         spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
         if not self.spec.allow_overlap:
             del spec["allow_overlap"]  # as in studies of before it was there
-        defaults = apply_overrides(self.tracker.settings(), self.spec.space.fixed)
-        masks = str(getattr(getattr(defaults, "segmentation", None), "source", ""))
-        return {
-            **spec,
-            "version": dynslam_bench.__version__,
-            "source": source_fingerprint(self.tracker, defaults, masks),
-            "parameters": digest([repr(parameter) for parameter in self.space]),
-        }
+        identity = {**spec, "parameters": digest([repr(parameter) for parameter in self.space])}
+        return identity if self.reading else identity | self._made_of()
+
+    def _made_of(self) -> dict[str, Any]:
+        """The content of the study's sequences, and the program that runs on them: code, weights, libraries, device."""
+        spec = self.spec
+        first: dict[str, Block] = {}
+        for block in spec.blocks(*spec.tune, *spec.confirm, *spec.held_out):
+            first.setdefault(block.sequence, block)
+        how: dict[str, Any] = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(spec.space.fixed)}
+        data, program = {}, {}
+        for sequence, block in first.items():
+            identity = resolve(block.run_spec(spec.tracker, **how)).identity
+            data[sequence] = digest([identity["content"], identity["camera"]])
+            program |= program_of(identity) | {"device": identity["device"]}
+        return {"data": data, "program": program}
 
 
 def _identity_of(study: optuna.Study, wait_s: float = 10.0) -> dict[str, Any] | None:

@@ -29,6 +29,7 @@ WHERE_SAID = {
     "masks": "masks",
     "from_store": "from the store",
     "settings": "settings",
+    "identity": "identity",
     "reason": "reason",
 }
 """Columns that are there only if a run has something to say in them."""

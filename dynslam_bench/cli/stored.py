@@ -1,7 +1,8 @@
-"""``runs list|show|rm``."""
+"""``runs list|show|rescore|rm``."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -86,6 +87,32 @@ def show(
             write(f"  {line}")
 
 
+@app.command()
+def rescore(
+    results: Results = Path("results"),
+    protocol: Annotated[Optional[str], typer.Option(help="Only under this one.")] = None,  # noqa: UP045
+    as_json: AsJson = False,
+) -> None:
+    """Compute the errors of all runs again from their trajectories, and say which have changed."""
+    from dynslam_bench.core.errors import RunError
+    from dynslam_bench.runs import RunStore
+    from dynslam_bench.runs.storage.scoring import rescore as score_again
+
+    store = RunStore(results)
+    if not store.runs.is_dir():
+        raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
+    with progress("scoring runs") as advance:
+        outcomes = score_again(store, protocol, on_progress=advance)
+    if as_json:
+        write_json([asdict(each) for each in outcomes])
+        return
+    for each in outcomes:
+        names = f": {', '.join(each.changed)}" if each.changed else ""
+        write(f"{each.protocol}: {each.runs} runs scored, {len(each.changed)} with other errors than stored{names}")
+    for reason in outcomes[0].unreadable if outcomes else ():
+        complain(f"unreadable: {reason}")
+
+
 def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
     """What is known of a run, by name; empty values are not shown."""
     from dynslam_bench.core.toml import assignments
@@ -94,6 +121,7 @@ def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
     return {
         "run": record.run_id,
         "folder": store.folder(record.run_id),
+        "identity": "" if record.verified else "unverified: its id does not tell the contents of data and code",
         "status": record.status,
         "reason": record.reason,
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",

@@ -215,13 +215,25 @@ def test_resuming_something_else_is_refused_with_the_difference(sequences: list[
     assert len(more.study.get_trials()) == 3, "more trials of the same study are welcome"
 
 
+def test_a_study_does_not_go_on_after_its_data_changed(tmp_path: Path) -> None:
+    folders = [str(toy_tracker.make_sequence(tmp_path / f"s{i}", 0.8 * i)) for i in range(3)]
+    spec = make(folders, trials=2)
+    run_study(spec, results=tmp_path / "r")
+    truth = Path(folders[1]) / "groundtruth.txt"
+    lines = truth.read_text().splitlines()
+    truth.write_text("\n".join([*lines[:-1], lines[-1].replace(" 0.0", " 0.1", 1).replace(" 0 ", " 0.1 ", 1)]) + "\n")
+    with pytest.raises(StudyError, match=r"stored with other data: the content of \S*s1 is not what it was"):
+        run_study(make(folders, trials=3), results=tmp_path / "r")
+    assert len(Tuner(spec, tmp_path / "r", reading=True).study.get_trials()) == 2
+
+
 def test_a_study_of_older_code_can_be_read_but_not_continued(
     sequences: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = make(sequences, trials=2)
     run_study(spec, results=tmp_path)
-    monkeypatch.setattr("dynslam_bench.tuning.study.source_fingerprint", lambda *_: "newer")
-    with pytest.raises(StudyError, match="stored with other source"):
+    monkeypatch.setattr("dynslam_bench.runs.identity.source_fingerprint", lambda *_: "newer")
+    with pytest.raises(StudyError, match="stored with other code"):
         Tuner(spec, tmp_path)
     reader = Tuner(spec, tmp_path, reading=True)
     assert len(reader.study.get_trials()) == 2

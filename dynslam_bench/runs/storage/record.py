@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -21,6 +22,14 @@ FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
 LOST_COVERAGE = 0.5
 """A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
+
+
+def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
+    """Code, weights and library versions in a run's identity, by name, as short texts."""
+    code = digest([identity.get(name) for name in _CODE], 8)
+    libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
+    weights = {f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()}
+    return {"code": code} | libraries | weights
 
 
 class TrackerInfo(Record):
@@ -234,11 +243,8 @@ class RunRecord(Record):
     @property
     def program(self) -> dict[str, str]:
         """What made the run beside its settings: code, weights and library versions, by name, as short texts."""
-        identity = self.identity
-        made = {"code": digest([identity.get(name) for name in _CODE], 8)} if self.kind == "run" else {}
-        libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
-        weights = {f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()}
-        return made | libraries | weights | ({} if self.verified else {"identity": "unverified"})
+        made = program_of(self.identity) if self.kind == "run" else {}
+        return made if self.verified else made | {"identity": "unverified"}
 
     @property
     def failed(self) -> bool:

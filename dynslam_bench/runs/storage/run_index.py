@@ -36,7 +36,17 @@ Line = list[Any]
 
 FIELDS = (
     *("run", "tracker", "sequence", "part", "seed", "offset", "noise", "repeat", "settings", "status"),
-    *("ate_rmse_m", "never_move_m", "coverage", "frame_ms", "masks", "seen_in_training", "reason", "started"),
+    *(
+        "ate_rmse_m",
+        "never_move_m",
+        "coverage",
+        "frame_ms",
+        "masks",
+        "seen_in_training",
+        "identity",
+        "reason",
+        "started",
+    ),
 )
 """Names of a row's values, in order; the values of a line, before which it has its stamps."""
 _LINES: TypeAdapter[list[Line]] = TypeAdapter(list[Line])
@@ -78,6 +88,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "masks": record.segmentation,
         "seen_in_training": seen_in_training(record.segmentation, record.sequence.id),
+        "identity": "" if record.verified else "unverified",
         "reason": record.reason or _not_scored(record, metrics),
         "started": record.started,
     }

@@ -287,21 +287,26 @@ class RunStore:
         raise RunError(f"there is no run '{prefix}'", hint)
 
     def metrics(self, record: RunRecord, protocol: Protocol) -> MetricRecord | None:
-        """A run's stored metrics under a protocol; None if it was not scored under it, or they are damaged.
+        """A run's stored metrics under a protocol; None if it was not scored under it, or they are out of date.
 
-        Metrics hold for one version of the evaluation code and one content of the trajectories and the ground truth;
-        they count as missing where either has changed since.
+        Metrics hold for one version of the evaluation code and one content of the trajectories and the ground truth.
         """
-        path = self.metric_file(record.run_id, protocol.digest())
+        found = self.stored_metrics(record.run_id, protocol)
+        if found is None or (found.code, found.inputs) != (evaluation_code(), self._inputs(record)):
+            return None
+        return found
+
+    def stored_metrics(self, run_id: str, protocol: Protocol) -> MetricRecord | None:
+        """A run's metrics under a protocol as they are stored, maybe out of date; None without valid ones."""
+        path = self.metric_file(run_id, protocol.digest())
         if not path.is_file():
             return None
         try:
             found = MetricRecord.read(path)
         except DynslamError as error:
-            LOGGER.warning("run %s is scored again: %s", record.run_id, error)
+            LOGGER.warning("run %s is scored again: %s", run_id, error)
             return None
-        wanted = (record.run_id, protocol.digest(), evaluation_code(), self._inputs(record))
-        return found if (found.run_id, found.protocol_digest, found.code, found.inputs) == wanted else None
+        return found if (found.run_id, found.protocol_digest) == (run_id, protocol.digest()) else None
 
     def _inputs(self, record: RunRecord) -> str:
         """Digest of everything that a run's metrics are computed from."""
