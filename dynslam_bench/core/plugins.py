@@ -119,7 +119,7 @@ class Registry(Generic[P]):
             except Exception as error:  # a foreign plug-in may raise anything; the reason is kept
                 self._failures.append(Failure(source, _reason(error)))
                 return
-            if spec.id in found and found[spec.id].spec != spec:
+            if spec.id in found:
                 self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {found[spec.id].source}"))
                 return
             found[spec.id] = Found(spec, source)

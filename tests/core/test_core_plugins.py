@@ -157,7 +157,7 @@ def test_entry_points_of_installed_distributions(tmp_path, monkeypatch):
     assert trackers.get("from-dist").id == "from-dist"
 
 
-def test_order_environment_before_entry_points_before_built_in(tmp_path, monkeypatch):
+def test_order_built_in_before_environment_before_entry_points(tmp_path, monkeypatch):
     (tmp_path / "order_env.py").write_text(SPEC_SOURCE.format(id="same"))
     (tmp_path / "order_dist.py").write_text(
         "from tests_plugin_contract import Spec\nSPEC = Spec('same')\nBUILT_IN = Spec('never-move', 'a:b')\n"
@@ -170,10 +170,10 @@ def test_order_environment_before_entry_points_before_built_in(tmp_path, monkeyp
     trackers = registry()
     sources = {found.spec.id: found.source for found in trackers.all()}
     assert sources["same"].startswith(ENVIRONMENT_VARIABLE)
-    assert sources["never-move"] == "entry point 'never' of order-dist"
+    assert sources["never-move"] == "built in"
     taken = {failure.source: failure.reason for failure in trackers.failures()}
     assert (
         "id 'same' is already taken by DYNSLAM_BENCH_PLUGINS: order_env:SPEC"
         in taken["entry point 'same' of order-dist"]
     )
-    assert "already taken by entry point 'never' of order-dist" in taken["built in"]
+    assert "id 'never-move' is already taken by built in" in taken["entry point 'never' of order-dist"]
