@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -136,9 +137,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.device = resolve_device(device)
         self._threads = threads
         self._cache = str(stage_cache_folder()) if cache else None
-        self._open: Callable[[str | FrameSequence], FrameSequence] = lambda name: open_frames(
-            name, data_root, camera, frames, stride, preprocessing_of(self.settings)
-        )
+        self._part = (data_root, camera, frames, stride)
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
         self._tracker_key: object = None
@@ -243,8 +242,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             TrackerError: The tracker broke its contract.
         """
         tracker = self._running_tracker()
+        settings = self._actions.settings(action)
         if self._actions.parameters:
-            tracker.configure(self._actions.settings(action))  # type: ignore[attr-defined]
+            tracker.configure(settings)  # type: ignore[attr-defined]
         self._track_next(tracker)
         reward = self.episode.outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
@@ -311,6 +311,28 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if close is not None:
             close()
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> SlamEnv:
+        """The environment at the same frame of its episode, with a tracker of its own: both go on alike, apart.
+
+        What nobody writes to is shared: the sequence, the specs and the settings.
+
+        Raises:
+            TrackerError: The tracker cannot be copied, as a program of its own cannot.
+        """
+        for name in ("sequence", "_source", "tracker_spec", "protocol", "settings"):
+            memo[id(vars(self)[name])] = vars(self)[name]
+        copied = memo[id(self)] = object.__new__(type(self))
+        try:
+            tracker = deepcopy(self._tracker, memo)
+        except Exception as error:
+            raise TrackerError(
+                f"tracker '{self.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
+                "make a second environment, or give the tracker a __deepcopy__",
+            ) from error
+        rest = {name: value for name, value in vars(self).items() if name not in ("_tracker", "_canvas")}
+        vars(copied).update(deepcopy(rest, memo), _tracker=tracker, _canvas=None)
+        return copied
+
     # -- inside ----------------------------------------------------------------------------------------------------
 
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
@@ -327,7 +349,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._actions = ActionMap(self.settings, self._control)
 
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
-        opened = self._open(sequence)
+        opened = open_frames(sequence, *self._part, preprocessing_of(self.settings))
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)
