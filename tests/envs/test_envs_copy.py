@@ -15,6 +15,7 @@ from envs_toys import TARGET, ToySequence
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.envs import DegradeFrames, SlamEnv
 from dynslam_bench.testing import CornerSequence
+from dynslam_bench.trackers.adapters.opencv_odometry import unavailable
 
 STILL = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
 PROGRAM = f"""
@@ -94,6 +95,13 @@ def test_built_in_trackers_go_on_to_the_bit(tracker: str) -> None:
     assert twin.episode.tracked == 6  # type: ignore[attr-defined]
     finals = [each.unwrapped.final_trajectory() for each in (env, twin)]  # type: ignore[attr-defined]
     assert tracker == "never-move" or np.array_equal(finals[0].T_world_cam, finals[1].T_world_cam)
+
+
+def test_a_frame_to_frame_odometry_goes_on_to_the_bit() -> None:
+    if reason := unavailable():
+        pytest.skip(reason)
+    env = started(SlamEnv(CornerSequence(6), "opencv-odometry"), 2)
+    check_alike(env, copy.deepcopy(env))
 
 
 def test_a_program_is_refused_and_stays_usable(tmp_path: Path) -> None:
