@@ -225,7 +225,7 @@ def _order_sequences(board: Board) -> None:
     for row in board.rows:
         rows.setdefault(board.sequence(row), []).append(row)
     for name, found in rows.items():
-        still = [row.never_move_m for row in found if row.never_move_m is not None]
+        still = [row.static_camera_ate_rmse_m for row in found if row.static_camera_ate_rmse_m is not None]
         if still:
             board.never_move[name] = median(still)
         else:

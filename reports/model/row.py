@@ -57,7 +57,7 @@ class RunRow(Record):
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
         held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
-        never_move_m: What a camera that does not move scores there; None without ground truth.
+        static_camera_ate_rmse_m: What a camera that does not move scores there; None without ground truth.
         n_frames: Input frames.
         n_processed: Frames that the tracker saw before it ended.
         n_tracked: Frames that were tracked.
@@ -114,7 +114,7 @@ class RunRow(Record):
     final_metrics: dict[str, float] = Field(default_factory=dict)
     rotation_uncertainty_deg: float | None = None
     held_ate_m: float | None = None
-    never_move_m: float | None = None
+    static_camera_ate_rmse_m: float | None = None
     n_frames: int = 0
     n_processed: int = 0
     n_tracked: int = 0
@@ -169,7 +169,8 @@ class RunRow(Record):
         A failure whose held trajectory is even further off than a camera that never moves keeps that error.
         """
         if self.failed:
-            return None if self.never_move_m is None else max(self.never_move_m, self.held_ate_m or 0.0)
+            static_m = self.static_camera_ate_rmse_m
+            return None if static_m is None else max(static_m, self.held_ate_m or 0.0)
         return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
 
     @property

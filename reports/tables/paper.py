@@ -81,7 +81,8 @@ def time_table(board: Board) -> Table | None:
 
 def _share(row: RunRow) -> float | None:
     """A run's error in percent of that of a camera that never moves."""
-    return None if not row.never_move_m or row.held_ate_m is None else 100 * row.held_ate_m / row.never_move_m
+    static_m = row.static_camera_ate_rmse_m
+    return None if not static_m or row.held_ate_m is None else 100 * row.held_ate_m / static_m
 
 
 def _statistics_table(

@@ -125,8 +125,8 @@ def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [["slam", "--token", "--threads", "2"], ["slam", "--tokenizer", "bert"], ["--keyframes", "3"], ["a token b"],
-              ["segmentation.source=plugin:token", "x"], ["--max-tokens", "5"], ["slam --token", "x"]],
+    "words", [["slam", "--token", "--threads", "2"], ["slam", "--tokenizer", "bert"], ["--keyframes", "3"],
+              ["a token b"], ["segmentation.source=plugin:token", "x"], ["--max-tokens", "5"], ["slam --token", "x"]],
 )  # fmt: skip
 def test_words_that_are_no_secrets_stay(words: list[str]) -> None:
     kept = words_without_passwords(words)

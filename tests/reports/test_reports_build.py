@@ -132,7 +132,7 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert failed["reason"] == "RuntimeError: the map is empty"
     runs = {row["run_id"]: row for row in rows_of(paths.csv["runs"])}
     row = runs[failed["run"]]
-    assert float(row["score_m"]) == float(row["never_move_m"]) != float(row["ate_rmse_m"])
+    assert float(row["score_m"]) == float(row["static_camera_ate_rmse_m"]) != float(row["ate_rmse_m"])
     text = paths.html.read_text()
     assert f'href="run.html#{failed["run"]}"' in text
     page = handed(paths.html.parent / "data" / f"run-{failed['run']}.js")
@@ -319,7 +319,7 @@ def test_published_numbers_stand_apart_and_never_compete(tmp_path):
 
 def row(**changes):
     base = dict(run_id="r", kind="run here", tracker="a", label="A", sequence="s", protocol_id="p", protocol_digest="d",
-                metrics={"ate_rmse_m": 0.1}, never_move_m=0.5)  # fmt: skip
+                metrics={"ate_rmse_m": 0.1}, static_camera_ate_rmse_m=0.5)  # fmt: skip
     return RunRow(**(base | changes))
 
 
@@ -327,7 +327,7 @@ def test_scores_impute_failures_only():
     assert row().score_m == 0.1
     assert row(failed=True).score_m == 0.5
     assert row(failed=True, metrics={}).score_m == 0.5
-    assert row(metrics={}, never_move_m=None).score_m is None
+    assert row(metrics={}, static_camera_ate_rmse_m=None).score_m is None
 
 
 def test_trackers_that_lack_sequences_are_shown_but_not_ranked():

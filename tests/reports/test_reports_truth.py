@@ -48,7 +48,7 @@ def test_a_failure_never_scores_better_than_not_moving():
     assert crashed().score_m == 0.3
     assert crashed(held_ate_m=0.7).score_m == 0.7
     assert crashed(held_ate_m=None, metrics={}).score_m == 0.3
-    assert crashed(never_move_m=None).score_m is None
+    assert crashed(static_camera_ate_rmse_m=None).score_m is None
 
 
 def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised():
@@ -327,7 +327,7 @@ def test_bold_is_not_given_to_most():
     apart = [row(name, s, error * (1 + 0.02 * at)) for name, error in (("a", 0.01), ("b", 0.1), ("c", 1.0))
              for at, s in enumerate(names)]  # fmt: skip
     near = [row(f"n{k}", s, 0.1 * (1 + 0.4 * ((at * 7 + k * 5) % 4))) for k in range(3) for at, s in enumerate(names)]
-    far = [row("far", s, 50.0 + at, never_move_m=99.0) for at, s in enumerate(names)]
+    far = [row("far", s, 50.0 + at, static_camera_ate_rmse_m=99.0) for at, s in enumerate(names)]
 
     def bold(rows):
         table = leaderboard(make_board(rows, reference=rows[0].tracker), PROTOCOL)
