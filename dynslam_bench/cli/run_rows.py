@@ -70,6 +70,10 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
     columns = [(title, [row[name] for row in rows]) for name, title in names.items()]
     write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
+    pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in rows]
+    worse = sum(static is not None and error is not None and error > (1 + 1e-9) * static for error, static in pairs)
+    if worse:
+        write(f"{worse} of {len(rows)} runs are worse than a static camera.")
     if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
         write("ATE: of the tracked frames alone; static camera: of all. A report holds lost frames at the last pose.")
 

@@ -57,7 +57,7 @@ class RunRow(Record):
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
         held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
-        static_camera_ate_rmse_m: What a camera that does not move scores there; None without ground truth.
+        static_camera_ate_rmse_m: What a static camera scores there; None without ground truth.
         n_frames: Input frames.
         n_processed: Frames that the tracker saw before it ended.
         n_tracked: Frames that were tracked.
@@ -164,9 +164,9 @@ class RunRow(Record):
 
     @property
     def score_m(self) -> float | None:
-        """The ATE that ranks: lost frames held; a failure counts as never moving or worse; None without ground truth.
+        """The ATE that ranks: lost frames held, failures as a static camera or worse; None without ground truth.
 
-        A failure whose held trajectory is even further off than a camera that never moves keeps that error.
+        A failure whose held trajectory is even further off than a static camera keeps that error.
         """
         if self.failed:
             static_m = self.static_camera_ate_rmse_m

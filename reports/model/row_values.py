@@ -42,7 +42,7 @@ def _short(value: object) -> str:
 def never_move_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> float | None:
-    """What a camera that does not move scores under the protocol's alignment; None without ground truth."""
+    """What a static camera scores under the protocol's alignment; None without ground truth."""
     if evaluation is not None and "static_camera_ate_rmse_m" in evaluation.metrics:
         return evaluation.metrics["static_camera_ate_rmse_m"]
     try:
@@ -61,7 +61,7 @@ def held_error(
     """The ATE with every lost frame counted as not having moved since the last tracked one; None without evaluation.
 
     Where the poses cannot be held, since they belong to no input frames, a trajectory with lost frames counts at least
-    as a camera that never moves (`still`).
+    as a static camera (`still`).
     """
     if evaluation is None:
         return None

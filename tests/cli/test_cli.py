@@ -156,7 +156,7 @@ def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
     code, out, err = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
     assert code == 0 and all(line.endswith(" s so far") for line in err.splitlines())  # quiet in pipes
     shown = [re.split(r"\s{2,}", line)[3:6] for line in out.splitlines()]
-    assert shown == [["part", "repeat", "status"], ["0:3", "seed 0", "ok"], ["0:3", "seed 1", "ok"]]
+    assert shown == [["frames", "repeat", "status"], ["0:3", "seed 0", "ok"], ["0:3", "seed 1", "ok"]]
     runs = json.loads(cli("runs", "list", "--json")[1])
     assert [(run["tracker"], run["seed"], run["coverage"]) for run in runs] == [
         ("never-move", 0, 1.0),

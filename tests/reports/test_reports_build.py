@@ -140,7 +140,7 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     markdown = paths.markdown.read_text()
     assert "2/3 succeeded" in markdown
     assert "(3 unless n says otherwise)" in markdown
-    assert "counts as a camera that never moves, or worse (1 of 61 runs)" in markdown
+    assert "counts as a static camera, or worse (1 of 61 runs)" in markdown
 
 
 def test_captions_carry_the_protocol_and_the_power_note(made):
@@ -199,8 +199,8 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     with pytest.raises(ReportError, match=r"no run of the reference 'orb-slam4' \(did you mean 'orb-slam3'"):
         build_report(store, tmp_path, reference="orb-slam4")
     paths = build_report(store, tmp_path, reference="orb-slam3")
-    assert "never move (from the ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
-    assert ReportData.read(paths.data).reference == "never move (from the ground truth)"
+    assert "static camera (from ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
+    assert ReportData.read(paths.data).reference == "static camera (from ground truth)"
     board = rows_of(paths.csv["leaderboard"])
     assert float(board[0]["ATE ratio"]) < 0.2
 
