@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -29,6 +28,7 @@ from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_set
 
 from .arguments import RENDER_MODES, check_arguments
 from .control import ActionMap
+from .copying import deep_copy
 from .device import resolve_device
 from .episode import Episode, FrameOutcome
 from .info import frame_info
@@ -311,27 +311,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if close is not None:
             close()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> SlamEnv:
-        """The environment at the same frame of its episode, with a tracker of its own: both go on alike, apart.
-
-        What nobody writes to is shared: the sequence, the specs and the settings.
-
-        Raises:
-            TrackerError: The tracker cannot be copied, as a program of its own cannot.
-        """
-        for name in ("sequence", "_source", "tracker_spec", "protocol", "settings"):
-            memo[id(vars(self)[name])] = vars(self)[name]
-        copied = memo[id(self)] = object.__new__(type(self))
-        try:
-            tracker = deepcopy(self._tracker, memo)
-        except Exception as error:
-            raise TrackerError(
-                f"tracker '{self.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
-                "make a second environment, or give the tracker a __deepcopy__",
-            ) from error
-        rest = {name: value for name, value in vars(self).items() if name not in ("_tracker", "_canvas")}
-        vars(copied).update(deepcopy(rest, memo), _tracker=tracker, _canvas=None)
-        return copied
+    __deepcopy__ = deep_copy
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
