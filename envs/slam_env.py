@@ -45,8 +45,6 @@ from .one_frame import FrameTransform, track_one
 from .reward import RewardKind, reward_named
 from .source import Frames, check_frames, check_same_size, open_frames, preprocessing_of
 
-Array = NDArray[np.float64]
-
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
     """Visual SLAM on one sequence as an environment.
