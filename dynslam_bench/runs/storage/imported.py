@@ -66,8 +66,7 @@ def import_trajectory(
         topic: Of a bag with several topics of poses, the one to take.
 
     Returns:
-        The record. Poses whose stamps are no input frame's are kept, and said so in its notes. One that covers as few
-        frames as a lost run does, or ends as early, has the status ``lost``, as runs have (`judge_coverage`).
+        The record, ``lost`` by the rule of runs (`judge_coverage`); its notes count poses whose stamps are no frame's.
 
     Raises:
         DynslamError: The trajectory cannot be read.
@@ -90,8 +89,7 @@ def import_trajectory(
     }
     asked["status"], asked["reason"] = judge_coverage(covered, len(opened), len(opened) - 1 - last, len(opened))
     record = _record(_identity(file, tracker, which, opened, timestamps, topic), opened, covered, asked)
-    store = results if isinstance(results, RunStore) else RunStore(results)
-    _keep(store, record, opened, loaded.trajectory, which)
+    _keep(results if isinstance(results, RunStore) else RunStore(results), record, opened, loaded.trajectory, which)
     return record
 
 
