@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import SettingsError, did_you_mean
 from dynslam_bench.core.settings import Parameter, Scalar, Settings, apply_overrides, flatten, parameters, value_of
 from dynslam_bench.core.steering import why_idle
+
+_ONLY = spaces.Discrete(1)
+"""The action space without steered settings; for membership alone, since each environment seeds its own."""
 
 
 class ActionMap:
@@ -64,18 +68,28 @@ class ActionMap:
         """The settings that an action asks for.
 
         Args:
-            action: float ``[k]``; values beyond [-1, 1] are clipped.
+            action: float ``[k]``; values beyond [-1, 1] are clipped. Without steered settings 0.
 
         Raises:
-            SettingsError: The action has the wrong shape or holds NaN.
+            SettingsError: The action is none of the space: not 0, of another shape, no numbers, or NaN.
         """
         if not self.parameters:
+            if not _ONLY.contains(action):
+                raise SettingsError(
+                    f"the action {reprlib.repr(action)} is not in {_ONLY}",
+                    "without control the only action is 0; name settings in control to change them",
+                )
             return self.base
         return apply_overrides(self.base, self.values(action))
 
     def values(self, action: object) -> dict[str, Scalar]:
         """Dotted name to value of the steered settings under an action."""
-        vector = np.asarray(action, dtype=np.float64)
+        try:
+            vector = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SettingsError(
+                f"the action {reprlib.repr(action)} holds no numbers", f"one in [-1, 1] for each of {self.names}"
+            ) from None
         if vector.shape != (len(self.parameters),):
             raise SettingsError(
                 f"the action has shape {vector.shape}, {len(self.parameters)} settings are steered: {self.names}"

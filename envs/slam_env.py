@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -28,6 +28,7 @@ from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_set
 
 from .arguments import RENDER_MODES, check_arguments
 from .control import ActionMap
+from .copying import deep_copy
 from .device import resolve_device
 from .episode import Episode, FrameOutcome
 from .info import frame_info
@@ -43,8 +44,6 @@ from .observation import (
 from .one_frame import FrameTransform, track_one
 from .reward import RewardKind, reward_named
 from .source import Frames, check_frames, check_same_size, open_frames, preprocessing_of
-
-Array = NDArray[np.float64]
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -136,9 +135,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.device = resolve_device(device)
         self._threads = threads
         self._cache = str(stage_cache_folder()) if cache else None
-        self._open: Callable[[str | FrameSequence], FrameSequence] = lambda name: open_frames(
-            name, data_root, camera, frames, stride, preprocessing_of(self.settings)
-        )
+        self._part = (data_root, camera, frames, stride)
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
         self._tracker_key: object = None
@@ -243,8 +240,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             TrackerError: The tracker broke its contract.
         """
         tracker = self._running_tracker()
+        settings = self._actions.settings(action)
         if self._actions.parameters:
-            tracker.configure(self._actions.settings(action))  # type: ignore[attr-defined]
+            tracker.configure(settings)  # type: ignore[attr-defined]
         self._track_next(tracker)
         reward = self.episode.outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
@@ -311,6 +309,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if close is not None:
             close()
 
+    __deepcopy__ = deep_copy
+
     # -- inside ----------------------------------------------------------------------------------------------------
 
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
@@ -327,7 +327,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._actions = ActionMap(self.settings, self._control)
 
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
-        opened = self._open(sequence)
+        opened = open_frames(sequence, *self._part, preprocessing_of(self.settings))
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)

@@ -1,7 +1,7 @@
 """An audit of the paper's own Tables 1 to 3: what can be true of them by arithmetic alone.
 
 Nothing is run. The printed numbers are held against identities that every such table obeys, against the numbers that
-the compared systems' authors published, and against a camera that never moves.
+the compared systems' authors published, and against a static camera.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ CHECKS = {
     "rmse-identity": "RMSE² = mean² + StD² (population standard deviation), within rounding",
     "rmse-at-least-mean": "RMSE >= mean: the opposite is impossible",
     "improvement": "improvement rows are 100 (baseline - ours) / baseline",
-    "better-than-not-moving": "the error is smaller than that of a camera that never moves",
+    "better-than-not-moving": "the error is smaller than that of a static camera",
     "published": "within a factor of two of what the system's authors and others published",
     "accuracy": "accuracy is 100 - error, and error is something else than 100 times the APE's StD in metres",
     "time": "a method with Mask R-CNN takes at least the published time of Mask R-CNN",

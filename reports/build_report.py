@@ -81,7 +81,7 @@ def build_report(
         output: Folder of the report; files in it that the report does not make are left alone.
         protocol: How to evaluate.
         reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Where it was not
-            run on every ranked sequence, a camera that never moves takes its place.
+            run on every ranked sequence, a static camera takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         trials: Whether the trials of studies count like other runs; without, they are left out and counted.

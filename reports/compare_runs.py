@@ -102,7 +102,7 @@ def _caption(protocol: str, differences: Mapping[str, list[str]]) -> str:
     changed = [f"{name}: {', '.join(words)}" for name, words in differences.items() if words]
     return (
         f"{protocol}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
-        "share none; failures count as a camera that never moves, or worse. B / A below 1: B is better. Brackets: "
+        "share none; failures count as a static camera, or worse. B / A below 1: B is better. Brackets: "
         f"Student's 95 % interval over sequences, from {FEWEST} of them on."
     ) + (f" What differs: {'; '.join(changed)}." if changed else " The settings are the same.")
 

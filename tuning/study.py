@@ -20,7 +20,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.harmless import storable
-from dynslam_bench.core.passwords import without_passwords
+from dynslam_bench.core.passwords import words_without_passwords
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.settings import apply_overrides, flatten
 from dynslam_bench.runs import RunEvent, RunStore
@@ -342,7 +342,7 @@ class Tuner:
     def _begin(self, study: optuna.Study) -> None:
         """What a new study begins with; the identity comes last, others wait for it."""
         study.set_user_attr("spec", self.spec.for_others())
-        study.set_user_attr("command", [without_passwords(word) for word in storable(sys.argv)])
+        study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             study.set_metric_names(list(self.spec.objectives))

@@ -11,9 +11,15 @@ def main() -> None:
     Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed or were lost (or could not
     write the map that was asked for), 4 verification failed, 128 and the signal's number after one (130 for Ctrl-C).
     """
+    import sys
+    from io import TextIOWrapper
+
     from .ending import leave_interrupted, watch_signals
 
     watch_signals()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a terminal of another encoding shows ? in place of what it lacks
+            stream.reconfigure(errors="replace")
     try:
         from .app import start
 

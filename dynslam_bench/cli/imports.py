@@ -10,7 +10,7 @@ import typer
 from . import completion
 from .options import TRAJECTORY_FORMATS as FORMATS
 from .options import AsJson, Camera, DataRoot, Frames, ProtocolId, Results, Stride, Timestamps
-from .output import complain, write, write_json
+from .output import SOME_RUNS_FAILED, complain, write, write_json
 from .panels import MEASURE
 from .run_rows import show_runs
 
@@ -62,6 +62,8 @@ def import_(
         topic=topic,
     )
     show_runs([record], store, protocol, as_json=as_json)
+    if record.status == "lost":
+        raise typer.Exit(SOME_RUNS_FAILED)
 
 
 def export(

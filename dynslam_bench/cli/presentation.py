@@ -39,7 +39,7 @@ def make(
     protocol: ProtocolId = "tum-rgbd/v1",
     reference: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Tracker that errors are divided by; default orb-slam2, else a camera that never moves."),
+        typer.Option(help="Tracker that errors are divided by; default orb-slam2, else a static camera."),
     ] = None,
     on: Annotated[
         str,
@@ -160,7 +160,7 @@ def audit_paper(
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Markdown file.")] = None,  # noqa: UP045
     as_json: AsJson = False,
 ) -> None:
-    """Hold the numbers that the paper prints against arithmetic, and against a camera that never moves."""
+    """Hold the numbers that the paper prints against arithmetic, and against a static camera."""
     from dataclasses import asdict
 
     from dynslam_bench.core.folders import find_data_root

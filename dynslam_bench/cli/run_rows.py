@@ -13,27 +13,38 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.storage.run_index import Row
 
 TITLES = {
-    "run": "run",
+    "run_id": "run",
     "tracker": "tracker",
     "sequence": "sequence",
-    "part": "part",
+    "frames": "frames",
     "repeat": "repeat",
     "status": "status",
     "ate_rmse_m": "ATE (m)",
-    "never_move_m": "not moving (m)",
+    "static_camera_ate_rmse_m": "static camera (m)",
     "coverage": "coverage",
     "frame_ms": "ms/frame",
 }
 """Columns of the table."""
 WHERE_SAID = {
-    "masks": "masks",
+    "segmentation": "masks",
+    "study": "study",
     "from_store": "from the store",
     "settings": "settings",
     "identity": "identity",
     "reason": "reason",
 }
 """Columns that are there only if a run has something to say in them."""
-SPARE = ("not moving (m)", "masks", "repeat", "coverage", "settings", "ms/frame", "part", "from the store")
+SPARE = (
+    "static camera (m)",
+    "masks",
+    "repeat",
+    "coverage",
+    "settings",
+    "ms/frame",
+    "frames",
+    "study",
+    "from the store",
+)
 """Columns that give way on a narrow terminal, the first one first."""
 LONG_WAY_M = 20.0
 """A way along which drift may have come in that only a closed loop gives back (docs/backend.md, Loops)."""
@@ -53,15 +64,19 @@ def show_runs(
 def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: bool) -> None:
     """The same of rows that `list_runs` gave."""
     if as_json:
-        places = ({"protocol": protocol, "folder": str(store.folder(row["run"]))} for row in rows)
+        places = ({"protocol": protocol, "folder": str(store.folder(row["run_id"]))} for row in rows)
         write_json([row | place for row, place in zip(rows, places, strict=True)])
         return
-    names = {name: title for name, title in TITLES.items() if name != "part" or any(row["part"] for row in rows)}
+    names = {name: title for name, title in TITLES.items() if name != "frames" or any(row["frames"] for row in rows)}
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
     columns = [(title, [row[name] for row in rows]) for name, title in names.items()]
     write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
+    pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in rows]
+    worse = sum(static is not None and error is not None and error > (1 + 1e-9) * static for error, static in pairs)
+    if worse:
+        write(f"{worse} of {len(rows)} runs are worse than a static camera.")
     if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
-        write("ATE: of the tracked frames alone; not moving: of all. A report counts a lost frame as not having moved.")
+        write("ATE: of the tracked frames alone; static camera: of all. A report holds lost frames at the last pose.")
 
 
 def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> set[str]:

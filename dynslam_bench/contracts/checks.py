@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
@@ -90,7 +91,7 @@ def trajectory_faults(trajectory: object) -> Iterator[Fault]:
 
 
 def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
-    """The result, if it has no faults; statistics that are not finite are left out.
+    """The result, if it has no faults; its pose in float64, without statistics that are not finite.
 
     Args:
         result: What ``track`` returned.
@@ -105,7 +106,8 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
         raise TrackerContractError(f"{where} returned {fault.found}", fault.cause)
     assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
-    return replace(result, stats=stats)
+    pose = None if result.T_world_cam is None else np.asarray(result.T_world_cam, dtype=np.float64)
+    return replace(result, stats=stats, T_world_cam=pose)
 
 
 def check_sensors(spec: TrackerSpec, sequence: Sequence) -> None:
@@ -137,17 +139,27 @@ def _pose_faults(pose: object) -> Iterator[Fault]:
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
         found = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
         yield Fault(f"{found} as pose, expected a 4x4 matrix")
+    elif pose.dtype.kind not in "fiu":
+        yield Fault(f"a pose of the type {pose.dtype}, expected real numbers", "return float64")
     elif not np.isfinite(pose).all():
         bad = int(np.count_nonzero(~np.isfinite(pose)))
         yield Fault(f"a pose with {bad} values that are not finite", "a solver diverged; say 'lost' instead")
     elif (far := float(np.abs(pose).max())) > FARTHEST_M:
         yield Fault(f"a pose {far:.3g} m away", "a solver diverged; say 'lost' instead")
-    elif not se3.is_pose(pose):
-        rotation = pose[:3, :3]
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        sizes = f"|R R^T - I| = {off:.2g}, det R = {float(np.linalg.det(rotation)):.4g}"
+    elif pose.dtype == np.float16:
+        step_mm = 1000 * float(np.spacing(np.abs(pose[:3, 3]).max()))
+        rounded = f"{_rotation_words(pose)}, positions to {step_mm:.2g} mm"
+        yield Fault(f"a pose in float16, which is too coarse: {rounded}", "return float64, or float32")
+    elif not se3.is_pose(pose.astype(np.float64)):
         cause = "the rotation drifted from orthonormal, or world-to-camera scale is mixed in"
-        yield Fault(f"a pose that is no rigid transformation: {sizes}", cause)
+        yield Fault(f"a pose that is no rigid transformation: {_rotation_words(pose)}", cause)
+
+
+def _rotation_words(pose: NDArray[np.generic]) -> str:
+    """How far a rotation is from orthonormal."""
+    rotation = pose[:3, :3].astype(np.float64)
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    return f"|R R^T - I| = {off:.2g}, det R = {float(np.linalg.det(rotation)):.4g}"
 
 
 def _is_number(value: object) -> bool:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from .errors import DynslamError
 from .files import atomic_folder, write_atomic
 from .harmless import storable
-from .passwords import without_passwords
+from .passwords import json_without_passwords
 from .reading import RECORD_BYTES, read_text
 
 __all__ = ["Digest", "Record", "atomic_folder", "digest", "schema", "write_atomic"]
@@ -47,7 +47,7 @@ class Record(BaseModel):
             text = self.model_dump_json(indent=indent)
         except ValueError:  # half characters, e.g. of a foreign command line
             text = type(self).model_validate(storable(self.model_dump())).model_dump_json(indent=indent)
-        return without_passwords(text)
+        return json_without_passwords(text)
 
     @classmethod
     def read(cls: type[R], path: Path) -> R:

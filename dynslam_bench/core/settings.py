@@ -191,20 +191,21 @@ def apply_overrides(settings: S, overrides: Mapping[str, Any]) -> S:
 
     Args:
         settings: The settings to start from.
-        overrides: Dotted name to value; strings are parsed by the field's type (``"0.5"``, ``"true"``, ``"[1,2]"``).
+        overrides: Dotted name to value. Text is parsed by the field's type: ``"0.5"``, ``"true"`` and ``"[1,2]"`` for
+            numbers, booleans and lists, as on the command line; a field of text takes it as it is.
 
     Raises:
         SettingsError: Unknown name (with a did-you-mean), or a value that does not fit.
     """
     values = settings.model_dump()
-    known = set(field_names(type(settings)))
+    known = {name: field for name, field, _ in _leaves(type(settings))}
     for name, value in overrides.items():
         node, *rest = _walk(values, name.split("."))
         if name not in known or rest:
             if any(field.startswith(f"{name}.") for field in known):
                 raise SettingsError(f"setting '{name}' is a group", f"set one of {name}.*")
             raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, known))
-        node[name.split(".")[-1]] = _parse(value)
+        node[name.split(".")[-1]] = _parse(value, known[name].annotation)
     return build(type(settings), values)
 
 
@@ -358,9 +359,14 @@ def value_of(settings: Settings, name: str) -> Any:
     return node
 
 
-def _parse(value: Any) -> Any:
-    """Strings of the command line become JSON values where they are; everything else stays as it is."""
+def _parse(value: Any, annotation: Any) -> Any:
+    """A text becomes the JSON value that it spells, unless the field takes the text itself; all else stays as it is."""
     if not isinstance(value, str):
+        return value
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    kinds = typing.get_args(annotation) if is_union else (annotation,)
+    texts = [choice for kind in kinds if typing.get_origin(kind) is Literal for choice in typing.get_args(kind)]
+    if (str in kinds or Path in kinds or value in texts) and not (value == "null" and type(None) in kinds):
         return value
     try:
         return json.loads(value)

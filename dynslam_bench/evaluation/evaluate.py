@@ -70,7 +70,7 @@ class Evaluation(Record):
         protocol: Its one-line description.
         metrics: Plain floats. Absolute errors ``ate_<statistic>_m`` (translation) and ``ape_rot_<statistic>_deg``,
             relative ones ``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg``, KITTI's
-            ``kitti_trans_percent`` and ``kitti_rot_deg_per_m``, and ``never_move_ate_rmse_m``: what a camera that
+            ``kitti_trans_percent`` and ``kitti_rot_deg_per_m``, and ``static_camera_ate_rmse_m``: what a camera that
             does not move scores under the same alignment. The statistics are rmse, mean, median, std, min, max, sse.
         n_pairs: Pairs of poses that the absolute error is taken over.
         n_pairs_rpe: The same for each relative error.
@@ -159,7 +159,7 @@ def evaluate(
     metrics.update(relative)
     if protocol.segments_m:
         metrics.update(segment_metrics(aligned, truth, protocol, diagnostics))
-    metrics["never_move_ate_rmse_m"] = _never_move(ground_truth, association, protocol, input_timestamps)
+    metrics["static_camera_ate_rmse_m"] = _never_move(ground_truth, association, protocol, input_timestamps)
     return Evaluation(
         protocol_id=protocol.id,
         protocol_digest=protocol.digest(),

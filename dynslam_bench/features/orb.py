@@ -8,7 +8,9 @@ intensity centroid and the descriptor the rotated BRIEF of Rublee et al. (2011).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -89,6 +91,12 @@ class OrbExtractor:
         """Put other FAST thresholds into force; a second threshold above the first leaves the second alone in force."""
         self.settings = settings
         self._detector.setThreshold(settings.fast_threshold_min)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> OrbExtractor:
+        """An extractor of the same settings: OpenCV's detectors cannot be copied, and hold nothing of an image."""
+        copied = copy(self)
+        copied._detector = cv2.FastFeatureDetector.create(self._detector.getThreshold(), True)
+        return copied
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +31,10 @@ class DisFlow:
     def __init__(self, settings: FlowSettings | None = None) -> None:
         self.settings = settings or FlowSettings(method="dis")
         self._dis = cv2.DISOpticalFlow.create(_PRESETS[self.settings.dis_preset])
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> DisFlow:
+        """A flow of the same settings: OpenCV's object cannot be copied, and holds nothing of an image."""
+        return copy(self)
 
     def configure(self, settings: FlowSettings) -> None:
         """Put other settings into force from the next call on."""

@@ -241,10 +241,20 @@ def _judge(verdict: Verdict, frames: FrameLog, total: int) -> tuple[Status, str]
         return verdict.status, verdict.reason
     if frames.damage:
         return "invalid", frames.damage
-    due = total - frames.count("dropped")
-    tracked, streak = frames.count("ok"), frames.lost_streak()
+    return judge_coverage(frames.count("ok"), total - frames.count("dropped"), frames.lost_streak(), total)
+
+
+def judge_coverage(tracked: int, due: int, lost_at_end: int, total: int) -> tuple[Status, str]:
+    """Whether a trajectory that came to its end is that of a lost camera, with the reason.
+
+    Args:
+        tracked: Frames with a pose.
+        due: Frames that the tracker was to see.
+        lost_at_end: Frames without a pose after the last one with one.
+        total: All frames.
+    """
     if tracked < LOST_COVERAGE * due:
         return "lost", f"tracked on {tracked} of {due} frames"
-    if streak >= LOST_AT_END:
-        return "lost", f"lost from frame {total - streak} to the end, tracked on {tracked} of {due} frames"
+    if lost_at_end >= LOST_AT_END:
+        return "lost", f"lost from frame {total - lost_at_end} to the end, tracked on {tracked} of {due} frames"
     return "ok", ""

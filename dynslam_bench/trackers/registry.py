@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from hashlib import sha256
@@ -69,8 +68,7 @@ def resolve_settings(spec: TrackerSpec, overrides: Mapping[str, Any] | None = No
     Raises:
         SettingsError: Unknown name, unfit value, or values that do not go together.
     """
-    bound = {name: json.dumps(value) for name, value in spec.bound.items()}  # as text, so that "5" stays a file's name
-    settings = apply_overrides(spec.settings(), {**bound, **(overrides or {})})
+    settings = apply_overrides(spec.settings(), {**spec.bound, **(overrides or {})})
     settings.verify()
     return settings
 

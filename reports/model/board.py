@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from statistics import median
+from statistics import geometric_mean, median
 from typing import TYPE_CHECKING, Literal
 
 from dynslam_bench.core.errors import ReportError
@@ -16,12 +16,12 @@ from .frame import rows_frame
 from .labels import make_labels
 from .row import RunRow
 from .rows import check_one_protocol, check_reference
-from .statistics import Standing, standings
+from .statistics import FLOOR_M, Standing, standings
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NEVER_MOVE = "never move (from the ground truth)"
+NEVER_MOVE = "static camera (from ground truth)"
 DEFAULT_REFERENCE = "orb-slam2"
 On = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
@@ -49,13 +49,15 @@ class Board:
         groups: Sequence to the name of its group.
         unscored: Names of the sequences without ground truth.
         cells: Variant key to sequence to its runs.
-        never_move: Sequence to the error of a camera that does not move.
-        reference: Variant key of the reference; None if ratios are to a camera that never moves.
+        never_move: Sequence to the error of a static camera.
+        reference: Variant key of the reference; None if ratios are to a static camera.
         reference_name: How to call the reference in captions.
         asked_reference: The tracker id that was asked for as the reference; empty for none.
         standings: Standing of every variant with a score on the common sequences, in order.
         ranked: Variant keys that take part in the ranking.
         incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
+        no_better: Variant keys of trackers that are not ranked since they are no better than a static camera: the
+            geometric mean of their errors over its on the common sequences is 1 or more.
         hopeless: Variant keys that never succeeded on the common sequences.
     """
 
@@ -79,6 +81,7 @@ class Board:
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
+    no_better: list[str] = field(default_factory=list)
     hopeless: list[str] = field(default_factory=list)
 
     @cached_property
@@ -101,7 +104,7 @@ class Board:
         return self._by_key[key][0]
 
     def no_better_than_still(self, key: str, sequence: str) -> bool:
-        """Whether a tracker's runs that ended well have, by their median, a camera's error that never moves, or more.
+        """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
 
         Controls make no claim: never.
         """
@@ -109,6 +112,11 @@ class Board:
         if cell is None or still is None or not cell.succeeded or self.first(key).provenance == "control":
             return False
         return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * still
+
+    def static_ratio(self, key: str) -> float:
+        """Geometric mean over the common sequences of a tracker's median error over that of a static camera."""
+        pairs = [(self.cells[key][name].median or 0.0, self.never_move[name]) for name in self.common]
+        return geometric_mean([max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs])
 
     def ranked_order(self) -> list[str]:
         """Ranked trackers from the best to the worst."""
@@ -154,7 +162,7 @@ def make_board(
     Args:
         rows: One a run.
         reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Where it was not
-            run on every ranked sequence, a camera that never moves takes its place.
+            run on every ranked sequence, a static camera takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 
@@ -226,7 +234,7 @@ def _order_sequences(board: Board) -> None:
     for row in board.rows:
         rows.setdefault(board.sequence(row), []).append(row)
     for name, found in rows.items():
-        still = [row.never_move_m for row in found if row.never_move_m is not None]
+        still = [row.static_camera_ate_rmse_m for row in found if row.static_camera_ate_rmse_m is not None]
         if still:
             board.never_move[name] = median(still)
         else:
@@ -244,7 +252,8 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
 
     Trackers with few sequences are left out where that leaves more cells to rank (trackers times sequences), so that
     neither one more sequence of one tracker nor one run of another takes the ranking away from the rest. A tracker
-    without any success is not ranked, nor is one where its network was trained (`Board.competes`).
+    without any success is not ranked, nor is one that is no better than a static camera, nor one where its network was
+    trained (`Board.competes`).
     """
     firsts = {key: board.first(key) for key in scored}
     rankable = [key for key, row in firsts.items() if row.ranked and row.is_current and row.provenance != "control"]
@@ -260,7 +269,9 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     shared = set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
     board.common = [name for name in board.sequences if name in shared]
     board.hopeless = [key for key in scored if not _succeeded(board, key)]
-    board.ranked = [key for key in scored if key in competing and key not in board.hopeless]
+    ended = [key for key in scored if key in competing and key not in board.hopeless]
+    board.no_better = [key for key in ended if board.static_ratio(key) >= 1 - 1e-9]
+    board.ranked = [key for key in ended if key not in board.no_better]
     board.incomplete = [key for key in rankable if key not in competing]
 
 

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _TEXT = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
-_TEXT += ["repeat", "status", "ending", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
+_TEXT += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
 _WHOLE = ["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"]
 _FLAGS = ["ranked", "failed", "cached", "seen_in_training"]
-_NUMBERS = ["coverage", "score_m", "held_ate_m", "final_ate_m", "never_move_m", "frame_ms", "real_time_factor"]
-_NUMBERS += ["peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
+_NUMBERS = ["coverage", "score_m", "held_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"]
+_NUMBERS += ["real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
 _OWN = ("label", "sequence", "settings")
 
 
@@ -36,14 +36,14 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
         One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
         run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
         ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
-        status, ending (of a failed run), protocol_id, protocol_digest, trajectory (``online``, ``final``: whose errors
-        they are), segmentation.
+        status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest, trajectory
+        (``online``, ``final``: whose errors they are), segmentation.
         ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked. ``boolean``:
         ranked, failed, cached (whether stage times come from the stage cache), seen_in_training (whether the masks
         come from a network that was trained on the scene). ``Float64``: coverage and
         epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
-        failures as never moving or worse), held_ate_m, final_ate_m and never_move_m (metres), frame_ms (median,
-        milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
+        failures as a static camera or worse), held_ate_m, final_ate_m and static_camera_ate_rmse_m (metres), frame_ms
+        (median, milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
         rotation_uncertainty_deg (standard error in degrees of the alignment's rotation; above 10 the metrics
         ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under
         its own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
@@ -51,7 +51,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     import pandas as pd
 
     ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
-    metrics = sorted({name for row in rows for name in row.metrics})
+    metrics = sorted({name for row in rows for name in row.metrics} - set(_NUMBERS))
     kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
     kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "Float64")
     plain = [name for name in kinds if name not in {*_OWN, *metrics}]

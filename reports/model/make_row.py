@@ -7,6 +7,7 @@ from typing import Any
 from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.runs.storage.record import LOST_COVERAGE, MetricRecord, RunRecord, Status
+from dynslam_bench.runs.storage.run_index import part_words
 from dynslam_bench.runs.storage.scoring import score
 from dynslam_bench.runs.storage.store import RunStore
 from dynslam_bench.segmentation.training_set import seen_in_training
@@ -20,7 +21,6 @@ from .row_values import (
     machine_words,
     never_move_error,
     part_options,
-    part_words,
     variant_of,
 )
 
@@ -70,7 +70,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         final_metrics={} if scored.final is None else dict(scored.final.metrics),
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         held_ate_m=held_error(store, record, protocol, evaluation, still),
-        never_move_m=still,
+        static_camera_ate_rmse_m=still,
         **_counts(record, scored.final if which == "final" and record.kind == "run" else None),
         epipolar_skipped=record.epipolar_skipped,
         cached=bool(record.identity.get("cache")),
@@ -80,7 +80,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         mask_iou=record.mask_iou,
         segmentation=record.segmentation,
         seen_in_training=seen_in_training(record.segmentation, sequence.id),
-        study=_trial_of(record),
+        study=record.trial_of,
         started=record.started,
         log=log_of(store, record.run_id),
         command=command_line(record.command),
@@ -114,14 +114,9 @@ def _counts(record: RunRecord, final: Evaluation | None) -> dict[str, Any]:
     return counts
 
 
-def _trial_of(record: RunRecord) -> str:
-    """The study that made a run with settings of its own; empty for its runs with the default settings, and others."""
-    return record.study if record.asked else ""
-
-
 def _notes(record: RunRecord, evaluation: Evaluation | None) -> list[str]:
     """What a reader should know of a run: whose trial it is, its own remarks, those of its evaluation."""
-    trial = [f"trial of the study '{_trial_of(record)}'"] if _trial_of(record) else []
+    trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
     return [*trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
 
 

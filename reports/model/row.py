@@ -61,7 +61,7 @@ class RunRow(Record):
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
         held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
-        never_move_m: What a camera that does not move scores there; None without ground truth.
+        static_camera_ate_rmse_m: What a static camera scores there; None without ground truth.
         n_frames: Input frames.
         n_processed: Frames that the tracker saw before it ended.
         n_tracked: Frames that were tracked.
@@ -122,7 +122,7 @@ class RunRow(Record):
     final_metrics: dict[str, float] = Field(default_factory=dict)
     rotation_uncertainty_deg: float | None = None
     held_ate_m: float | None = None
-    never_move_m: float | None = None
+    static_camera_ate_rmse_m: float | None = None
     n_frames: int = 0
     n_processed: int = 0
     n_tracked: int = 0
@@ -178,12 +178,13 @@ class RunRow(Record):
 
     @property
     def score_m(self) -> float | None:
-        """The ATE that ranks: lost frames held; a failure counts as never moving or worse; None without ground truth.
+        """The ATE that ranks: lost frames held, failures as a static camera or worse; None without ground truth.
 
-        A failure whose held trajectory is even further off than a camera that never moves keeps that error.
+        A failure whose held trajectory is even further off than a static camera keeps that error.
         """
         if self.failed:
-            return None if self.never_move_m is None else max(self.never_move_m, self.held_ate_m or 0.0)
+            static_m = self.static_camera_ate_rmse_m
+            return None if static_m is None else max(static_m, self.held_ate_m or 0.0)
         return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
 
     @property

@@ -42,9 +42,9 @@ def _short(value: object) -> str:
 def never_move_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> float | None:
-    """What a camera that does not move scores under the protocol's alignment; None without ground truth."""
-    if evaluation is not None and "never_move_ate_rmse_m" in evaluation.metrics:
-        return evaluation.metrics["never_move_ate_rmse_m"]
+    """What a static camera scores under the protocol's alignment; None without ground truth."""
+    if evaluation is not None and "static_camera_ate_rmse_m" in evaluation.metrics:
+        return evaluation.metrics["static_camera_ate_rmse_m"]
     try:
         truth = store.ground_truth(record.sequence.part)
         if truth is None:
@@ -61,7 +61,7 @@ def held_error(
     """The ATE with every lost frame counted as not having moved since the last tracked one; None without evaluation.
 
     Where the poses cannot be held, since they belong to no input frames, a trajectory with lost frames counts at least
-    as a camera that never moves (`still`).
+    as a static camera (`still`).
     """
     if evaluation is None:
         return None
@@ -93,17 +93,6 @@ def variant_of(record: RunRecord) -> dict[str, Any]:
         variant["drop_share"] = record.drop_share
     variant |= {f"degrade.{name}": value for name, value in sorted(record.degrade.items())}
     return variant
-
-
-def part_words(record: RunRecord) -> str:
-    """Which frames of the sequence, in words; empty for all."""
-    parts = []
-    if record.frames is not None:
-        start, stop = record.frames
-        parts.append(f"{start}:{'' if stop is None else stop}")
-    if record.stride != 1:
-        parts.append(f"every {record.stride}")
-    return ", ".join(parts)
 
 
 def part_options(record: RunRecord) -> list[str]:

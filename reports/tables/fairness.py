@@ -91,7 +91,7 @@ def failure_rule_table(board: Board) -> Table | None:
         "The same runs under three rules. Lost frames held: the report's rule, a lost frame counts as not having moved "
         "since the last tracked one. Lost frames left out: the error of the tracked frames only, which is what most "
         "papers print; a tracker gains by losing the hard frames. Failures left out too: survivors only, which also "
-        "flatters trackers that fail; in the first two they count as a camera that never moves, or worse. A ranking "
+        "flatters trackers that fail; in the first two they count as a static camera, or worse. A ranking "
         "that changes between the rules is decided by the rule."
     )
     return Table("failure_rules", "Sensitivity to the rule for lost frames and failures", caption, columns, rows)

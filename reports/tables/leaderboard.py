@@ -103,18 +103,18 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
         f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
         f"{board.reference_name}; below 1 is better. {intervals}",
-        f"A run that failed or was lost counts as a camera that never moves, or worse ({failed} of "
+        f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
         "in the map of an earlier one, trackers that lack "
-        "sequences or never succeeded.",
+        "sequences, never succeeded, or are no better than a static camera.",
     ]
     if still := _no_better_than_still(board):
-        parts.append(f"No better than a camera that never moves, although their runs ended: {still}.")
+        parts.append(f"No better than a static camera, although their runs ended: {still}.")
     if board.asked_reference and board.reference is None:
         parts.append(
-            f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a camera that "
-            "never moves takes its place."
+            f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a static "
+            "camera takes its place."
         )
     if epipolar:
         parts.append("F skipped: frames on which an epipolar system did not use its fundamental matrix.")
@@ -127,7 +127,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
 
 
 def _no_better_than_still(board: Board) -> str:
-    """Trackers with how many sequences they are no better on than a camera that never moves; empty if none is."""
+    """Trackers with how many sequences they are no better on than a static camera; empty if none is."""
     counts = {key: sum(board.no_better_than_still(key, name) for name in board.sequences) for key in board.trackers}
     return "; ".join(
         f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
@@ -151,7 +151,8 @@ def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[T
         ratio = TableCell(ratio.text, text, ratio.value)
     wins = TableCell("reference") if key == board.reference else wins_cell(standing)
     mean_rank, p = number(standing.mean_rank, ".2f"), number(standing.p_value, ".3f")
-    return [rank_cell(standing), success, name, ratio, mean_rank, wins, p]
+    rank = TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing)
+    return [rank, success, name, ratio, mean_rank, wins, p]
 
 
 def _mark(board: Board, standing: Standing) -> Emphasis:

@@ -45,8 +45,8 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     caption = (
         f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
         "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
-        "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a camera "
-        "that never moves, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
+        "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
+        "camera, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
         f"nothing succeeded. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four "
         f"times or more). Bold best, italic second among ranked trackers. {_names_note(board)}{protocol.describe()}."
     )
@@ -161,7 +161,7 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         return TableCell(cell.ending, _count(cell, usual), emphasis="failed", tip=tip, link=link)
     notes = [_spread(cell), _count(cell, usual), skipped_words(cell)]
     if board.no_better_than_still(key, sequence):
-        notes.append("no better than not moving")
+        notes.append("no better than a static camera")
     if cell.failed:
         notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
     small = ", ".join(filter(None, notes))

@@ -182,8 +182,8 @@ def add(cell: Cell, run: LoadedRun) -> None:
         cell.ates.append(ate)
     cell.coverages.append(run.row.coverage)
     cell.broken += run.record.failed
-    if run.row.never_move_m is not None:
-        cell.standstills.append(run.row.never_move_m)
+    if run.row.static_camera_ate_rmse_m is not None:
+        cell.standstills.append(run.row.static_camera_ate_rmse_m)
     stages = [time.median_s for name, time in run.record.timings.items() if name.startswith("culling_")]
     cell.filter_ms.append(1e3 * sum(stages))
     cell.culled += culled(run.store.folder(run.record.run_id) / "frames.csv")

@@ -156,7 +156,7 @@ def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
     code, out, err = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
     assert code == 0 and all(line.endswith(" s so far") for line in err.splitlines())  # quiet in pipes
     shown = [re.split(r"\s{2,}", line)[3:6] for line in out.splitlines()]
-    assert shown == [["part", "repeat", "status"], ["0:3", "seed 0", "ok"], ["0:3", "seed 1", "ok"]]
+    assert shown == [["frames", "repeat", "status"], ["0:3", "seed 0", "ok"], ["0:3", "seed 1", "ok"]]
     runs = json.loads(cli("runs", "list", "--json")[1])
     assert [(run["tracker"], run["seed"], run["coverage"]) for run in runs] == [
         ("never-move", 0, 1.0),
@@ -165,7 +165,7 @@ def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
     stored = sorted(path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json"))
     assert cli("run", "never-move", walk, "--seed", "0", "1", "--frames", ":3")[0] == 0  # nothing is made again
     assert stored == sorted(path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json"))
-    code, out, _ = cli("runs", "show", runs[0]["run"][:8])
+    code, out, _ = cli("runs", "show", runs[0]["run_id"][:8])
     assert code == 0 and "ATE (rmse)" in out and "walk" in out
     shown = json.loads(cli("runs", "show", "latest", "--json")[1])
     assert shown["record"]["status"] == "ok" and shown["metrics"]["online"]["metrics"]["ate_rmse_m"] > 0
@@ -173,8 +173,8 @@ def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
     assert code == 0 and out.strip().endswith("page/index.html") and Path("page/index.html").is_file()
     assert json.loads(cli("report", "--json")[1])["html"].endswith("results/report/index.html")
     assert cli("report", "compare", "results", "page")[0] == 0
-    code, out, _ = cli("runs", "rm", *[run["run"] for run in runs])
-    assert code == 0 and out.split() == [run["run"] for run in runs]
+    code, out, _ = cli("runs", "rm", *[run["run_id"] for run in runs])
+    assert code == 0 and out.split() == [run["run_id"] for run in runs]
     assert json.loads(cli("runs", "list", "--json")[1]) == []
 
 
@@ -191,7 +191,7 @@ def test_failed_runs_exit_with_3_and_the_others_go_on(cli, walk, tmp_path):
     (row,) = json.loads(out)
     assert code == 3 and row["status"] == "crashed" and "ValueError: a wall" in row["reason"]
     code, out, _ = cli("runs", "rm", "--failed")
-    assert code == 0 and out.strip() == row["run"]
+    assert code == 0 and out.strip() == row["run_id"]
 
 
 def test_damaged_sequences_never_become_runs(cli, walk, tmp_path):

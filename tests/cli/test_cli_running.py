@@ -20,7 +20,7 @@ def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
     code, out, _ = cli(*command)
     assert code == 0 and "from the store" in out and "yes" in out.splitlines()[1]
     (row,) = json.loads(cli(*command, "--json")[1])
-    assert row["from_store"] is True and row["settings"] == "frames=4" and row["part"] == "0:3, every 2nd"
+    assert row["from_store"] is True and row["settings"] == "frames=4" and row["frames"] == "0:3, every 2nd"
     assert row["repeat"] == "seed 0"
     listed = cli("runs", "list")[1]
     assert "0:3, every 2nd" in listed and "frames=4" in listed and "from the store" not in listed

@@ -1,5 +1,6 @@
 """The room of contracts: complete, light, and the same objects as in the rooms that use them."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,9 +10,17 @@ import pytest
 
 from dynslam_bench import contracts
 from dynslam_bench.contracts import Frame, TrackResult, Trajectory
-from dynslam_bench.contracts.checks import STATES, blemishes, check_result, faults, trajectory_faults
+from dynslam_bench.contracts.checks import (
+    STATES,
+    TrackerContractError,
+    blemishes,
+    check_result,
+    faults,
+    trajectory_faults,
+)
 from dynslam_bench.features.registry import FeatureSpec
 from dynslam_bench.flow.registry import FlowSpec
+from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
 from dynslam_bench.sequences import DatasetSpec
 
@@ -52,11 +61,36 @@ def given(**changes: object) -> TrackResult:
         (given(T_world_cam=np.eye(3)), "an array of shape (3, 3) as pose"),
         (given(T_world_cam=np.full((4, 4), np.nan)), "a pose with 16 values that are not finite"),
         (given(T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0])), "a pose that is no rigid transformation"),
+        (given(T_world_cam=np.eye(4, dtype=complex)), "a pose of the type complex128"),
+        (given(T_world_cam=np.eye(4).astype(object)), "a pose of the type object"),
+        (given(T_world_cam=np.eye(4).astype(str)), "a pose of the type <U32"),
+        (given(T_world_cam=np.eye(4, dtype=bool)), "a pose of the type bool"),
+        (given(T_world_cam=np.eye(4, dtype=np.float16)), "a pose in float16"),
+        (given(T_world_cam=np.full((4, 4), np.inf, np.float16)), "a pose with 16 values that are not finite"),
         (given(dynamic_mask=np.zeros((4, 4), bool)), "a dynamic mask of shape (4, 4)"),
     ],
 )
 def test_faults(result: object, words: str) -> None:
     assert [fault.found[: len(words)] for fault in faults(result, FRAME)] == [words]
+
+
+TURNED = se3.exp(np.array([3.0, -2.0, 1.0, 0.3, -0.7, 1.1]))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.longdouble, ">f4"])
+def test_a_pose_of_any_real_type_is_taken_as_float64(dtype: object) -> None:
+    pose = check_result(given(T_world_cam=TURNED.astype(dtype)), FRAME, "mine").T_world_cam
+    assert pose is not None and pose.dtype == np.float64 and np.abs(pose - TURNED).max() < 3e-7
+    whole = check_result(given(T_world_cam=np.eye(4, dtype=np.int64)), FRAME, "mine").T_world_cam
+    assert whole is not None and whole.dtype == np.float64
+
+
+def test_a_pose_in_float16_is_invalid_with_its_deviation() -> None:
+    (fault,) = faults(given(T_world_cam=TURNED.astype(np.float16)), FRAME)
+    off = float(re.findall(r"I. = ([\d.e-]+)", fault.found)[0])
+    assert 1e-4 < off < 2e-3 and "float64" in fault.cause
+    with pytest.raises(TrackerContractError, match="frame 3"):
+        check_result(given(T_world_cam=TURNED.astype(np.float16)), FRAME, "mine")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import stat
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from pydantic import Field
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.harmless import inside, printable, storable
-from dynslam_bench.core.passwords import without_passwords
+from dynslam_bench.core.passwords import without_passwords, words_without_passwords
 from dynslam_bench.core.reading import parse_json, read_bytes, read_json, read_lines, read_text
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.toml import parse_toml
@@ -92,6 +93,44 @@ def test_records_hold_no_password() -> None:
 )  # fmt: skip
 def test_passwords_are_in_no_message(address: str) -> None:
     assert "s3cret" in address and "s3cret" not in str(DynslamError(f"cannot reach {address!r} now", f"try {address}"))
+
+
+class Command(Record):
+    text: str
+    words: list[str]
+    shell: list[str]
+    settings: dict[str, str]
+
+
+SECRETS = [
+    "--token=s3cret", "--token s3cret", "--api-key s3cret", "--api_key=s3cret", "--apikey s3cret", "-token s3cret",
+    "--hf-token='s3cret s3cret'", '--password "s3cret s3cret"', "--db.password=s3cret", "PASSWORD=s3cret slam",
+    "HF_TOKEN=s3cret slam", "--client-secret s3cr\\\\s3cret", "--access-key=s3cr\xe9s3cret", "--Passphrase s3cret",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("secret", SECRETS)
+def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
+    command = f"slam {secret} --threads 2"
+    words = ["dynslam-bench", "run", f"subprocess:{command}", "--set", f"command={command}"]
+    shell = shlex.split(command)
+    stored = Command(text=command, words=words, shell=shell, settings={"api_key": "s3cret", "command": command})
+    for text in (stored.to_json(), stored.to_line()):
+        assert "s3cret" not in text
+        again = Command.model_validate_json(text)
+        assert again.shell[0] == "slam" and again.shell[-2:] == ["--threads", "2"] and len(again.shell) == len(shell)
+        assert again.text.startswith("slam ") and again.text.endswith(" --threads 2")
+    assert "s3cret" not in str(DynslamError(f"cannot start {command}"))
+    assert "s3cret" not in " ".join(words_without_passwords(words + shlex.split(command)))
+
+
+@pytest.mark.parametrize(
+    "words", [["slam", "--token", "--threads", "2"], ["slam", "--tokenizer", "bert"], ["--keyframes", "3"],
+              ["a token b"], ["segmentation.source=plugin:token", "x"], ["--max-tokens", "5"], ["slam --token", "x"]],
+)  # fmt: skip
+def test_words_that_are_no_secrets_stay(words: list[str]) -> None:
+    kept = words_without_passwords(words)
+    assert len(kept) == len(words) and (kept == words or words[-1] == "x")
 
 
 def test_what_holds_no_password_stays_as_it_is() -> None:

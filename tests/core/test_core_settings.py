@@ -1,5 +1,6 @@
 """Settings: one annotation gives validation, overrides, search space and table; errors name what is wrong."""
 
+from pathlib import Path
 from typing import Literal
 
 import pytest
@@ -94,6 +95,23 @@ def test_bad_assignments_are_one_clear_line(assignment, expected):
     with pytest.raises(SettingsError, match=expected) as caught:
         apply_overrides(Root(), parse_assignments([assignment]))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["34", "true", "null", "[1]", '"quoted"', "1e3", "", "NaN"])
+def test_a_text_stays_the_text_that_it_is(text):
+    class Texts(Settings):
+        name: str = ""
+        file: Path | None = None
+        either: float | str = 1.0
+        choice: Literal["true", "34", 2] = 2
+
+    assert apply_overrides(Texts(), {"name": text}).name == text
+    assert apply_overrides(Texts(), parse_assignments([f"name={text}"])).name == text
+    assert apply_overrides(Texts(), {"either": text}).either == text
+    assert apply_overrides(Texts(), {"file": text}).file == (None if text == "null" else Path(text))
+    if text in ("34", "true"):
+        assert apply_overrides(Texts(), {"choice": text}).choice == text
+    assert apply_overrides(Texts(choice="34"), {"choice": "2"}).choice == 2
 
 
 def test_unknown_keys_of_a_file_are_errors():

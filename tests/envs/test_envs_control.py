@@ -143,3 +143,23 @@ def test_our_own_tracker_can_be_steered(real_data: str) -> None:
     env.reset(seed=0)
     spent = [env.step(np.array([action]))[4]["stats"]["flow_evaluations"] for action in (-1.0, 1.0, -1.0)]
     assert spent[1] > 2 * spent[0] and spent[1] > 2 * spent[2]
+
+
+@pytest.mark.parametrize("action", ["x", None, 1, -1, 0.0, [0], np.array([0]), {}])
+def test_what_is_no_action_is_refused_without_control(action: object) -> None:
+    env = SlamEnv(ToySequence(4), TARGET)
+    env.reset(seed=0)
+    with pytest.raises(SettingsError, match=r"Discrete\(1\)"):
+        env.step(action)
+    assert env.episode.next_index == 1, "nothing was tracked"
+    env.step(np.int64(0))
+    assert env.episode.next_index == 2
+
+
+@pytest.mark.parametrize("action", ["x", None, [None], {}, ["a"], object()])
+def test_what_is_no_number_is_refused_under_control(action: object) -> None:
+    env = SlamEnv(ToySequence(4), TARGET, control=["noise.level_m"])
+    env.reset(seed=0)
+    with pytest.raises(SettingsError, match="action"):
+        env.step(action)
+    assert env.episode.next_index == 1

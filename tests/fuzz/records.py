@@ -78,7 +78,7 @@ def _read_list(data: bytes | None, folder: Path) -> None:
     path = run_index.index_file(store.root, get_protocol("tum-rgbd/v1"))
     at(path.parent, path.name, data)
     rows, unreadable = run_list.list_runs(store)
-    assert [row["run"] for row in rows] == [RUN] and len(unreadable) == 1
+    assert [row["run_id"] for row in rows] == [RUN] and len(unreadable) == 1
 
 
 @cache

@@ -132,7 +132,7 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert failed["reason"] == "RuntimeError: the map is empty"
     runs = {row["run_id"]: row for row in rows_of(paths.csv["runs"])}
     row = runs[failed["run"]]
-    assert float(row["score_m"]) == float(row["never_move_m"]) != float(row["ate_rmse_m"])
+    assert float(row["score_m"]) == float(row["static_camera_ate_rmse_m"]) != float(row["ate_rmse_m"])
     text = paths.html.read_text()
     assert f'href="run.html#{failed["run"]}"' in text
     page = handed(paths.html.parent / "data" / f"run-{failed['run']}.js")
@@ -140,7 +140,7 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     markdown = paths.markdown.read_text()
     assert "2/3 succeeded" in markdown
     assert "(3 unless n says otherwise)" in markdown
-    assert "counts as a camera that never moves, or worse (1 of 61 runs)" in markdown
+    assert "counts as a static camera, or worse (1 of 61 runs)" in markdown
 
 
 def test_captions_carry_the_protocol_and_the_power_note(made):
@@ -199,8 +199,8 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     with pytest.raises(ReportError, match=r"no run of the reference 'orb-slam4' \(did you mean 'orb-slam3'"):
         build_report(store, tmp_path, reference="orb-slam4")
     paths = build_report(store, tmp_path, reference="orb-slam3")
-    assert "never move (from the ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
-    assert ReportData.read(paths.data).reference == "never move (from the ground truth)"
+    assert "static camera (from ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
+    assert ReportData.read(paths.data).reference == "static camera (from ground truth)"
     board = rows_of(paths.csv["leaderboard"])
     assert float(board[0]["ATE ratio"]) < 0.2
 
@@ -319,7 +319,7 @@ def test_published_numbers_stand_apart_and_never_compete(tmp_path):
 
 def row(**changes):
     base = dict(run_id="r", kind="run here", tracker="a", label="A", sequence="s", protocol_id="p", protocol_digest="d",
-                metrics={"ate_rmse_m": 0.1}, never_move_m=0.5)  # fmt: skip
+                metrics={"ate_rmse_m": 0.1}, static_camera_ate_rmse_m=0.5)  # fmt: skip
     return RunRow(**(base | changes))
 
 
@@ -327,7 +327,7 @@ def test_scores_impute_failures_only():
     assert row().score_m == 0.1
     assert row(failed=True).score_m == 0.5
     assert row(failed=True, metrics={}).score_m == 0.5
-    assert row(metrics={}, never_move_m=None).score_m is None
+    assert row(metrics={}, static_camera_ate_rmse_m=None).score_m is None
 
 
 def test_trackers_that_lack_sequences_are_shown_but_not_ranked():

@@ -57,7 +57,7 @@ def test_accuracy_is_what_is_left_of_not_moving(store):
     board = load_board(store)
     (ours,) = (cells for cells in time_table(board).rows if cells[0].text == "ours")
     row = next(row for row in board.rows if row.label == "ours" and row.sequence == "s/a")
-    error = 100 * row.held_ate_m / row.never_move_m
+    error = 100 * row.held_ate_m / row.static_camera_ate_rmse_m
     assert [cell.value for cell in ours[1:4]] == pytest.approx([100 - error, error, 20.0])
 
 

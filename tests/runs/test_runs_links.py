@@ -71,7 +71,7 @@ def test_a_pipe_in_the_place_of_the_index_hangs_nothing(filled: tuple[RunStore, 
     index.parent.mkdir()
     os.mkfifo(index)
     assert store.score(store.read_whole(run)).run_id == run  # which would add a line to it
-    assert [row["run"] for row in list_runs(store)[0]] == [run]
+    assert [row["run_id"] for row in list_runs(store)[0]] == [run]
 
 
 @pytest.mark.parametrize("file", ["groundtruth.txt", "timestamps.txt"])

@@ -38,9 +38,9 @@ def reads(monkeypatch):
 def test_rows_are_those_of_the_records_and_are_read_once(filled, reads):
     store, ids = filled
     rows, unreadable = list_runs(store)
-    assert [row["run"] for row in rows] == ids[::-1] and unreadable == []
+    assert [row["run_id"] for row in rows] == ids[::-1] and unreadable == []
     for row in rows:
-        record = store.read(row["run"])
+        record = store.read(row["run_id"])
         assert row == run_row(record, store.score(record)) and tuple(row) == FIELDS
     reads.clear()
     assert list_runs(store) == (rows, [])
@@ -60,8 +60,8 @@ def test_what_changed_is_read_again(filled, reads):
     reads.clear()
     rows, _ = list_runs(store)
     assert sorted(reads) == sorted([ids[0], ids[1], new])
-    assert {row["run"] for row in rows} == {ids[0], ids[1], new}
-    assert next(row for row in rows if row["run"] == ids[1])["reason"] == "edited by hand"
+    assert {row["run_id"] for row in rows} == {ids[0], ids[1], new}
+    assert next(row for row in rows if row["run_id"] == ids[1])["reason"] == "edited by hand"
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"head": 1}', '{"head": [], "rows": {}}', "\x00", '{"rows": [1]}'])
@@ -108,7 +108,7 @@ def test_a_run_joins_the_index_when_it_is_scored(filled, reads):
         store.score(store.read_whole(run_id))
     reads.clear()
     rows, _ = list_runs(store)
-    assert reads == [] and [row["run"] for row in rows] == ids[::-1]
+    assert reads == [] and [row["run_id"] for row in rows] == ids[::-1]
     assert rows == [run_row(record, store.score(record)) for record in store.all()[0]]
     store.score(store.read_whole(ids[0]), again=True)
     assert len(lines_of(store)) == 3
@@ -124,7 +124,7 @@ def test_a_run_that_is_made_again_is_listed_as_it_is_now(filled, reads):
         store.score(record)
     reads.clear()
     rows, _ = list_runs(store)
-    assert reads == [] and next(row for row in rows if row["run"] == ids[0])["reason"] == "second"
+    assert reads == [] and next(row for row in rows if row["run_id"] == ids[0])["reason"] == "second"
     assert len(lines_of(store)) == 3
 
 
@@ -165,7 +165,7 @@ def rescore(store, run, error):
 
 
 def errors_of(store):
-    return {row["run"]: row["ate_rmse_m"] for row in list_runs(store)[0]}
+    return {row["run_id"]: row["ate_rmse_m"] for row in list_runs(store)[0]}
 
 
 def made_long_ago(store, seconds=10):

@@ -14,7 +14,7 @@ from envs_toys import TARGET, truth
 
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.tum_file import read_tum, write_tum
 from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
 from dynslam_bench.runs.storage.packing import pack, unpack
 
@@ -188,6 +188,27 @@ def test_import(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     assert metrics.trajectory == "final" and metrics.online is None
     assert 0.001 < metrics.metrics["ate_rmse_m"] < 0.01 and metrics.primary.coverage == 0.5
     assert import_trajectory(path, "their-slam", toy_folder, results=store).run_id == record.run_id
+
+
+@pytest.mark.parametrize(
+    ("kept", "status"),
+    [
+        (slice(0, 8), "lost"),  # 13 %
+        (slice(0, 60, 7), "lost"),  # 15 %, to the end
+        (slice(0, 50), "lost"),  # the last ten frames have none, as in a run that is lost at its end
+        (slice(0, 51), "ok"),
+        (slice(0, 60, 2), "ok"),
+        (slice(30, 60), "ok"),
+    ],
+)
+def test_an_import_is_lost_by_the_rule_of_runs(
+    kept: slice, status: str, store: RunStore, toy_folder: str, tmp_path: Path
+) -> None:
+    whole = read_tum(write_estimate(tmp_path / "all.txt"))
+    write_tum(tmp_path / "part.txt", whole.select(kept))
+    record = import_trajectory(tmp_path / "part.txt", "their-slam", toy_folder, results=store, which="online")
+    assert (record.status, bool(record.reason)) == (status, status != "ok")
+    assert record.n_tracked == len(whole.select(kept)) and record.coverage == pytest.approx(record.n_tracked / 60)
 
 
 def test_import_with_stamps_of_its_own(store: RunStore, toy_folder: str, tmp_path: Path) -> None:

@@ -13,9 +13,11 @@ import pytest
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
+from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import RunStore, load_frames, score
 from dynslam_bench.runs.frame_row import FrameRow, read_csv, read_log, write_csv
 from dynslam_bench.runs.storage.frames import FrameLog
+from dynslam_bench.runs.storage.run_list import list_runs
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
@@ -99,6 +101,38 @@ def test_a_row_a_run(store: RunStore) -> None:
     assert missing.isna().all(axis=None) and missing.notna().sum().sum() == 0
     other = store.frame("evo-default")
     assert set(other["protocol_id"]) == {"evo-default"} and set(frame["protocol_id"]) == {"tum-rgbd/v1"}
+
+
+def test_trials_of_studies_are_left_out_unless_asked_for(store: RunStore) -> None:
+    records, _ = store.all()
+    trial = records[0].model_copy(update={"study": "thresholds", "overrides": {"frames": 3}})
+    (store.folder(trial.run_id) / "run.json").write_text(trial.to_json())
+    assert store.frame()["run_id"].tolist() == [records[1].run_id]
+    everything = store.frame(trials=True)
+    assert everything["study"].tolist() == ["thresholds", pd.NA] and everything["study"].dtype == "string"
+    assert store.frame()["study"].isna().all()
+
+
+def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
+    listed, table = set(list_runs(store)[0][0]), set(store.frame(trials=True).columns)
+    reported = set(load_frame(store).columns)
+    assert listed - table == {"seen_in_training"} and "seen_in_training" in reported
+    assert listed - reported == {"reason", "started"}
+    shared = {
+        "run_id",
+        "frames",
+        "segmentation",
+        "study",
+        "static_camera_ate_rmse_m",
+        "ate_rmse_m",
+        "coverage",
+        "frame_ms",
+    }
+    assert shared <= listed & table & reported
+    by_id = {row["run_id"]: row for row in list_runs(store)[0]}
+    for line in store.frame().astype(object).to_dict("records"):
+        row = by_id[line["run_id"]]
+        assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
 
 
 def test_an_empty_store_has_the_same_columns(store: RunStore, tmp_path: Path) -> None:

@@ -65,6 +65,10 @@ class SparseDaisyFlow:
         self.pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
         self._buffers = BufferPool()
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> SparseDaisyFlow:
+        """A flow of the same settings with threads of its own: nothing is carried from frame to frame here."""
+        return SparseDaisyFlow(self.settings, threads=self.threads)
+
     def configure(self, settings: FlowSettings) -> None:
         """Put other settings into force from the next call on."""
         self.settings = settings

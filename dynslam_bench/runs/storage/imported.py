@@ -23,7 +23,7 @@ from dynslam_bench.sequences.part import part_of
 
 from ..exchange.provenance import digest_of, stated_provenance
 from ..exchange.reading import read_trajectory
-from ..one import part_digest, sequence_info
+from ..one import judge_coverage, part_digest, sequence_info
 from ..spec import place_of
 from .record import RunRecord, TrackerInfo
 from .store import RunStore
@@ -66,7 +66,7 @@ def import_trajectory(
         topic: Of a bag with several topics of poses, the one to take.
 
     Returns:
-        The record. Poses whose stamps are no input frame's are kept, and said so in its notes.
+        The record, ``lost`` by the rule of runs (`judge_coverage`); its notes count poses whose stamps are no frame's.
 
     Raises:
         DynslamError: The trajectory cannot be read.
@@ -78,7 +78,7 @@ def import_trajectory(
     file = Path(path).expanduser()
     loaded = read_trajectory(file, timestamps, topic)
     opened = open_frames(sequence, data_root, camera, frames, stride)
-    covered, odd = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
+    covered, odd, last = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
     notes = loaded.notes.describe()
     if odd:
         notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
@@ -87,9 +87,9 @@ def import_trajectory(
         **{"frames": _pair(frames), "stride": stride, "place": place_of(sequence)},
         **{"stamps_match": not odd, "provenance": provenance or stated_provenance(file) or str(file), "notes": notes},
     }
+    asked["status"], asked["reason"] = judge_coverage(covered, len(opened), len(opened) - 1 - last, len(opened))
     record = _record(_identity(file, tracker, which, opened, timestamps, topic), opened, covered, asked)
-    store = results if isinstance(results, RunStore) else RunStore(results)
-    _keep(store, record, opened, loaded.trajectory, which)
+    _keep(results if isinstance(results, RunStore) else RunStore(results), record, opened, loaded.trajectory, which)
     return record
 
 
@@ -107,7 +107,6 @@ def _record(identity: dict[str, Any], sequence: Sequence, covered: int, asked: d
     return RunRecord(
         kind="imported",
         run_id=digest(identity, 16),
-        status="ok",
         sequence=sequence_info(sequence, identity["content"], part_digest(identity)),
         n_frames=total,
         n_tracked=covered,
@@ -120,8 +119,8 @@ def _record(identity: dict[str, Any], sequence: Sequence, covered: int, asked: d
     ).normalised()
 
 
-def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int]:
-    """How many frames a trajectory covers, and how many of its poses carry stamps that are no frame's.
+def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int, int]:
+    """How many frames a trajectory covers, how many of its poses carry no frame's stamp, and the last frame it covers.
 
     Raises:
         RunError: Fewer than two of them are near a frame; `shares` and `name` say whose they are.
@@ -135,7 +134,7 @@ def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name
             f"the nearest is {gap:.3f} s off; frames last from {stamps[0]:.6f} to {stamps[-1]:.6f}",
         )
     odd = len(trajectory) - len(exact)
-    return (len(near) if odd else len(exact)), odd
+    return (len(near) if odd else len(exact)), odd, int(near[-1])
 
 
 def _identity(

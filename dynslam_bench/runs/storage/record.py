@@ -265,6 +265,11 @@ class RunRecord(Record):
         return named | {"map": self.start_map.digest[:8]} | alone
 
     @property
+    def trial_of(self) -> str:
+        """The study that made it with settings of its own; empty for its runs with the default settings, and others."""
+        return self.study if self.asked else ""
+
+    @property
     def repeat(self) -> str:
         """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
         words = [f"seed {self.seed}"]

@@ -35,25 +35,16 @@ ground truth; (0, 0) for each that is not there."""
 Line = list[Any]
 
 FIELDS = (
-    *("run", "tracker", "sequence", "part", "seed", "offset", "noise", "repeat", "settings", "status"),
-    *(
-        "ate_rmse_m",
-        "never_move_m",
-        "coverage",
-        "frame_ms",
-        "masks",
-        "seen_in_training",
-        "identity",
-        "reason",
-        "started",
-    ),
+    *("run_id", "tracker", "sequence", "frames", "seed", "offset", "noise", "repeat", "settings", "status"),
+    *("ate_rmse_m", "static_camera_ate_rmse_m", "coverage", "frame_ms", "segmentation"),
+    *("seen_in_training", "study", "identity", "reason", "started"),
 )
-"""Names of a row's values, in order; the values of a line, before which it has its stamps."""
+"""Names of a row's values, in order, as in `runs_frame`; the values of a line, before which it has its stamps."""
 _LINES: TypeAdapter[list[Line]] = TypeAdapter(list[Line])
 FIRST = 11
 """Where the values begin in a line; before them stand the stamps and the run's part of its sequence."""
 PART = FIRST - 1
-RUN, STARTED = FIRST + FIELDS.index("run"), FIRST + FIELDS.index("started")
+RUN, STARTED = FIRST + FIELDS.index("run_id"), FIRST + FIELDS.index("started")
 _LENGTH = FIRST + len(FIELDS)
 _SETTLED_NS = 1_000_000_000
 """A folder as young as this, when the file was written, may change again without another time."""
@@ -72,22 +63,23 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
 
     errors = {} if metrics is None else metrics.metrics
     return {
-        "run": record.run_id,
+        "run_id": record.run_id,
         "tracker": record.tracker.id,
         "sequence": record.sequence.id,
-        "part": part_words(record),
+        "frames": part_words(record),
         "seed": record.seed,
         "offset": record.offset,
         "noise": record.sequence.noise,
         "repeat": record.repeat,
-        "settings": ", ".join(assignments(record.asked)),
+        "settings": "; ".join(assignments(record.asked)),
         "status": record.status,
         "ate_rmse_m": errors.get("ate_rmse_m"),
-        "never_move_m": errors.get("never_move_ate_rmse_m"),
+        "static_camera_ate_rmse_m": errors.get("static_camera_ate_rmse_m"),
         "coverage": record.coverage,
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
-        "masks": record.segmentation,
+        "segmentation": record.segmentation,
         "seen_in_training": seen_in_training(record.segmentation, record.sequence.id),
+        "study": record.trial_of,
         "identity": "" if record.verified else "unverified",
         "reason": record.reason or _not_scored(record, metrics),
         "started": record.started,

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 from dynslam_bench.core.toml import assignments
 
 from .record import MetricRecord, RunRecord
+from .run_index import part_words
 
 if TYPE_CHECKING:
     import pandas as pd
 
 _TEXT = (
     *("run_id", "kind", "tracker", "label", "settings", "provenance"),
-    *("sequence", "frames", "split", "repeat", "status", "reason"),
+    *("sequence", "frames", "split", "repeat", "status", "reason", "study", "identity"),
     *("device", "segmentation", "protocol_id", "protocol_digest", "trajectory"),
 )
 _WHOLE = ("seed", "offset", "noise", "stride", "threads", "n_frames", "n_processed", "n_tracked", "n_lost")
@@ -35,8 +36,9 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
         One row a run, in their order. Whatever may be missing is ``pd.NA``, never nan or an empty string.
 
         - ``string``: run_id, kind (``run``, ``imported``), tracker, label (its name in tables), settings (those that
-          were asked for, ``name=value; ...``), provenance, sequence, frames (``A:B``, missing for all), split, repeat
-          (``seed 0, offset 2``), status, reason (missing for ``ok``), device, segmentation (source of the masks),
+          were asked for, ``name=value; ...``), provenance, sequence, frames (``A:B, every 2nd``, missing for all),
+          split, repeat (``seed 0, offset 2``), status, reason (missing for ``ok``), study (of which the run is a trial,
+          missing for any other run), identity (``unverified`` for runs of an older scheme of ids, else missing), device, segmentation (source of the masks),
           protocol_id, protocol_digest and trajectory (``online``, ``final``): what the errors hold under and are of.
         - ``Int64``: seed, offset, noise (missing for the sequence's own), stride, threads, n_frames, n_processed,
           n_tracked, n_lost, keyframes, map_points, maps.
@@ -61,7 +63,6 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
 
 def _line(record: RunRecord, scored: MetricRecord | None) -> dict[str, Any]:
     same = {name: getattr(record, name) for name in (*_WHOLE, *_MAP, *_NUMBERS, *_TEXT) if hasattr(record, name)}
-    start, stop = record.frames or (0, None)
     line = same | {
         "tracker": record.tracker.id,
         "label": record.tracker.label or record.tracker.id,
@@ -70,7 +71,9 @@ def _line(record: RunRecord, scored: MetricRecord | None) -> dict[str, Any]:
         "sequence": record.sequence.id,
         "split": record.sequence.split,
         "noise": record.sequence.noise,
-        "frames": "" if record.frames is None else f"{start}:{'' if stop is None else stop}",
+        "frames": part_words(record),
+        "study": record.trial_of,
+        "identity": "" if record.verified else "unverified",
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
     }
     if scored is not None:

@@ -349,11 +349,12 @@ class RunStore:
             add_to_index(index_file(self.root, protocol), make_line(stamps, record, metrics))
         return metrics
 
-    def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL) -> pd.DataFrame:
+    def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL, *, trials: bool = False) -> pd.DataFrame:
         """All runs, scored under one protocol, as a pandas frame: one row a run, from the oldest to the newest.
 
         Args:
             protocol: How to evaluate; SLAM is never run again for it.
+            trials: Whether the trials of studies are listed, too: their settings are candidates, no results.
 
         Returns:
             The columns that `runs_frame` describes.
@@ -361,7 +362,8 @@ class RunStore:
         from .run_table import runs_frame
 
         records, _ = self.all()
-        return runs_frame([(r, None if r.status == "stopped" else self.score(r, protocol)) for r in records])
+        listed = [record for record in records if trials or not record.trial_of]
+        return runs_frame([(r, None if r.status == "stopped" else self.score(r, protocol)) for r in listed])
 
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
         """The ``online`` or ``final`` trajectory of a run; None if there is none or no frame was tracked."""

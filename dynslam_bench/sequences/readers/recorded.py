@@ -26,6 +26,8 @@ from .diagnostics import Dropped
 from .lists import ImageList
 
 GROUND_TRUTH_DT_S = 0.02
+SLOWEST_S = 5.0
+"""Frames further apart by the median are no video: their stamps are in another unit than seconds."""
 MISSING_TOLERATED = 0.02
 """Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
 
@@ -111,6 +113,7 @@ class RecordedSequence:
                 "do both lists use the same clock?",
             )
         self._timestamps = colour.stamps[index[0]]
+        _check_unit(folder, self._timestamps)
         self._timestamps.flags.writeable = False
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
@@ -242,6 +245,19 @@ class RecordedSequence:
             except SequenceError as error:
                 faults.append(f"frame {index}: {error}")
         return faults
+
+
+def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
+    """Refuse stamps in milliseconds, microseconds or nanoseconds: associations and RPE would be over other spans."""
+    interval = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    if interval <= SLOWEST_S:
+        return
+    units = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+    likely = [f"{name} ({per_s / interval:.3g} Hz)" for name, per_s in units.items() if 1 <= per_s / interval <= 1000]
+    raise SequenceError(
+        f"the colour images of {folder} are {interval:g} s apart by the median of their stamps ({1 / interval:.2g} Hz)",
+        f"stamps are in seconds; these look like {likely[0] if likely else 'another unit'}",
+    )
 
 
 def _existing(folder: Path, images: ImageList, kind: str) -> ImageList:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from typing import Generic, Protocol, TypeVar
+from copy import copy
+from typing import Any, Generic, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -44,6 +45,10 @@ class FrameToFrame(ABC, Generic[Prepared]):
     def __init__(self, name: str) -> None:
         self._name = name
         self._aligner: Aligner[Prepared] | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> FrameToFrame[Prepared]:
+        """A tracker at the same frame; the alignment and the last good frame are shared, since neither changes."""
+        return copy(self)
 
     @abstractmethod
     def make_aligner(self, camera: Camera) -> Aligner[Prepared]:

@@ -57,6 +57,14 @@ class ProgramTracker:
         self._program: Program | None = None
         self._exchange: ImageExchange | None = None
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> ProgramTracker:
+        """Refused: what a program holds in memory cannot be copied.
+
+        Raises:
+            TrackerError: Always.
+        """
+        raise TrackerError(f"{self.name} is a program of its own, whose state cannot be copied")
+
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Start the program and tell it the camera.
 

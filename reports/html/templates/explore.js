@@ -87,7 +87,7 @@ class Explore {
     const all = this.data;
     $("explore-count").textContent = `${trackers.length} of ${all.trackers.length} trackers, ${sequences.length} of ${all.sequences.length} sequences`;
     const unit = ratio ? `ratio to ${all.referenceName}` : { m: "millimetres", deg: "degrees" }[metric?.unit ?? "m"];
-    const base = metric?.key === "ate_rmse_m" && metric.which === "online" ? "lost frames held, failures counted as not moving or worse" : "over the runs that succeeded";
+    const base = metric?.key === "ate_rmse_m" && metric.which === "online" ? "lost frames held, failures counted as a static camera or worse" : "over the runs that succeeded";
     $("explore-caption").textContent = metric ? `${metric.name} of the ${metric.which} trajectory, ${unit}: median over the repeats, ${base}. Bold: best of the ranked trackers shown.${[...this.cells.values()].some((cell) => cell.seen) ? ` ${this.data.seen} masks of a network that was trained on this scene: takes no part in bold and colour.` : ""} A cell leads to the run with the median error, the numbers behind it to the others. ${all.protocol}.` : "No run has this number.";
     drawExploreFigures(this, trackers, sequences);
   }

@@ -34,7 +34,7 @@ def ate_of(name, frames, **settings):
     assert {result.state for result in results} == {"ok"}
     estimate = Trajectory(sequence.timestamps, np.stack([result.T_world_cam for result in results]))
     metrics = evaluate(estimate, sequence.ground_truth, "tum-rgbd/v1").metrics
-    return metrics["ate_rmse_m"], metrics["never_move_ate_rmse_m"]
+    return metrics["ate_rmse_m"], metrics["static_camera_ate_rmse_m"]
 
 
 @needs_opencv
