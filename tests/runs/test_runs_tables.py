@@ -117,7 +117,7 @@ def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
     listed, table = set(list_runs(store)[0][0]), set(store.frame(trials=True).columns)
     reported = set(load_frame(store).columns)
     assert listed - table == {"seen_in_training"} and "seen_in_training" in reported
-    assert listed - reported == {"reason", "started"}
+    assert listed - reported == {"identity", "reason", "started"}
     shared = {
         "run_id",
         "frames",

@@ -38,8 +38,9 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
         - ``string``: run_id, kind (``run``, ``imported``), tracker, label (its name in tables), settings (those that
           were asked for, ``name=value; ...``), provenance, sequence, frames (``A:B, every 2nd``, missing for all),
           split, repeat (``seed 0, offset 2``), status, reason (missing for ``ok``), study (of which the run is a trial,
-          missing for any other run), identity (``unverified`` for runs of an older scheme of ids, else missing), device, segmentation (source of the masks),
-          protocol_id, protocol_digest and trajectory (``online``, ``final``): what the errors hold under and are of.
+          missing for any other run), identity (``unverified`` for runs of an older scheme of ids, else missing),
+          device, segmentation (source of the masks), protocol_id, protocol_digest and trajectory (``online``,
+          ``final``): what the errors hold under and are of.
         - ``Int64``: seed, offset, noise (missing for the sequence's own), stride, threads, n_frames, n_processed,
           n_tracked, n_lost, keyframes, map_points, maps.
         - ``Float64``: coverage (0 to 1), frame_ms (median, milliseconds, segmentation included, decoding excluded),
