@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.checks import check_sensors, check_trajectory
+from dynslam_bench.contracts.checks import check_sensors, check_trajectory, tracker_code
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
@@ -180,13 +180,16 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """
         finalize = getattr(self._tracker, "finalize", None)
         if self._final is None and finalize is not None:
-            self._final = check_trajectory(finalize(), self.tracker_spec.id)
+            with tracker_code():
+                final = finalize()
+            self._final = check_trajectory(final, self.tracker_spec.id)
         return self._final
 
     def map_outputs(self) -> Any:
         """The tracker's keyframes and map points (``slam.outputs.MapOutputs``); None if it offers none."""
         outputs = getattr(self._tracker, "map_outputs", None)
-        return outputs() if outputs is not None else None
+        with tracker_code():
+            return outputs() if outputs is not None else None
 
     def save_map(self, path: Path | str, made_by: str = "") -> None:
         """Write the tracker's map to a file from which a later run may start; `made_by` says in words by which run.
@@ -198,7 +201,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if save is None:
             why = "has not begun: call reset()" if self._tracker is None else "cannot save its map"
             raise TrackerError(f"tracker '{self.tracker_spec.id}' {why}")
-        save(Path(path), made_by)
+        with tracker_code():
+            save(Path(path), made_by)
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
@@ -220,9 +224,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         try:
             self._apply_options(options or {})
             tracker = self._ready_tracker()
-            if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
-                tracker.configure(self.settings)  # type: ignore[attr-defined]
-            tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
+            with tracker_code():
+                if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
+                    tracker.configure(self.settings)  # type: ignore[attr-defined]
+                tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
         except Exception:
             vars(self).update(before)
             self.close()
@@ -244,7 +249,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """
         tracker = self._running_tracker()
         if self._actions.parameters:
-            tracker.configure(self._actions.settings(action))  # type: ignore[attr-defined]
+            steered = self._actions.settings(action)
+            with tracker_code():
+                tracker.configure(steered)  # type: ignore[attr-defined]
         self._track_next(tracker)
         reward = self.episode.outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
@@ -309,7 +316,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         tracker, self._tracker, self._tracker_key = self._tracker, None, None
         close = getattr(tracker, "close", None)
         if close is not None:
-            close()
+            with tracker_code():
+                close()
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
@@ -363,7 +371,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 fps=self.sequence.fps,
                 cache=self._cache,
             )
-            self._tracker = build_tracker(self.tracker_spec, self.settings, context)
+            with tracker_code():
+                self._tracker = build_tracker(self.tracker_spec, self.settings, context)
             self._tracker_key = key
             if self._actions.parameters and not isinstance(self._tracker, Steerable):
                 raise TrackerError(

@@ -73,8 +73,9 @@ def run_one(
         The record.
 
     Raises:
-        DynslamError: The request names something unknown or unfit, the store cannot be written, or what a run needs
-            broke (`InfrastructureError`); nothing is stored then.
+        DynslamError: The request names something unknown or unfit, something other than the tracker's own code raised
+            (an image, a mask or a file that cannot be read), the store cannot be written, or what a run needs broke
+            (`InfrastructureError`); nothing is stored then.
     """
     resolved = resolve(run) if isinstance(run, RunSpec) else run
     run_id = resolved.run_id
@@ -91,7 +92,9 @@ def run_one(
         listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
         verdict = _watched(resolved, work, job, listener, cancelled, at_a_time)
         if verdict.refused:
-            raise RunError(f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}")
+            raise RunError(
+                f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
+            )
         try:
             frames = FrameLog.read(work / FRAMES_FILE)
             frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
