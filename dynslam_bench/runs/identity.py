@@ -12,7 +12,7 @@ from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.errors import RunError, SequenceError, did_you_mean
 from dynslam_bench.core.fingerprint import code_digest, named_digests, path_digest, plugin_digest
-from dynslam_bench.core.machine import versions
+from dynslam_bench.core.machine import this_machine, versions
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
@@ -119,6 +119,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "threads": spec.threads,
         **({"cache": True} if spec.cache else {}),
         "realtime": spec.realtime,
+        **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
         "opencv": known.get("opencv", ""),

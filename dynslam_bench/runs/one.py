@@ -168,6 +168,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     spec, identity, final = resolved.spec, resolved.identity, verdict.final
     total = len(resolved.sequence)
     status, reason = _judge(verdict, frames, total)
+    if status == "ok" and spec.realtime and (dropped := frames.count("dropped")):
+        reason = f"{dropped} of {total} frames dropped while the tracker was busy"
     return RunRecord(
         run_id=resolved.run_id,
         status=status,

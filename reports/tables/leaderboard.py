@@ -106,7 +106,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"A run that failed or was lost counts as a camera that never moves, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
-        "in the map of an earlier one, trackers that lack "
+        "in the map of an earlier one, real-time runs beside others, trackers that lack "
         "sequences or never succeeded.",
     ]
     if still := _no_better_than_still(board):
