@@ -14,7 +14,7 @@ from dynslam_bench.core.seeding import stream
 from .record_timings import slam_env_of
 
 WARM_UP_FRAMES = 12
-"""Tracked off the clock: enough for keyframes and bundle adjustment, so for every kernel and network of a usual frame."""
+"""Tracked off the clock: enough for keyframes and bundle adjustment, so every kernel and network has run once."""
 
 
 class DropFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.checks import check_sensors, check_trajectory, tracker_code
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
+from dynslam_bench.contracts.sequence import exact_stamps
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
@@ -164,13 +165,18 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return self._actions.neutral if self._actions.parameters else 0
 
     @property
+    def exact_stamps(self) -> dict[float, int]:
+        """The nanoseconds of every frame's stamp by its seconds: a float of Unix time does not hold them."""
+        return exact_stamps(self.sequence)
+
+    @property
     def timings(self) -> list[dict[str, float]]:
         """Seconds by stage of every frame so far: ``read``, ``total`` and the tracker's stages (see `FrameOutcome`)."""
         return [dict(outcome.timings) for outcome in self.episode.outcomes]
 
     def online_trajectory(self) -> Trajectory:
         """Poses of the frames that were tracked, each as it was when the frame came."""
-        return self.episode.trajectory()
+        return self.episode.trajectory().with_exact(self.exact_stamps)
 
     def final_trajectory(self) -> Trajectory | None:
         """The tracker's trajectory after its last optimisation of the map; None if it has no ``finalize``.
@@ -182,7 +188,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if self._final is None and finalize is not None:
             with tracker_code():
                 final = finalize()
-            self._final = check_trajectory(final, self.tracker_spec.id)
+            self._final = check_trajectory(final, self.tracker_spec.id).with_exact(self.exact_stamps)
         return self._final
 
     def map_outputs(self) -> Any:

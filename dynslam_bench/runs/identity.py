@@ -10,7 +10,7 @@ from typing import Any
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.core.errors import RunError, SequenceError, did_you_mean
+from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.fingerprint import code_digest, named_digests, path_digest, plugin_digest
 from dynslam_bench.core.machine import this_machine, versions
 from dynslam_bench.core.plugins import Registry, load_object
@@ -19,7 +19,7 @@ from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
 from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
-from dynslam_bench.envs.source import open_frames, preprocessing_of
+from dynslam_bench.envs.source import check_frames, open_frames, preprocessing_of
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.segmentation.availability import segmentation_source
@@ -87,8 +87,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     sequence = open_frames(
         spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride, preprocessing_of(settings)
     )
-    if len(sequence) < 2:
-        raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
+    check_frames(sequence)
     check_sensors(tracker, sequence)
     _check_degradation(spec.degrade)
     device = resolve_device(spec.device)

@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.contracts.sequence import exact_stamps, timestamps_ns
 from dynslam_bench.core.errors import InfrastructureError, RunError
 from dynslam_bench.core.machine import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
@@ -97,14 +98,15 @@ def run_one(
             )
         try:
             frames = FrameLog.read(work / FRAMES_FILE)
-            frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
+            title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
+            frames.write(work, title, exact_stamps(resolved.sequence))
             (work / FRAMES_FILE).unlink(missing_ok=True)
         except OSError as error:
             raise InfrastructureError(f"cannot write {work}: {error.strerror}", "the run is not stored") from error
         check_unchanged(resolved.start_map, resolved.settings)
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
-            store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)
+            store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)
             store.publish(work, record)
     return record
 

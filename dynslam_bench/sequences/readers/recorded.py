@@ -70,6 +70,7 @@ class RecordedSequence:
 
     Attributes:
         folder: The sequence's folder.
+        timestamps_ns: Stamps of the colour images in nanoseconds, int64 ``[N]``.
         dropped: What was not used, and why.
 
     Raises:
@@ -109,6 +110,8 @@ class RecordedSequence:
                 f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
                 "do both lists use the same clock?",
             )
+        self.timestamps_ns = colour.stamps_ns[index[0]]
+        self.timestamps_ns.flags.writeable = False
         self._timestamps = colour.stamps[index[0]]
         self._timestamps.flags.writeable = False
         self._colour = [colour.files[i] for i in index[0]]
@@ -247,7 +250,7 @@ def _existing(folder: Path, images: ImageList, kind: str) -> tuple[ImageList, li
     if len(missing) > MISSING_TOLERATED * len(images):
         _refuse(folder, missing, len(images), kind, "missing")
     there = [i for i, size in enumerate(sizes) if size is not None]
-    kept = replace(images, stamps=images.stamps[there], files=tuple(images.files[i] for i in there))
+    kept = replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
     return kept, _file_sizes(folder, kept.files, kind)
 
 
@@ -280,7 +283,7 @@ def _turned(truth: Trajectory | None, R_body_cam: tuple[tuple[float, float, floa
     """The camera's orientations, of a truth that holds those of the body that carries it."""
     if truth is None or R_body_cam is None:
         return truth
-    return Trajectory(truth.timestamps, in_camera_axes(truth.T_world_cam, R_body_cam))
+    return truth.with_poses(in_camera_axes(truth.T_world_cam, R_body_cam))
 
 
 def _count(
