@@ -111,7 +111,9 @@ def test_tum_missing_folder_and_binary_files(tmp_path):
 
 def test_stamps_that_no_file_tells_apart_make_no_trajectory():
     poses = np.tile(np.eye(4), (2, 1, 1))
-    with pytest.raises(TrajectoryError, match=r"not strictly increasing in nanoseconds: 1\.000000000 then 1\.000000000"):
+    with pytest.raises(
+        TrajectoryError, match=r"not strictly increasing in nanoseconds: 1\.000000000 then 1\.000000000"
+    ):
         Trajectory(np.array([1.0, 1.0 + 4e-10]), poses)
     assert Trajectory(np.array([1.0, 1.0 + 2e-9]), poses).timestamps_ns.tolist() == [1_000_000_000, 1_000_000_002]
 

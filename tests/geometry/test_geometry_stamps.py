@@ -70,7 +70,9 @@ def test_files_keep_nanoseconds(tmp_path: Path) -> None:
     write_kitti(tmp_path / "k.txt", read, tmp_path / "times.txt")
     assert (tmp_path / "times.txt").read_text().split() == texts
     assert read_kitti(tmp_path / "k.txt", tmp_path / "times.txt").timestamps_ns.tolist() == read.timestamps_ns.tolist()
-    assert file_interface.read_tum_trajectory_file(tmp_path / "b.txt").timestamps.tolist() == read.timestamps[3:].tolist()
+    assert (
+        file_interface.read_tum_trajectory_file(tmp_path / "b.txt").timestamps.tolist() == read.timestamps[3:].tolist()
+    )
 
 
 @pytest.mark.parametrize("gap", [1, 200, 999])

@@ -40,8 +40,11 @@ def test_every_file_of_a_run_has_the_frames_own_stamps(store: RunStore, folder: 
     record = run_one(RunSpec(tracker=TARGET, sequence=str(folder)), store)
     made, part = store.folder(record.run_id), store.root / "sequences" / record.sequence.part
     for path in (
-        made / "trajectory_online.txt", made / "trajectory_final.txt", part / "timestamps.txt", part / "groundtruth.txt",
-    ):  # fmt: skip
+        made / "trajectory_online.txt",
+        made / "trajectory_final.txt",
+        part / "timestamps.txt",
+        part / "groundtruth.txt",
+    ):
         assert column(path) == stamps(), path.name
     assert [line.split(",")[1] for line in (made / "frames.csv").read_text().splitlines()[1:]] == stamps()
     assert record.status == "ok" and score(store, record).metrics["ate_rmse_m"] > 0
