@@ -11,8 +11,9 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.checks import check_sensors, check_trajectory
+from dynslam_bench.contracts.checks import check_sensors, check_trajectory, tracker_code
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
+from dynslam_bench.contracts.sequence import exact_stamps
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
@@ -161,13 +162,18 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return self._actions.neutral if self._actions.parameters else 0
 
     @property
+    def exact_stamps(self) -> dict[float, int]:
+        """The nanoseconds of every frame's stamp by its seconds: a float of Unix time does not hold them."""
+        return exact_stamps(self.sequence)
+
+    @property
     def timings(self) -> list[dict[str, float]]:
         """Seconds by stage of every frame so far: ``read``, ``total`` and the tracker's stages (see `FrameOutcome`)."""
         return [dict(outcome.timings) for outcome in self.episode.outcomes]
 
     def online_trajectory(self) -> Trajectory:
         """Poses of the frames that were tracked, each as it was when the frame came."""
-        return self.episode.trajectory()
+        return self.episode.trajectory().with_exact(self.exact_stamps)
 
     def final_trajectory(self) -> Trajectory | None:
         """The tracker's trajectory after its last optimisation of the map; None if it has no ``finalize``.
@@ -177,13 +183,16 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """
         finalize = getattr(self._tracker, "finalize", None)
         if self._final is None and finalize is not None:
-            self._final = check_trajectory(finalize(), self.tracker_spec.id)
+            with tracker_code():
+                final = finalize()
+            self._final = check_trajectory(final, self.tracker_spec.id).with_exact(self.exact_stamps)
         return self._final
 
     def map_outputs(self) -> Any:
         """The tracker's keyframes and map points (``slam.outputs.MapOutputs``); None if it offers none."""
         outputs = getattr(self._tracker, "map_outputs", None)
-        return outputs() if outputs is not None else None
+        with tracker_code():
+            return outputs() if outputs is not None else None
 
     def save_map(self, path: Path | str, made_by: str = "") -> None:
         """Write the tracker's map to a file from which a later run may start; `made_by` says in words by which run.
@@ -195,7 +204,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if save is None:
             why = "has not begun: call reset()" if self._tracker is None else "cannot save its map"
             raise TrackerError(f"tracker '{self.tracker_spec.id}' {why}")
-        save(Path(path), made_by)
+        with tracker_code():
+            save(Path(path), made_by)
 
     # -- Gymnasium -------------------------------------------------------------------------------------------------
 
@@ -217,9 +227,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         try:
             self._apply_options(options or {})
             tracker = self._ready_tracker()
-            if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
-                tracker.configure(self.settings)  # type: ignore[attr-defined]
-            tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
+            with tracker_code():
+                if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
+                    tracker.configure(self.settings)  # type: ignore[attr-defined]
+                tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
         except Exception:
             vars(self).update(before)
             self.close()
@@ -242,7 +253,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         tracker = self._running_tracker()
         settings = self._actions.settings(action)
         if self._actions.parameters:
-            tracker.configure(settings)  # type: ignore[attr-defined]
+            with tracker_code():
+                tracker.configure(settings)  # type: ignore[attr-defined]
         self._track_next(tracker)
         reward = self.episode.outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
@@ -307,7 +319,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         tracker, self._tracker, self._tracker_key = self._tracker, None, None
         close = getattr(tracker, "close", None)
         if close is not None:
-            close()
+            with tracker_code():
+                close()
 
     __deepcopy__ = deep_copy
 
@@ -363,7 +376,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 fps=self.sequence.fps,
                 cache=self._cache,
             )
-            self._tracker = build_tracker(self.tracker_spec, self.settings, context)
+            with tracker_code():
+                self._tracker = build_tracker(self.tracker_spec, self.settings, context)
             self._tracker_key = key
             if self._actions.parameters and not isinstance(self._tracker, Steerable):
                 raise TrackerError(

@@ -8,10 +8,11 @@ from typing import cast
 
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import refuse_close
 from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.view import SequenceView
@@ -51,10 +52,11 @@ def open_frames(
 
 
 def check_frames(sequence: Sequence) -> None:
-    """Refuse a sequence that is too short for an episode, or whose stamps tell no frame from another.
+    """Refuse a sequence that is too short for an episode, or whose stamps tell no frame or true pose from another.
 
     Raises:
-        SequenceError: It has fewer than two frames, or stamps that do not increase.
+        SequenceError: It has fewer than two frames, stamps that do not increase, or two of the frames or of the ground
+            truth that differ by less than 1 us.
     """
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
@@ -67,6 +69,10 @@ def check_frames(sequence: Sequence) -> None:
             f"that of frame {at}: {stamps[at]} after {stamps[at - 1]} s",
             "each frame has a stamp of its own, in seconds, ascending",
         )
+    refuse_close(timestamps_ns(sequence), f"frames of '{sequence.id}'", SequenceError)
+    truth = sequence.ground_truth
+    if truth is not None:
+        refuse_close(truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError)
 
 
 def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:

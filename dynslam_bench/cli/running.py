@@ -44,11 +44,12 @@ from .options import (
     Video,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, note, progress
+from .output import SOME_RUNS_FAILED, complain, note, progress
 from .panels import MEASURE
 from .run_rows import drift_note, seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.errors import DynslamError
     from dynslam_bench.core.records import Record
     from dynslam_bench.runs import RunEvent, RunRecord, RunSpec
 
@@ -256,14 +257,18 @@ def finish(
     as_json: bool,
     scheduler: str | None = None,
 ) -> None:
-    """Make runs, show them, and exit with 3 if some failed or were lost, or have no map though it was asked for."""
+    """Make runs, show them, and exit with 3 if some failed, were lost or cannot be made, or lack a map asked for."""
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.many import pictures_asked
     from dynslam_bench.slam.mapping.saved_map import MAP_FILE
 
     store = RunStore(results)
     reused: set[str] = set()
-    records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
+    faults: list[str] = []
+    made_with: dict[str, Any] = {"scheduler": scheduler, "reused": reused, "faults": faults}
+    records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, **made_with)
+    if not records:
+        raise typer.Exit(1)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
     missing = show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
     made = [record for record in records if record.run_id not in reused]  # what is stored already was said then
@@ -271,7 +276,7 @@ def finish(
         if caution:
             note(caution)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
-    if MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
+    if faults or MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
 
 
@@ -292,8 +297,13 @@ def make_runs(
     protocol: str = "tum-rgbd/v1",
     scheduler: str | None = None,
     reused: set[str] | None = None,
+    faults: list[str] | None = None,
 ) -> list[RunRecord]:
-    """`run_many` with a progress bar; the ids of runs that were stored already are added to `reused`."""
+    """`run_many` with a progress bar.
+
+    The ids of runs that were stored already are added to `reused`. What is wrong with runs that cannot be made is said
+    once and added to `faults`; without `faults` the first of them is raised when all others are stored.
+    """
     from dynslam_bench.runs import run_many
 
     with progress(f"{len(specs)} run{'s' * (len(specs) != 1)}") as advance:
@@ -310,7 +320,12 @@ def make_runs(
                     note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
             advance(sum(shares.values()), event.total, run_words(event))
 
-        with_executor: dict[str, Any] = {}
+        def fault(_: RunSpec, error: DynslamError) -> None:
+            if faults is not None and str(error) not in faults:
+                faults.append(str(error))
+                complain(f"error: {error}")
+
+        with_executor: dict[str, Any] = {} if faults is None else {"on_fault": fault}
         if scheduler is not None:
             with_executor["executor"] = dask_executor(scheduler)
         return run_many(

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.errors import SequenceError, TrackerError
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .result import TrackingState, TrackResult
@@ -29,6 +31,45 @@ FARTHEST_M = 1e9
 
 class TrackerContractError(TrackerError):
     """A tracker returned something that is no valid result: its run counts as ``invalid``, not as crashed."""
+
+
+_MARK = "_dynslam_raised_by_tracker"
+
+
+@contextmanager
+def tracker_code() -> Iterator[None]:
+    """Mark every exception that leaves the block: the tracker's own code raised it (see `raised_by_tracker`)."""
+    try:
+        yield
+    except BaseException as error:
+        setattr(error, _MARK, True)
+        raise
+
+
+def raised_by_tracker(error: BaseException) -> bool:
+    """Whether an exception came out of the tracker's own code, not out of what reads its data or measures it."""
+    return isinstance(error, TrackerError) or getattr(error, _MARK, False)
+
+
+def check_frame(frame: Frame, camera: Camera) -> None:
+    """Refuse what is no frame of this camera.
+
+    Raises:
+        SequenceError: Colour is not uint8, depth no floating point in metres, sizes differ from the camera's, or the
+            timestamp is not finite.
+    """
+    rgb, depth = np.asarray(frame.rgb), np.asarray(frame.depth)
+    if rgb.dtype != np.uint8:
+        raise SequenceError(f"frame {frame.index} has colour of type {rgb.dtype}", "it must be uint8")
+    if depth.dtype.kind != "f":
+        raise SequenceError(f"frame {frame.index} has depth of type {depth.dtype}", "it must be float32, in metres")
+    if rgb.shape != (camera.height, camera.width, 3) or depth.shape != (camera.height, camera.width):
+        raise SequenceError(
+            f"frame {frame.index} has colour {rgb.shape} and depth {depth.shape}, "
+            f"the camera is {camera.width}x{camera.height}"
+        )
+    if not np.isfinite(frame.timestamp):
+        raise SequenceError(f"frame {frame.index} has the timestamp {frame.timestamp}", "it must be finite seconds")
 
 
 @dataclass(frozen=True)

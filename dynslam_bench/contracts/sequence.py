@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import from_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
 
 
@@ -56,6 +57,7 @@ class Sequence(Protocol):
     """A recorded or rendered RGB-D sequence; frames are decoded (or rendered) when they are asked for.
 
     One without depth images says so with an attribute ``has_depth`` that is False; its frames' depth is 0 everywhere.
+    One whose stamps are known to more digits than a float holds has an attribute ``timestamps_ns``, int64 ``[N]``.
     """
 
     @property
@@ -105,6 +107,17 @@ class Sequence(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+
+def timestamps_ns(sequence: Sequence) -> NDArray[np.int64]:
+    """Stamps of all frames in nanoseconds, int64 ``[N]``."""
+    known: NDArray[np.int64] | None = getattr(sequence, "timestamps_ns", None)
+    return from_seconds(sequence.timestamps.tolist()) if known is None else known
+
+
+def exact_stamps(sequence: Sequence) -> dict[float, int]:
+    """The nanoseconds of every frame's stamp by its seconds."""
+    return dict(zip(sequence.timestamps.tolist(), timestamps_ns(sequence).tolist(), strict=True))
 
 
 @dataclass(frozen=True)

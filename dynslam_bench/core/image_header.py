@@ -29,6 +29,12 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     return None if match is None else (int(match[1]), int(match[2]))
 
 
+def is_whole_jpeg(data: bytes) -> bool:
+    """Whether the image data of a JPEG file ends with its end marker, which occurs nowhere within that data."""
+    scan = next((position for position in _segments(data) if data[position + 1] == 0xDA), len(data))
+    return data.find(b"\xff\xd9", scan) >= 0
+
+
 def _pair(layout: str, data: bytes, position: int) -> tuple[int, int]:
     width, height = struct.unpack_from(layout, data, position)
     return abs(width), abs(height)  # a BMP whose rows come from the top has a negative height

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DynslamError
-from .image_header import image_size
+from .image_header import image_size, is_whole_jpeg
 from .reading import MEGABYTE, read_bytes
 
 Image = NDArray[np.integer | np.floating]
@@ -18,6 +18,7 @@ MOST_PIXELS = 1 << 26
 """Larger images (67 megapixels) are refused where nothing says which size to expect."""
 MOST_BYTES = 512 * MEGABYTE
 AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+_JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
@@ -49,8 +50,9 @@ def read_image(
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
     if not data:
         raise kind(f"image {path} is empty (0 bytes)", "fetch it again")
-    if data.startswith(_PNG_START) and not _is_whole_png(data):
-        # some OpenCV versions fill what is missing of a PNG with zeros, some take the memory that a chunk claims
+    whole = not data.startswith(_PNG_START) or _is_whole_png(data)
+    if not whole or (data.startswith(_JPEG_START) and not is_whole_jpeg(data)):
+        # OpenCV fills what is missing of a JPEG, some versions also of a PNG; some take the memory that a chunk claims
         raise kind(f"image {path} is truncated ({len(data)} bytes)", "fetch it again")
     found = image_size(data)
     if found is not None and size is not None and found != size:

@@ -14,8 +14,9 @@ from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.core.files import write_atomic
 
 from . import se3
+from .stamps import format_ns, to_seconds
 from .trajectory import Trajectory
-from .tum_file import read_table
+from .tum_file import read_stamped_table, read_table
 
 _MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 
@@ -51,20 +52,25 @@ def read_kitti(
             raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     poses[:, :3, :3] = u @ vt
+    exact = None
     if times is None:
         if not (np.isfinite(fps) and fps > 0):
             raise TrajectoryError(f"the frame rate is {fps!r}, not a positive number of Hz")
         stamps = np.arange(len(poses)) / fps
     else:
         named = described or (str(times) if isinstance(times, (str, Path)) else "the list")
-        stamps = read_table(Path(times), 1, "timestamp")[:, 0] if isinstance(times, (str, Path)) else times
+        if isinstance(times, (str, Path)):
+            exact = read_stamped_table(Path(times), 1, "timestamp")[1]
+            stamps = to_seconds(exact)
+        else:
+            stamps = times
         if len(stamps) != len(poses):
             raise TrajectoryError(f"{path} has {len(poses)} poses but {named} has {len(stamps)} stamps")
-    return Trajectory(stamps, poses)
+    return Trajectory(stamps, poses, exact)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:
-    """Write poses in KITTI's format and, if `times` is given, their stamps beside them (six decimals).
+    """Write poses in KITTI's format and, if `times` is given, their stamps beside them (nine decimals).
 
     Raises:
         DynslamError: A file cannot be written.
@@ -72,4 +78,4 @@ def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | No
     rows = trajectory.T_world_cam[:, :3].reshape(-1, 12).tolist()
     write_atomic(Path(path), "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
     if times is not None:
-        write_atomic(Path(times), "".join(f"{stamp:.6f}\n" for stamp in trajectory.timestamps.tolist()))
+        write_atomic(Path(times), "".join(f"{format_ns(ns)}\n" for ns in trajectory.timestamps_ns.tolist()))

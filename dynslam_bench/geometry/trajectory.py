@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import TrajectoryError
 
 from . import se3
+from .stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,10 +22,13 @@ class Trajectory:
     Attributes:
         timestamps: Seconds, float64 ``[N]``, strictly increasing.
         T_world_cam: Camera-to-world poses, float64 ``[N, 4, 4]``.
+        exact_ns: The same stamps in nanoseconds where they are known to more digits than a float holds, int64 ``[N]``;
+            None where the floats are all that is known.
     """
 
     timestamps: NDArray[np.float64]
     T_world_cam: NDArray[np.float64]
+    exact_ns: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         stamps = np.ascontiguousarray(self.timestamps, dtype=np.float64)
@@ -33,12 +39,27 @@ class Trajectory:
             raise TrajectoryError("a trajectory holds values that are not finite")
         if (np.diff(stamps) <= 0).any():
             at = int(np.argmax(np.diff(stamps) <= 0))
-            raise TrajectoryError(f"stamps are not strictly increasing: {stamps[at]:.6f} then {stamps[at + 1]:.6f}")
+            raise TrajectoryError(f"stamps are not strictly increasing: {stamps[at]:.9f} then {stamps[at + 1]:.9f}")
         object.__setattr__(self, "timestamps", stamps)
         object.__setattr__(self, "T_world_cam", poses)
+        if self.exact_ns is not None:
+            object.__setattr__(self, "exact_ns", np.ascontiguousarray(self.exact_ns, dtype=np.int64))
+            if len(self.timestamps_ns) != len(stamps):
+                raise TrajectoryError(f"a trajectory has {stamps.size} stamps but {len(self.timestamps_ns)} in ns")
+        if len(stamps) > 1 and np.diff(stamps).min() * NS_PER_S < LEAST_GAP_NS:
+            gaps = np.diff(self.timestamps_ns)
+            at = int(gaps.argmin())
+            if gaps[at] <= 0:
+                first, second = (format_ns(int(ns)) for ns in self.timestamps_ns[at : at + 2])
+                raise TrajectoryError(f"stamps are not strictly increasing in nanoseconds: {first} then {second}")
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    @cached_property
+    def timestamps_ns(self) -> NDArray[np.int64]:
+        """Stamps in nanoseconds, int64 ``[N]``: what files hold."""
+        return from_seconds(self.timestamps.tolist()) if self.exact_ns is None else self.exact_ns
 
     @property
     def positions(self) -> NDArray[np.float64]:
@@ -52,11 +73,24 @@ class Trajectory:
 
     def select(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Trajectory:
         """The poses at an index, mask or slice."""
-        return Trajectory(self.timestamps[index], self.T_world_cam[index])
+        exact = None if self.exact_ns is None else self.exact_ns[index]
+        return Trajectory(self.timestamps[index], self.T_world_cam[index], exact)
+
+    def with_poses(self, T_world_cam: NDArray[np.float64]) -> Trajectory:
+        """Other poses ``[N, 4, 4]`` at the same stamps."""
+        return Trajectory(self.timestamps, T_world_cam, self.exact_ns)
+
+    def with_exact(self, exact: Mapping[float, int]) -> Trajectory:
+        """The same trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
+        known = [exact.get(stamp) for stamp in self.timestamps.tolist()]
+        if all(ns is None for ns in known):
+            return self
+        stamps = [ns_of(s) if ns is None else ns for s, ns in zip(self.timestamps.tolist(), known, strict=True)]
+        return Trajectory(self.timestamps, self.T_world_cam, np.array(stamps, dtype=np.int64))
 
     def transformed(self, T_new_world: NDArray[np.float64]) -> Trajectory:
         """The same trajectory in another world frame: ``T_new_world @ T_world_cam``."""
-        return Trajectory(self.timestamps, T_new_world @ self.T_world_cam)
+        return self.with_poses(T_new_world @ self.T_world_cam)
 
     def relative_to_first(self) -> Trajectory:
         """The trajectory in the frame of its own first pose."""

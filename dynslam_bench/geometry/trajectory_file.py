@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.core.reading import read_lines
 
 from .kitti_file import read_kitti
-from .tum_file import FileNotes, TumFile, load_tum
+from .stamps import to_seconds
+from .tum_file import FileNotes, TumFile, load_tum, read_stamps
 
 KITTI_VALUES = 12
 
@@ -29,7 +28,10 @@ def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> T
     path = Path(path)
     if timestamps is None or _values(path) != KITTI_VALUES:
         return load_tum(path)
-    trajectory = read_kitti(path, np.array(_stamps(Path(timestamps))), described=str(timestamps))
+    ns = read_stamps(Path(timestamps))
+    seconds = to_seconds(ns)
+    trajectory = read_kitti(path, seconds, described=str(timestamps))
+    trajectory = trajectory.with_exact(dict(zip(seconds.tolist(), ns.tolist(), strict=True)))
     return TumFile(trajectory, FileNotes(lines=len(trajectory)))
 
 
@@ -40,16 +42,3 @@ def _values(path: Path) -> int:
         if parts:
             return len(parts)
     return 0
-
-
-def _stamps(path: Path) -> list[float]:
-    found = []
-    for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
-        parts = line.partition("#")[0].replace(",", " ").split()
-        if not parts:
-            continue
-        try:
-            found.append(float(parts[0]))
-        except ValueError:
-            raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds") from None
-    return found

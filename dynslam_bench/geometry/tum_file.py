@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import io
 from array import array
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import RECORD_BYTES, read_lines
 
 from . import se3
+from .stamps import format_ns, parse_ns, refuse_close, to_seconds
 from .trajectory import Trajectory
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
@@ -29,8 +30,8 @@ MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
 _UNIT_TOLERANCE = 0.01
-_LATEST_S = 1e11
-"""Seconds, some 3,000 years: larger stamps are nanoseconds or something else."""
+_LATEST_S = 9e9
+"""Seconds, the year 2255: larger stamps are nanoseconds or something else, and 64 bits of nanoseconds end there."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
 
     Raises:
-        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number) or no valid pose.
+        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number), two stamps that
+            differ by less than 1 us, or no valid pose.
     """
     return load_tum(path).trajectory
 
@@ -90,7 +92,7 @@ def load_tum(path: str | Path) -> TumFile:
         TrajectoryError: As `read_tum`.
     """
     path = Path(path)
-    values = read_table(path, 8, _COLUMNS)
+    values, texts = _read_table(path, 8, _COLUMNS)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
@@ -103,25 +105,27 @@ def load_tum(path: str | Path) -> TumFile:
     if not valid.any():
         raise TrajectoryError(f"{path} holds no valid pose", "; ".join(FileNotes(**counted).describe()))
     kept = values[valid]
-    order = np.argsort(kept[:, 0], kind="stable")
-    stamps = kept[order, 0]
-    last_of_stamp = np.append(np.diff(stamps) > 0, True)
-    chosen = kept[order][last_of_stamp]
-    if chosen[-1, 0] > _LATEST_S:
+    if (latest := float(np.abs(kept[:, 0]).max())) > _LATEST_S:
         raise TrajectoryError(
-            f"{path} has stamps up to {chosen[-1, 0]:.4g}, which are no seconds",
+            f"{path} has stamps up to {latest:.4g}, which are no seconds",
             "nanoseconds? EuRoC's tables are read by `eval` and `import` where their heading is left in",
         )
+    ns = np.array([parse_ns(texts[row]) for row in np.flatnonzero(valid)], dtype=np.int64)
+    order = np.argsort(ns, kind="stable")
+    refuse_close(ns[order], str(path), TrajectoryError, lambda stamp: _line_of(path, stamp))
+    last_of_stamp = np.append(np.diff(ns[order]) > 0, True)
+    chosen, exact = kept[order][last_of_stamp], ns[order][last_of_stamp]
     notes = FileNotes(
         **counted,
         duplicates=int((~last_of_stamp).sum()),
-        out_of_order=int((np.diff(kept[:, 0]) < 0).sum()),
+        out_of_order=int((np.diff(ns) < 0).sum()),
     )
-    return TumFile(Trajectory(chosen[:, 0], se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8])), notes)
+    poses = se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8])
+    return TumFile(Trajectory(to_seconds(exact), poses, exact), notes)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:
-    """Write a trajectory with six-decimal stamps; the file appears whole or not at all.
+    """Write a trajectory with stamps to the nanosecond; the file appears whole or not at all.
 
     Args:
         path: Target file.
@@ -129,22 +133,14 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") ->
         comment: Written behind ``#`` above the header, line by line.
 
     Raises:
-        TrajectoryError: Two stamps are equal at six decimals.
         DynslamError: The file cannot be written.
     """
     write_atomic(Path(path), format_tum(trajectory, comment=comment))
 
 
 def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
-    """The text of a TUM trajectory file.
-
-    Raises:
-        TrajectoryError: Two stamps are equal at six decimals.
-    """
-    stamps = [f"{stamp:.6f}" for stamp in trajectory.timestamps.tolist()]
-    same = [a for a, b in pairwise(stamps) if a == b]
-    if same:
-        raise TrajectoryError(f"{len(same)} stamps are equal at six decimals, the first is {same[0]}")
+    """The text of a TUM trajectory file: nine decimals for stamps (seconds) and all other numbers."""
+    stamps = [format_ns(ns) for ns in trajectory.timestamps_ns.tolist()]
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     rows = np.concatenate([position, quaternion], axis=1).tolist()
     lines = [f"# {line}" for line in comment.splitlines()] + [f"# {_COLUMNS}"]
@@ -159,16 +155,72 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     Raises:
         TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
     """
-    whole = _plain_table(path, columns)
-    if whole is not None:
-        return whole
-    values = array("d")
+    return _read_table(path, columns, meaning)[0]
+
+
+def read_stamped_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A table as `read_table` reads it, and its first column, seconds, in nanoseconds ``[N]``.
+
+    Raises:
+        TrajectoryError: As `read_table`; or a stamp is not finite or beyond the range of 64 bits.
+    """
+    values, texts = _read_table(path, columns, meaning)
+    try:
+        return values, np.array([parse_ns(text) for text in texts], dtype=np.int64)
+    except ValueError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+
+
+def read_stamps(path: Path) -> NDArray[np.int64]:
+    """The first numbers of all lines, seconds, in nanoseconds ``[N]``; comments and blank lines are left out.
+
+    Raises:
+        TrajectoryError: The file cannot be read, or a line does not begin with a stamp.
+    """
+    found = []
+    for number, parts in _lines(path):
+        try:
+            found.append(parse_ns(parts[0]))
+        except ValueError:
+            raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds") from None
+    return np.array(found, dtype=np.int64)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number and parts of all lines that hold anything.
+
+    Raises:
+        TrajectoryError: The file cannot be read or is too long.
+    """
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if number > MOST_LINES:
             raise TrajectoryError(f"{path} has more than {MOST_LINES} lines, too many for a trajectory")
-        parts = line.partition("#")[0].replace(",", " ").replace("\t", " ").split()
-        if not parts:
-            continue
+        parts = _parts(line)
+        if parts:
+            yield number, parts
+
+
+def _parts(line: str) -> list[str]:
+    return line.partition("#")[0].replace(",", " ").split()
+
+
+def _line_of(path: Path, ns: int) -> int | None:
+    """The last line that begins with a stamp."""
+    found = None
+    for number, parts in _lines(path):
+        with suppress(ValueError):
+            found = number if parse_ns(parts[0]) == ns else found
+    return found
+
+
+def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[str]]:
+    """The numbers of a table, and the texts of its first column."""
+    whole = _plain_table(path, columns)
+    if whole is not None:
+        return whole
+    values, texts = array("d"), []
+    for number, parts in _lines(path):
+        texts.append(parts[0])
         if len(parts) != columns:
             raise TrajectoryError(
                 f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(len(parts))
@@ -180,18 +232,19 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
             raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
     if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
-    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns), texts
 
 
-def _plain_table(path: Path, columns: int) -> NDArray[np.float64] | None:
+def _plain_table(path: Path, columns: int) -> tuple[NDArray[np.float64], list[str]] | None:
     """The numbers of a file of a usual size and without any fault, read at once; None for every other one."""
     with suppress(OSError, ValueError):  # whatever it is, reading line by line says it
         if 0 < path.stat().st_size <= RECORD_BYTES:
             text = path.read_text(encoding="utf-8-sig").replace(",", " ")
-            if any(line.strip().partition("#")[0] for line in text.splitlines()):  # numpy warns of a table of nothing
+            texts = [parts[0] for line in text.splitlines() if (parts := line.partition("#")[0].split(None, 1))]
+            if texts:  # numpy warns of a table of nothing
                 found = np.loadtxt(io.StringIO(text), ndmin=2)
-                if found.shape[1] == columns:
-                    return found
+                if found.shape == (len(texts), columns):
+                    return found, texts
     return None
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.reading import parse_json, read_lines
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.stamps import format_ns, ns_of
 
 if TYPE_CHECKING:
     from dynslam_bench.envs.episode import FrameOutcome, FrameState
@@ -42,7 +43,7 @@ class FrameRow:
 
     Attributes:
         index: Index of the frame in the run's part of the sequence.
-        timestamp: Seconds; ``frames.csv`` keeps six decimals.
+        timestamp: Seconds; ``frames.csv`` holds them to the nanosecond.
         state: ``initialising``, ``ok``, ``lost``, or ``dropped`` if the frame never reached the tracker.
         frame_error_trans_m: Frame-to-frame translational error in metres; None without ground truth at both frames.
         frame_error_rot_deg: Frame-to-frame rotational error in degrees, likewise.
@@ -122,8 +123,8 @@ def read_log(path: Path) -> tuple[list[FrameRow], str]:
         for line in read_lines(path, kind=RunError):
             if line.endswith("\n"):
                 row = _from_json(line)
-                if rows and round(row.timestamp, 6) <= round(rows[-1].timestamp, 6):
-                    raise ValueError(f"stamp {row.timestamp:.6f} after {rows[-1].timestamp:.6f}")
+                if rows and row.timestamp <= rows[-1].timestamp:
+                    raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
                 rows.append(row)
     except (DynslamError, LookupError, TypeError, ValueError, OverflowError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -176,14 +177,14 @@ def column_names(rows: Iterable[FrameRow]) -> list[str]:
     return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT))]
 
 
-def write_csv(path: Path, rows: Sequence[FrameRow]) -> None:
-    """Write ``frames.csv``."""
+def write_csv(path: Path, rows: Sequence[FrameRow], exact: Mapping[float, int]) -> None:
+    """Write ``frames.csv``; `exact` gives the nanoseconds of stamps by their seconds."""
     columns = column_names(rows)
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = csv.writer(file)
         table.writerow(columns)
         for row in rows:
-            cells = row.cells() | {"timestamp": f"{row.timestamp:.6f}"}
+            cells = row.cells() | {"timestamp": format_ns(exact.get(row.timestamp) or ns_of(row.timestamp))}
             table.writerow([cells.get(name) for name in columns])
 
 

@@ -9,16 +9,16 @@ from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.digests import contents_digest
-from dynslam_bench.core.errors import PluginError, RunError, SequenceError, did_you_mean
+from dynslam_bench.core.errors import PluginError, RunError, did_you_mean
 from dynslam_bench.core.fingerprint import code_digest, distribution_of_module, named_digests, plugin_digest
-from dynslam_bench.core.machine import versions
+from dynslam_bench.core.machine import this_machine, versions
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
 from dynslam_bench.envs.degrade_frames import Degradation
 from dynslam_bench.envs.device import resolve_device
-from dynslam_bench.envs.source import open_frames, preprocessing_of
+from dynslam_bench.envs.source import check_frames, open_frames, preprocessing_of
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.segmentation.availability import segmentation_source
@@ -88,8 +88,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     sequence = open_frames(
         spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride, preprocessing_of(settings)
     )
-    if len(sequence) < 2:
-        raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, a run needs 2 or more")
+    check_frames(sequence)
     check_sensors(tracker, sequence)
     _check_degradation(spec.degrade)
     device = resolve_device(spec.device)
@@ -120,6 +119,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "threads": spec.threads,
         **({"cache": True} if spec.cache else {}),
         "realtime": spec.realtime,
+        **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
         "libraries": libraries_of(settings),

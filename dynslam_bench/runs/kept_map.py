@@ -42,7 +42,7 @@ def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> KeptMap:
     outputs = env.map_outputs()
     if outputs is None:
         return KeptMap(None, notes=not_saved)
-    write_keyframes_csv(folder / "keyframes.csv", outputs)
+    write_keyframes_csv(folder / "keyframes.csv", outputs, env.exact_stamps)
     write_ply(folder / "map.ply", outputs)
     numbers = np.array([record.map for record in outputs.keyframes])
     maps = len(np.unique(numbers))

@@ -59,8 +59,9 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         over = False
         reported = 0
         while True:
-            recorder.add()
             done = base.episode.next_index
+            with at(f"frame {done - 1} of {len(base.sequence)}"):
+                recorder.add()
             send({"type": "frame", "index": done - 1})
             if done - reported >= job["progress_every"] or over:
                 reported = done

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, SequenceError, TrajectoryError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.slam.mapping.saved_map import MAP_FILE
 
@@ -28,6 +28,8 @@ from .storage.store import RunStore
 from .video import VIDEO_FILE
 
 T = TypeVar("T")
+OnFault = Callable[[RunSpec, DynslamError], None]
+"""Called as ``on_fault(spec, error)`` for a run that cannot be made; nothing of it is stored."""
 _LOOK_AGAIN_S = 0.2
 
 
@@ -63,13 +65,15 @@ def run_many(
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
     cancelled: Callable[[], bool] | None = None,
+    on_fault: OnFault | None = None,
 ) -> list[RunRecord]:
     """Make the runs that are not stored yet, and score all of them.
 
     Everything is looked up before the first run begins. A stored run is made again if a video, a sheet or its map is
     asked for that it lacks; one that is given another label gets that, and one that a study made is an ordinary run
     once it is asked for without the study. Each run is a child process; a failure is a record like any other and stops
-    nothing. Interrupting leaves the finished runs stored, so calling again goes on from
+    nothing. A run that cannot be made because its sequence cannot be read, or a file that it needs, stops no other
+    either, and nothing of it is stored. Interrupting leaves the finished runs stored, so calling again goes on from
     there. Several processes may do so at a time on one results folder: each run is made by one of them (not with
     `executor`).
 
@@ -85,21 +89,27 @@ def run_many(
         on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
         protocol: Protocol to score under.
         cancelled: Asked many times a second; True ends the runs on this machine at once, as stopped.
+        on_fault: Told of every run that cannot be made, by one thread at a time. Without it the first such fault is
+            raised when all other runs are stored.
 
     Returns:
-        The records in the order of `specs`.
+        The records in the order of `specs`, without those of runs that cannot be made.
 
     Raises:
-        DynslamError: A spec names something unknown or unfit, or the results folder cannot be written; nothing ran.
+        DynslamError: A spec names something unknown or unfit, or the results folder cannot be written, and nothing ran;
+            or, without `on_fault`, a run could not be made.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     protocol = get_protocol(protocol)
     again = _statuses(retry)
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
-    resolved = [resolve(spec) for spec in specs]
-    store.prepare()
-    bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs, cancelled)
+    resolved, faults = _resolved(specs)
+    if resolved:
+        store.prepare()
+    bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs, cancelled, on_fault)
+    for spec, error in faults:
+        bench.fault(spec, error)
     todo: dict[str, ResolvedRun] = {}
     done: dict[str, RunRecord] = {}
     for run in resolved:
@@ -111,7 +121,25 @@ def run_many(
         else:
             todo[run.run_id] = run
     done |= bench.run_remotely(todo, executor) if executor is not None else bench.run_here(todo, jobs)
-    return [done[run.run_id] for run in resolved]
+    if bench.faults and on_fault is None:
+        raise bench.faults[0]
+    return [done[run.run_id] for run in resolved if run.run_id in done]
+
+
+def _resolved(specs: Iterable[RunSpec]) -> tuple[list[ResolvedRun], list[tuple[RunSpec, DynslamError]]]:
+    """The runs whose sequences can be read, and the others with what is wrong with them.
+
+    Raises:
+        DynslamError: A spec names something else that is unknown or unfit.
+    """
+    resolved: list[ResolvedRun] = []
+    faults: list[tuple[RunSpec, DynslamError]] = []
+    for spec in specs:
+        try:
+            resolved.append(resolve(spec))
+        except (SequenceError, TrajectoryError) as error:
+            faults.append((spec, error))
+    return resolved, faults
 
 
 class _Waiting:
@@ -162,8 +190,11 @@ class _Bench:
         on_progress: OnProgress | None,
         jobs: int,
         cancelled: Callable[[], bool] | None,
+        on_fault: OnFault | None,
     ) -> None:
         self.jobs = jobs
+        self.on_fault = on_fault
+        self.faults: list[DynslamError] = []
         self.cancelled_outside = cancelled or (lambda: False)
         self.store, self.protocol, self.total = store, protocol, total
         self.on_event, self.on_progress = on_event, on_progress
@@ -183,12 +214,16 @@ class _Bench:
         waiting = _Waiting(self.store, todo)
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-run") as pool:
             futures = {pool.submit(self._next, waiting): run_id for run_id in todo}
-            return dict(self._collect(futures, lambda future, _: future.result()).values())
+            made = self._collect(futures, lambda future, _: future.result()).values()
+            return {run_id: record for run_id, record in made if record is not None}
 
-    def _next(self, waiting: _Waiting) -> tuple[str, RunRecord]:
-        """Make the first run that nobody else is making, or take what another process has made of it meanwhile."""
+    def _next(self, waiting: _Waiting) -> tuple[str, RunRecord | None]:
+        """Make the first run that nobody else is making, or take what another process has made of it meanwhile.
+
+        None stands for a run that cannot be made.
+        """
         with waiting.next(self._is_cancelled) as (run, stored):
-            return run.run_id, self._one(run) if stored is None else self.reuse(run, stored)
+            return run.run_id, self._attempt(run, self._one) if stored is None else self.reuse(run, stored)
 
     def run_remotely(self, todo: dict[str, ResolvedRun], executor: Executor) -> dict[str, RunRecord]:
         options = json.dumps({"protocol": self.protocol.model_dump(mode="json")})
@@ -197,13 +232,33 @@ class _Bench:
             self.tell("started", run)
             futures[_asked(executor.submit, run_packed, run.spec.model_dump_json(), options)] = run_id
 
-        def take(future: Future[bytes], run_id: str) -> RunRecord:
-            record = unpack(_asked(future.result), self.store)
-            score(self.store, record, self.protocol)
-            self.tell("finished", todo[run_id], record=record)
-            return record
+        def take(future: Future[bytes], run_id: str) -> RunRecord | None:
+            return self._attempt(todo[run_id], lambda run: self._unpacked(run, _asked(future.result)))
 
-        return self._collect(futures, take)
+        made = self._collect(futures, take)
+        return {run_id: record for run_id, record in made.items() if record is not None}
+
+    def _unpacked(self, run: ResolvedRun, packed: bytes) -> RunRecord:
+        record = unpack(packed, self.store)
+        score(self.store, record, self.protocol)
+        self.tell("finished", run, record=record)
+        return record
+
+    def _attempt(self, run: ResolvedRun, make: Callable[[ResolvedRun], RunRecord]) -> RunRecord | None:
+        """The run's record; None, once that is told, if it cannot be made although nothing is broken here."""
+        try:
+            return make(run)
+        except InfrastructureError:
+            raise
+        except RunError as error:
+            self.fault(run.spec, error)
+            return None
+
+    def fault(self, spec: RunSpec, error: DynslamError) -> None:
+        with self.lock:
+            self.faults.append(error)
+            if self.on_fault is not None:
+                self.on_fault(spec, error)
 
     def _collect(self, futures: Mapping[Future[Any], str], take: Callable[[Future[Any], str], T]) -> dict[str, T]:
         try:

@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.contracts.sequence import exact_stamps, timestamps_ns
 from dynslam_bench.core.errors import InfrastructureError, RunError
 from dynslam_bench.core.machine import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
@@ -73,8 +74,9 @@ def run_one(
         The record.
 
     Raises:
-        DynslamError: The request names something unknown or unfit, the store cannot be written, or what a run needs
-            broke (`InfrastructureError`); nothing is stored then.
+        DynslamError: The request names something unknown or unfit, something other than the tracker's own code raised
+            (an image, a mask or a file that cannot be read), the store cannot be written, or what a run needs broke
+            (`InfrastructureError`); nothing is stored then.
     """
     resolved = resolve(run) if isinstance(run, RunSpec) else run
     run_id = resolved.run_id
@@ -91,17 +93,20 @@ def run_one(
         listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
         verdict = _watched(resolved, work, job, listener, cancelled, at_a_time)
         if verdict.refused:
-            raise RunError(f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}")
+            raise RunError(
+                f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
+            )
         try:
             frames = FrameLog.read(work / FRAMES_FILE)
-            frames.write(work, f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online")
+            title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
+            frames.write(work, title, exact_stamps(resolved.sequence))
             (work / FRAMES_FILE).unlink(missing_ok=True)
         except OSError as error:
             raise InfrastructureError(f"cannot write {work}: {error.strerror}", "the run is not stored") from error
         check_unchanged(resolved.start_map, resolved.settings)
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
-            store.add_sequence(record.sequence.part, resolved.sequence.timestamps, resolved.sequence.ground_truth)
+            store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)
             record = store.publish(work, record)
     return record
 
@@ -165,6 +170,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     spec, identity, final = resolved.spec, resolved.identity, verdict.final
     total = len(resolved.sequence)
     status, reason = _judge(verdict, frames, total)
+    if status == "ok" and spec.realtime and (dropped := frames.count("dropped")):
+        reason = f"{dropped} of {total} frames dropped while the tracker was busy"
     return RunRecord(
         run_id=resolved.run_id,
         status=status,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.core.files import atomic_folder
+from dynslam_bench.geometry.stamps import parse_ns
 
 from .catalogue import open_folder
 from .published.cameras import CAMERA_FILE, write_camera
@@ -102,8 +103,8 @@ def unpack_bag(
     return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, tuple(notes))
 
 
-def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Stamps in seconds ``[N]`` and rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` of a bag's topic of poses, as they come.
+def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps in nanoseconds ``[N]`` and rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` of a bag's topic of poses.
 
     Args:
         bag: A ROS 1 ``.bag``, a ROS 2 folder, an ``.mcap`` or ``.db3`` file.
@@ -123,7 +124,7 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
     if not np.isfinite(table).all():
         raise SequenceError(f"{source} holds poses that are not finite")
-    return table[:, 0], table[:, 1:]
+    return np.array([parse_ns(line.split()[0]) for line in lines], dtype=np.int64), table[:, 1:]
 
 
 class _Topics:

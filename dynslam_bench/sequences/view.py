@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence, timestamps_ns
 
 
 class SequenceView:
@@ -34,6 +34,11 @@ class SequenceView:
     def timestamps(self) -> NDArray[np.float64]:
         """Stamps of the selected frames."""
         return self.base.timestamps[self.range.start : self.range.stop : self.range.step]
+
+    @property
+    def timestamps_ns(self) -> NDArray[np.int64]:
+        """The same in nanoseconds."""
+        return timestamps_ns(self.base)[self.range.start : self.range.stop : self.range.step]
 
     @property
     def masks(self) -> MaskSource | None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
@@ -35,7 +36,6 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from .backend import RgbdBackend
 from .culled import Culled, settled
 from .flow_to_previous import flow_to_previous
-from .frame_checks import check_frame, own_depth
 from .localisation.localised import Localised
 from .stage_clock import CachedStage, StageClock
 
@@ -135,7 +135,8 @@ class SlamPipeline:
         """Track one frame.
 
         Raises:
-            TrackerError: `reset` was not called, or the frame's size is not the camera's.
+            TrackerError: `reset` was not called.
+            SequenceError: The frame is none of this camera (see `check_frame`).
         """
         camera = self._begun("track")
         check_frame(frame, camera)
@@ -160,7 +161,7 @@ class SlamPipeline:
     def _see(self, frame: Frame, camera: Camera, clock: StageClock) -> FrameBundle:
         """The objects in the image, and keypoints with their depth, enough of them outside the objects."""
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        depth = own_depth(frame.depth)
+        depth = _own_depth(frame.depth)
         instances = mask = None
         if self._masks is not None:
             with clock("segmentation"):
@@ -327,3 +328,14 @@ class SlamPipeline:
 def groups_of(each: DynamicFilter) -> tuple[str, ...]:
     """The groups of settings that a filter takes; its name alone where it does not say."""
     return tuple(getattr(each, "groups", (each.name,)))
+
+
+def _own_depth(depth: NDArray[np.floating]) -> NDArray[np.float32]:
+    """A depth image of our own, which later frames look at: float32 metres, 0 wherever depth is missing or not finite.
+
+    The caller may reuse the buffer that it gave.
+    """
+    own = np.array(depth, dtype=np.float32)
+    if not np.isfinite(own).all():
+        own[~np.isfinite(own)] = 0
+    return own

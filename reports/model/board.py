@@ -161,8 +161,9 @@ def make_board(
 
     Args:
         rows: One a run.
-        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Where it was not
-            run on every ranked sequence, a static camera takes its place.
+        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Real-time runs, imports
+            and runs by an older program are never it. Where it was not run on every ranked sequence, a static camera
+            takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 
@@ -188,6 +189,7 @@ def make_board(
     wanted = reference or DEFAULT_REFERENCE
     candidates = [k for k in scored if board.first(k).tracker == wanted and "map" not in board.first(k).variant]
     candidates = [k for k in candidates if board.first(k).is_current and not board.first(k).imported]
+    candidates = [k for k in candidates if not _real_time(board, k)]
     candidates = [k for k in candidates if set(board.common) <= set(_scored(board, k))]
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
@@ -247,6 +249,11 @@ def _order_sequences(board: Board) -> None:
     board.short = shortened(board.sequences)
 
 
+def _real_time(board: Board, key: str) -> bool:
+    """Whether the machine's speed decided which frames a tracker saw."""
+    return "realtime" in board.first(key).variant
+
+
 def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     """Who is ranked on which sequences: on those that all ranked trackers have.
 
@@ -257,6 +264,8 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     """
     firsts = {key: board.first(key) for key in scored}
     rankable = [key for key, row in firsts.items() if row.ranked and row.is_current and row.provenance != "control"]
+    if not all(_real_time(board, key) for key in rankable):  # real-time runs are ranked among themselves only
+        rankable = [key for key in rankable if not _real_time(board, key)]
     rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
     has = {key: {name for name in _scored(board, key) if board.competes(key, name)} for key in rankable}
     rankable = [key for key in rankable if has[key]]

@@ -88,7 +88,8 @@ def variant_of(record: RunRecord) -> dict[str, Any]:
     if record.kind == "run":
         variant |= {"device": record.device, "threads": record.threads}
     if record.realtime:
-        variant["realtime"] = True
+        machine = record.machine
+        variant["realtime"] = f"{machine.cpu}, {machine.cores} cores" if machine is not None else True
     if record.drop_share:
         variant["drop_share"] = record.drop_share
     variant |= {f"degrade.{name}": value for name, value in sorted(record.degrade.items())}

@@ -106,7 +106,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
-        "in the map of an earlier one, trackers that lack "
+        "in the map of an earlier one or by an older program, real-time runs beside others, trackers that lack "
         "sequences, never succeeded, or are no better than a static camera.",
     ]
     if still := _no_better_than_still(board):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from envs_toys import TARGET, ToySequence, images
+from envs_toys import FIXED, TARGET, FixedTracker, ToySequence, images
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import DynslamError, SettingsError
@@ -162,3 +165,46 @@ def test_sequence_sampler(toy_folder: str, tmp_path) -> None:
     assert first == second and set(first) == {toy_folder, other}
     with pytest.raises(SettingsError, match="no sequences"):
         SequenceSampler(SlamEnv(toy_folder, TARGET), [])
+
+
+class Compiles(FixedTracker):
+    """Takes long over the first frames that it ever sees, as what compiles its kernels does."""
+
+    slow_frames = 0
+    resets = 0
+
+    def reset(self, camera, *, rng):
+        super().reset(camera, rng=rng)
+        type(self).resets += 1
+        self.drawn = rng.random()
+
+    def track(self, frame):
+        if type(self).slow_frames < 3:
+            type(self).slow_frames += 1
+            time.sleep(0.4)
+        return super().track(frame)
+
+
+def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Compiles, "slow_frames", 0)
+    monkeypatch.setattr(Compiles, "resets", 0)
+    spec = replace(FIXED, entry_point=f"{__name__}:Compiles")
+    env = DropFrames(SlamEnv(ToySequence(20), spec), speed=0.5)
+    play(env)
+    assert Compiles.slow_frames == 3 and env.dropped == 0 and Compiles.resets == 2
+    play(env)
+    assert Compiles.resets == 3  # it is warm
+
+
+def test_warming_up_leaves_the_random_numbers_where_they_are() -> None:
+    def drawn(env) -> list[float]:
+        found = []
+        for seed in (3, None, None):
+            env.reset(seed=seed)
+            found.append(env.unwrapped._tracker.drawn)  # the tracker's first random number has no public name
+        return found
+
+    def make() -> SlamEnv:
+        return SlamEnv(ToySequence(4), replace(FIXED, entry_point=f"{__name__}:Compiles"))
+
+    assert drawn(DropFrames(make())) == drawn(make())

@@ -174,7 +174,7 @@ def test_trajectory_refuses_what_is_none():
     poses = np.tile(np.eye(4), (3, 1, 1))
     with pytest.raises(TrajectoryError, match="2 stamps but 3 poses"):
         Trajectory(np.arange(2.0), poses)
-    with pytest.raises(TrajectoryError, match=r"not strictly increasing: 1\.000000 then 1\.000000"):
+    with pytest.raises(TrajectoryError, match=r"not strictly increasing: 1\.0+ then 1\.0+"):
         Trajectory(np.array([0.0, 1.0, 1.0]), poses)
     with pytest.raises(TrajectoryError, match="not finite"):
         Trajectory(np.array([0.0, 1.0, np.nan]), poses)

@@ -18,7 +18,7 @@ def test_reads_what_was_written(tmp_path):
     assert len(sequence) == 4
     assert (sequence.camera.width, sequence.camera.height) == (32, 24)
     frame = sequence[2]
-    assert (frame.index, frame.timestamp) == (2, 100.0 + 2 / 30)
+    assert (frame.index, frame.timestamp) == (2, 100.066666667)  # to the nanosecond
     assert frame.rgb.dtype == np.uint8 and (frame.rgb == rgb[2]).all()
     assert frame.depth.dtype == np.float32
     assert np.allclose(frame.depth, depth[2] / 5000, rtol=1e-6) and (frame.depth[depth[2] == 0] == 0).all()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.errors import SequenceError, TrackerError
 from dynslam_bench.sequences.synthetic import open_synthetic
 from dynslam_bench.trackers import TrackerContext, build_tracker
 
@@ -137,7 +137,7 @@ def test_frames_of_another_kind_are_refused_in_one_line(sequence) -> None:
         (replace(frame, depth=None), r"depth of type object"),
         (replace(frame, timestamp=float("inf")), r"timestamp inf"),
     ):
-        with pytest.raises(TrackerError, match=text):
+        with pytest.raises(SequenceError, match=text):
             tracker.track(wrong)
 
 

@@ -16,7 +16,7 @@ from dynslam_bench.core.reading import read_lines
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.readers.bodies import camera_truth
-from dynslam_bench.sequences.readers.nanoseconds import column, floats, read_rows, seconds
+from dynslam_bench.sequences.readers.nanoseconds import column, floats, nanoseconds, read_rows
 from dynslam_bench.sequences.readers.vslam_lab import POSE
 
 EUROC_HEADING = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
@@ -51,15 +51,15 @@ def read_pose_table(path: Path) -> Trajectory:
             "EuRoC's fifth is the quaternion's w; VSLAM-LAB's are " + ", ".join(POSE),
         )
     picked = [[row[at] for at in order] for row in rows]
-    stamps, values = seconds([row[0] for row in picked], path), floats([row[1:] for row in picked], path)
-    found = camera_truth(stamps, values, np.eye(4))
+    stamps, values = nanoseconds([row[0] for row in picked], path), floats([row[1:] for row in picked], path)
+    found = camera_truth(stamps, values, np.eye(4), str(path))
     if found is None:
         raise TrajectoryError(f"none of the {len(rows)} rows of {path} holds a rotation")
     return found
 
 
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
-    """Write poses as EuRoC's ground truth is written (stamps of whole microseconds in nanoseconds).
+    """Write poses as EuRoC's ground truth is written.
 
     Raises:
         DynslamError: The file cannot be written.
@@ -78,15 +78,9 @@ def write_vslam_lab(path: Path, trajectory: Trajectory) -> None:
     _write(path, ",".join(POSE), trajectory, [[*p, *q] for p, q in zip(position, quaternion, strict=True)])
 
 
-def nanoseconds(stamp: float) -> int:
-    """A stamp in seconds as whole nanoseconds; our stamps hold six decimals, more than that a double does not."""
-    return round(stamp * 1e6) * 1000
-
-
 def _write(path: Path, heading: str, trajectory: Trajectory, rows: list[list[float]]) -> None:
-    stamps = trajectory.timestamps.tolist()
     lines = [
-        f"{nanoseconds(stamp)}," + ",".join(f"{value:.9f}" for value in row)
-        for stamp, row in zip(stamps, rows, strict=True)
+        f"{ns}," + ",".join(f"{value:.9f}" for value in row)
+        for ns, row in zip(trajectory.timestamps_ns.tolist(), rows, strict=True)
     ]
     write_atomic(path, "\n".join([heading, *lines]) + "\n")

@@ -18,8 +18,6 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.bags import read_bag_poses
 from dynslam_bench.sequences.readers.bodies import camera_truth
 
-from .pose_tables import nanoseconds
-
 POSE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
 BAG = "trajectory"
 _BILLION = 1_000_000_000
@@ -36,7 +34,7 @@ def read_bag_trajectory(path: Path, topic: str | None = None) -> Trajectory:
         DynslamError: `rosbags` is missing, the bag is damaged, or the topic is not the only one and was not named.
     """
     stamps, rows = read_bag_poses(path, topic)
-    found = camera_truth(stamps, rows, np.eye(4)) if len(stamps) else None
+    found = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
     if found is None:
         raise TrajectoryError(f"{path} holds no pose", "name its topic with --topic")
     return found
@@ -92,8 +90,8 @@ def _at(message: Any) -> int:
 def _messages(types: Mapping[str, Any], trajectory: Trajectory, frame_id: str) -> list[Any]:
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     made = []
-    for stamp, p, q in zip(trajectory.timestamps.tolist(), position.tolist(), quaternion.tolist(), strict=True):
-        sec, nanosec = divmod(nanoseconds(stamp), _BILLION)
+    for ns, p, q in zip(trajectory.timestamps_ns.tolist(), position.tolist(), quaternion.tolist(), strict=True):
+        sec, nanosec = divmod(ns, _BILLION)
         time = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
         header = types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
         where = types["geometry_msgs/msg/Point"](*p)

@@ -12,11 +12,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, PluginError, SegmentationError, SettingsError
+from dynslam_bench.core.errors import (
+    DynslamError,
+    InfrastructureError,
+    PluginError,
+    SegmentationError,
+    SequenceError,
+    SettingsError,
+    TrajectoryError,
+)
 
 _LONGEST = 400
-_REFUSALS = (SettingsError, SegmentationError, PluginError)
+_REFUSALS = (SettingsError, PluginError, TrajectoryError)
 """Raised before the first frame is tracked, these say that what was asked for cannot be."""
+
+_DATA_FAULTS = (SequenceError, SegmentationError)
+"""These say, whenever they are raised, that an image, a mask or a network's weights are at fault."""
 
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE)
 """What a disk says that is full, read-only, damaged or gone: no tracker can help it."""
@@ -40,11 +51,12 @@ def at(where: object) -> Iterator[None]:
 def describe_failure(error: BaseException) -> dict[str, Any]:
     """The last message of a run that an exception ended: ``status``, ``reason`` and ``refused``.
 
-    With ``infrastructure`` it was no fault of the run's: that says what broke.
+    With ``infrastructure`` it was no fault of the run's: that says what broke. With ``data`` it was not the tracker's
+    own code that raised it, or what it was given to read cannot be read: the run says nothing about the tracker.
 
     The reason reads ``frame 20 of 60: ValueError: too few points (my_tracker.py:31)``.
     """
-    from dynslam_bench.contracts.checks import TrackerContractError
+    from dynslam_bench.contracts.checks import TrackerContractError, raised_by_tracker
 
     where, cause = "", error
     if isinstance(error, FailedAt) and error.__cause__ is not None:
@@ -61,9 +73,10 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
         return _message("out-of-memory", _located(where, named, cause))
     if isinstance(cause, TrackerContractError):
         return _message("invalid", _located(where, text))
+    data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
     if isinstance(cause, DynslamError):
-        return _message("crashed", _located(where, text)) | {"refused": isinstance(cause, _REFUSALS)}
-    return _message("crashed", _located(where, named, cause))
+        return _message("crashed", _located(where, text)) | {"refused": isinstance(cause, _REFUSALS)} | data
+    return _message("crashed", _located(where, named, cause)) | data
 
 
 def _broken(error: BaseException | None) -> str:

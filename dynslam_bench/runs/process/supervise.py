@@ -38,7 +38,8 @@ class Verdict:
         final: Its last message.
         peak_memory_mb: Largest memory seen or reported.
         n_frames: Frames it announced; 0 if it never began.
-        refused: Whether it failed before anything ran, because what was asked for cannot be.
+        refused: Whether it is no outcome of a tracker: it failed before anything ran, because what was asked for
+            cannot be, or something else than the tracker's own code raised.
     """
 
     status: Status
@@ -144,7 +145,7 @@ class _Watch:
             return self._verdict("stopped", f"stopped on request after {self.final['frames']} frames")
         if kind == "failed":
             verdict = self._verdict(self.final["status"], self.final["reason"])
-            verdict.refused = self.final.get("refused", False) and self.frame < 0
+            verdict.refused = self.final.get("data", False) or (self.final.get("refused", False) and self.frame < 0)
             return verdict
         code = _wait_exit(self.child)
         if code < 0 and self._is_cancelled(_SIGNAL_GRACE_S):  # what ends this process ended the child first

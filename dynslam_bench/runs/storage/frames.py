@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -82,7 +83,13 @@ class FrameLog:
         )
         return 1 - judged / asked if asked else None
 
-    def write(self, folder: Path, comment: str) -> None:
-        """Write `frames.csv` and `trajectory_online.txt`."""
-        write_tum(folder / ONLINE_FILE, self.trajectory(), comment=comment)
-        write_csv(folder / CSV_FILE, self.rows)
+    def write(self, folder: Path, comment: str, exact: Mapping[float, int] | None = None) -> None:
+        """Write `frames.csv` and `trajectory_online.txt`.
+
+        Args:
+            folder: Where.
+            comment: Head of the trajectory.
+            exact: The nanoseconds of the frames' stamps by their seconds, where a float does not hold them.
+        """
+        write_tum(folder / ONLINE_FILE, self.trajectory().with_exact(exact or {}), comment=comment)
+        write_csv(folder / CSV_FILE, self.rows, exact or {})

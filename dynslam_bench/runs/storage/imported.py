@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.machine import versions
 from dynslam_bench.core.records import digest
@@ -98,7 +98,7 @@ def _keep(store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Tr
     with store.work_folder(record.run_id) as work:
         comment = f"imported: {record.tracker.id} on {sequence.id}"
         write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
-        store.add_sequence(record.sequence.part, sequence.timestamps, sequence.ground_truth)
+        store.add_sequence(record.sequence.part, timestamps_ns(sequence), sequence.ground_truth)
         store.publish(work, record)
 
 

@@ -23,6 +23,7 @@ from dynslam_bench.core.locks import claimed
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.geometry.stamps import format_ns
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum, read_tum
 
@@ -170,14 +171,14 @@ class RunStore:
         LOGGER.warning("run %s: %s", record.run_id, note)
         return record.model_copy(update={"notes": [*record.notes, note]})
 
-    def add_sequence(self, part: str, timestamps: NDArray[np.float64], ground_truth: Trajectory | None) -> None:
-        """Keep the stamps of a sequence's frames and its ground truth; done once a part."""
+    def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
+        """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth; done once a part."""
         folder = self._part(part)
         if (folder / "timestamps.txt").is_file():
             return
         if ground_truth is not None and len(ground_truth):
             write_atomic(folder / "groundtruth.txt", format_tum(ground_truth))
-        write_atomic(folder / "timestamps.txt", "".join(f"{stamp:.6f}\n" for stamp in timestamps.tolist()))
+        write_atomic(folder / "timestamps.txt", "".join(f"{format_ns(ns)}\n" for ns in timestamps_ns.tolist()))
 
     def relabel(self, record: RunRecord, label: str) -> RunRecord:
         """Give a stored run another name in tables; everything else of it stays.

@@ -63,12 +63,17 @@ class OracleSegmenter:
         """The objects of frame `frame.index`.
 
         Raises:
-            SegmentationError: The masks do not have the frame's size, or the sequence has none for this frame.
+            SegmentationError: The masks do not have the frame's size, or the sequence has none for this frame, or they
+                cannot be read.
         """
         try:
             masks = self.source[frame.index]
         except (IndexError, KeyError) as error:
             raise SegmentationError(f"there are no exact masks for frame {frame.index}") from error
+        except MemoryError:
+            raise
+        except Exception as error:  # the masks of a data set of the user's may raise anything
+            raise SegmentationError(f"the exact masks of frame {frame.index} cannot be read: {error}") from error
         check_mask_shape(np.asarray(masks.instances), frame.rgb.shape, f"exact masks of frame {frame.index}")
         found = instances_of(masks, where=f"exact masks of frame {frame.index}")
         return found if self.motion else replace(found, moving=None)

@@ -17,7 +17,7 @@ from .bodies import camera_on_body, camera_truth
 from .contents import Contents
 from .frame_names import stamped
 from .lists import ImageList
-from .nanoseconds import floats, read_rows, seconds
+from .nanoseconds import floats, nanoseconds, read_rows
 from .yaml_numbers import numbers, read_yaml, section
 
 MILLIMETRES = 1000.0
@@ -59,7 +59,7 @@ def _images(folder: Path, name: str) -> ImageList:
     rows = read_rows(path)[1]
     if len(rows[0]) < 2:
         raise SequenceError(f"{path} has one column, expected a stamp and a file name")
-    return stamped([f"{name}/data/{row[1]}" for row in rows], seconds([row[0] for row in rows], path), str(path))
+    return stamped([f"{name}/data/{row[1]}" for row in rows], nanoseconds([row[0] for row in rows], path), str(path))
 
 
 def _depth_factor(path: Path) -> float:
@@ -74,5 +74,5 @@ def _truth(path: Path, T_BS: object, where: str) -> Trajectory | None:
     rows = read_rows(path)[1]
     if len(rows[0]) < 8:
         raise SequenceError(f"{path} has {len(rows[0])} columns, expected a stamp, a position and a quaternion")
-    stamps, values = seconds([row[0] for row in rows], path), floats([row[1:8] for row in rows], path)
-    return camera_truth(stamps, values[:, [0, 1, 2, 4, 5, 6, 3]], camera_on_body(T_BS, where))
+    stamps, values = nanoseconds([row[0] for row in rows], path), floats([row[1:8] for row in rows], path)
+    return camera_truth(stamps, values[:, [0, 1, 2, 4, 5, 6, 3]], camera_on_body(T_BS, where), str(path))

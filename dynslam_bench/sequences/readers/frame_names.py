@@ -11,6 +11,7 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.image_header import image_size
 from dynslam_bench.core.reading import MEGABYTE, read_bytes
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import format_ns, refuse_close
 
 from .lists import MOST_LINES, ImageList
 
@@ -27,18 +28,22 @@ def find_names(folder: Path, pattern: str) -> list[str]:
     return found
 
 
-def stamped(files: list[str], stamps: NDArray[np.float64], where: str) -> ImageList:
-    """Images with a stamp each, in seconds, put in order of time.
+def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageList:
+    """Images with a stamp each, in nanoseconds, put in order of time.
 
     Raises:
-        SequenceError: The numbers differ, or stamps are equal or not finite.
+        SequenceError: The numbers differ, or stamps are equal or less than 1 us apart.
     """
     if len(files) != len(stamps):
         raise SequenceError(f"{where} holds {len(files)} images but {len(stamps)} stamps")
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
-    if not np.isfinite(ordered).all() or (np.diff(ordered) <= 0).any():
-        raise SequenceError(f"{where} holds stamps that are equal or not finite")
+    equal = np.flatnonzero(np.diff(ordered) == 0)
+    if len(equal):
+        raise SequenceError(
+            f"{where} holds {len(equal)} stamps twice, the first is {format_ns(int(ordered[equal[0]]))} s"
+        )
+    refuse_close(ordered, where, SequenceError)
     return ImageList(ordered, tuple(files[i] for i in order))
 
 

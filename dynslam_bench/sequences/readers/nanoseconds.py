@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.reading import read_lines
+from dynslam_bench.geometry.stamps import parse_ns
 from dynslam_bench.geometry.tum_file import is_number
 
 from .lists import MOST_LINES
@@ -50,13 +52,19 @@ def column(heading: list[str], name: str, path: Path) -> int:
     return heading.index(name)
 
 
-def seconds(texts: list[str], path: Path) -> NDArray[np.float64]:
-    """Stamps of nanoseconds, written as whole numbers or with a point, in seconds ``[N]``.
+def nanoseconds(texts: list[str], path: Path) -> NDArray[np.int64]:
+    """Stamps of nanoseconds, written as whole numbers or with a point, int64 ``[N]``.
 
     Raises:
-        SequenceError: One is no number.
+        SequenceError: One is no number, or beyond the range of 64 bits.
     """
-    return _numbers(texts, path, "a stamp in nanoseconds") / 1e9
+    stamps = []
+    for text in texts:
+        try:
+            stamps.append(int(text) if text.isdigit() and len(text) < 19 else parse_ns(f"{Decimal(text)}e-9"))
+        except (ValueError, ArithmeticError):
+            raise SequenceError(f"{path}: '{text[:40]}' is not a stamp in nanoseconds") from None
+    return np.array(stamps, dtype=np.int64)
 
 
 def floats(rows: list[list[str]], path: Path) -> NDArray[np.float64]:

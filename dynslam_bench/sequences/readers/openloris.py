@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import nearest_gap
-from dynslam_bench.geometry.trajectory import Trajectory
 
 from . import tum
 from .contents import Contents
@@ -53,7 +52,7 @@ def read(folder: Path, fps: float | None = None) -> Contents:
             f"the ground truth of {folder} is never nearer than {gap:.3f} s to an image",
             "stamps of OpenLORIS carry a bias of their own in every sequence: are both files of the same one?",
         )
-    truth = Trajectory(base.timestamps, base.T_world_cam @ T_base_cam(folder / "trans_matrix.yaml"))
+    truth = base.with_poses(base.T_world_cam @ T_base_cam(folder / "trans_matrix.yaml"))
     return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
 
 

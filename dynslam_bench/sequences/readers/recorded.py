@@ -73,6 +73,7 @@ class RecordedSequence:
 
     Attributes:
         folder: The sequence's folder.
+        timestamps_ns: Stamps of the colour images in nanoseconds, int64 ``[N]``.
         dropped: What was not used, and why.
 
     Raises:
@@ -112,6 +113,8 @@ class RecordedSequence:
                 f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
                 "do both lists use the same clock?",
             )
+        self.timestamps_ns = colour.stamps_ns[index[0]]
+        self.timestamps_ns.flags.writeable = False
         self._timestamps = colour.stamps[index[0]]
         _check_unit(folder, self._timestamps)
         self._timestamps.flags.writeable = False
@@ -194,7 +197,7 @@ class RecordedSequence:
     @cached_property
     def _digest(self) -> str:
         truth = self._ground_truth
-        poses = None if truth is None else [truth.timestamps.tolist(), truth.T_world_cam.tolist()]
+        poses = None if truth is None else [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
         try:
             images = contents_digest(self.folder / file for file in (*self._colour, *self._depth))
         except OSError as error:
@@ -202,7 +205,7 @@ class RecordedSequence:
                 f"cannot read {error.filename}: {error.strerror}", "fetch the sequence again"
             ) from error
         special = [self._missing_depth, self._furthest_m]
-        return digest([repr(self.camera), self.fps, self._timestamps.tolist(), images, poses, special])
+        return digest([repr(self.camera), self.fps, self.timestamps_ns.tolist(), images, poses, special])
 
     def __len__(self) -> int:
         return len(self._colour)
@@ -266,7 +269,7 @@ def _existing(folder: Path, images: ImageList, kind: str) -> ImageList:
     if len(missing) > MISSING_TOLERATED * len(images):
         _refuse(folder, [file for file in images.files if file in missing], len(images), kind, "missing")
     there = [i for i, file in enumerate(images.files) if file not in missing]
-    kept = replace(images, stamps=images.stamps[there], files=tuple(images.files[i] for i in there))
+    kept = replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
     _check_files(folder, kept.files, kind)
     return kept
 
@@ -300,7 +303,7 @@ def _turned(truth: Trajectory | None, R_body_cam: tuple[tuple[float, float, floa
     """The camera's orientations, of a truth that holds those of the body that carries it."""
     if truth is None or R_body_cam is None:
         return truth
-    return Trajectory(truth.timestamps, in_camera_axes(truth.T_world_cam, R_body_cam))
+    return truth.with_poses(in_camera_axes(truth.T_world_cam, R_body_cam))
 
 
 def _count(

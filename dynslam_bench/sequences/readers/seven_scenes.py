@@ -15,6 +15,7 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.reading import read_text
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import from_seconds, to_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from .contents import Contents
@@ -42,11 +43,12 @@ def read(folder: Path, fps: float | None = None) -> Contents:
     bad = [number for number in numbers if not (number.isascii() and number.isdigit() and len(number) < 16)]
     if bad:
         raise SequenceError(f"frame-{bad[0][:40]}.color.png of {folder} is named by no number")
-    stamps = np.array([int(number) / rate for number in numbers])
+    stamps = from_seconds(int(number) / rate for number in numbers)
     colour, depth = stamped(files, stamps, str(folder)), [f"frame-{number}.depth.png" for number in numbers]
     poses = [read_pose(folder / f"frame-{number}.pose.txt") for number in numbers]
     known = [i for i, pose in enumerate(poses) if pose is not None]
-    truth = Trajectory(stamps[known], np.array([poses[i] for i in known])) if known else None
+    tracked = np.array([poses[i] for i in known])
+    truth = Trajectory(to_seconds(stamps[known]), tracked, stamps[known]) if known else None
     dropped = f"ground truth: {len(poses) - len(known)} of {len(poses)} poses lost" if len(known) < len(poses) else ""
     paired = stamped(depth, stamps, str(folder))
     return Contents(colour, paired, True, truth, dropped, CAMERA, rate, missing_depth=MISSING)

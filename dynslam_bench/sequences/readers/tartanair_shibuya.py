@@ -14,7 +14,7 @@ from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_table
+from dynslam_bench.geometry.tum_file import read_stamped_table, read_table
 
 from .contents import Contents
 from .frame_names import find_names, stamped
@@ -38,7 +38,7 @@ def read(folder: Path, fps: float | None = None) -> Contents:
         TrajectoryError: The stamps or poses are malformed.
     """
     colour, depth = find_names(folder, "image_0/*.[pj][np]g"), find_names(folder, "depth_0/*.npy")
-    stamps = read_table(folder / "times.txt", 1, "timestamp")[:, 0]
+    stamps = read_stamped_table(folder / "times.txt", 1, "timestamp")[1]
     try:
         rows = read_table(folder / "gt_pose.txt", 8, "timestamp tx ty tz qx qy qz qw")[:, 1:]
     except TrajectoryError:
@@ -53,5 +53,5 @@ def read(folder: Path, fps: float | None = None) -> Contents:
     images, arrays = stamped(colour, stamps, str(folder)), stamped(depth, stamps, str(folder))
     order = np.argsort(stamps, kind="stable")
     poses = se3.from_quaternion(rows[order, :3], rows[order, 3:]) @ T_NED_CAM
-    truth = Trajectory(images.stamps, poses)
+    truth = Trajectory(images.stamps, poses, images.stamps_ns)
     return Contents(images, arrays, True, truth, camera=CAMERA, fps=fps, furthest_m=SKY_M)

@@ -17,7 +17,7 @@ from dynslam_bench.geometry.camera import Camera
 from .bodies import camera_on_body, camera_truth
 from .contents import Contents
 from .frame_names import stamped
-from .nanoseconds import column, floats, read_rows, seconds
+from .nanoseconds import column, floats, nanoseconds, read_rows
 from .yaml_numbers import numbers, read_yaml, section
 
 COLUMNS = ("ts_rgb_0 (ns)", "path_rgb_0", "ts_depth_0 (ns)", "path_depth_0")
@@ -38,9 +38,9 @@ def read(folder: Path, fps: float | None = None) -> Contents:
     heading, rows = read_rows(table)
     places = [column(heading, name, table) for name in COLUMNS]
     stamps, files, depth_stamps, depth_files = ([row[at] for row in rows] for at in places)
-    colour = stamped(files, seconds(stamps, table), str(table))
-    order = np.argsort(seconds(stamps, table), kind="stable")
-    depth = stamped([depth_files[i] for i in order], seconds([depth_stamps[i] for i in order], table), str(table))
+    colour = stamped(files, nanoseconds(stamps, table), str(table))
+    order = np.argsort(nanoseconds(stamps, table), kind="stable")
+    depth = stamped([depth_files[i] for i in order], nanoseconds([depth_stamps[i] for i in order], table), str(table))
     stated = _camera(read_yaml(calibration), calibration)
     truth = None
     if poses.is_file():
@@ -48,9 +48,8 @@ def read(folder: Path, fps: float | None = None) -> Contents:
         places = [column(names, name, poses) for name in POSE]
         picked = [[row[at] for at in places] for row in values]
         T_body_cam = camera_on_body(stated.get("T_BS"), str(calibration))
-        truth = camera_truth(
-            seconds([row[0] for row in picked], poses), floats([r[1:] for r in picked], poses), T_body_cam
-        )
+        stamps_ns = nanoseconds([row[0] for row in picked], poses)
+        truth = camera_truth(stamps_ns, floats([r[1:] for r in picked], poses), T_body_cam, str(poses))
     rate = stated.get("fps")
     nominal = fps or (float(rate) if isinstance(rate, (int, float)) and 0 < rate < 1e6 else None)
     return Contents(colour, depth, True, truth, camera=_intrinsics(stated, calibration), fps=nominal)

@@ -22,6 +22,7 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import format_ns
 from dynslam_bench.geometry.trajectory import Trajectory
 
 from ..published.cameras import write_camera
@@ -162,5 +163,5 @@ class FrameStore:
         path = self.folder / f"{kind}.txt"
         if not path.is_file():
             return set()
-        stamps = {f"{stamp:.6f}" for stamp, _ in read_stamped_lines(path)}
+        stamps = {format_ns(ns)[:-3] for ns, _ in read_stamped_lines(path) if ns is not None}
         return {stamp for stamp in stamps if (self.folder / kind / f"{stamp}.png").is_file()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.stamps import format_ns, ns_of
 
 _COLOURS = ("red", "green", "blue")
 _LAYOUT = np.dtype(
@@ -22,11 +24,11 @@ _LAYOUT = np.dtype(
 )
 
 
-def write_keyframes_csv(path: Path, outputs: MapOutputs) -> None:
+def write_keyframes_csv(path: Path, outputs: MapOutputs, exact: Mapping[float, int] | None = None) -> None:
     """Write ``keyframes.csv``: the fields of `KeyframeRecord`, the pose as tx ty tz and qx qy qz qw.
 
-    The timestamp has six decimals; it and the frame are empty for keyframes of an earlier run, in whose map this one
-    began.
+    The timestamp has nine decimals; `exact` gives the nanoseconds of stamps by their seconds, where a float does not
+    hold them. It and the frame are empty for keyframes of an earlier run, in whose map this one began.
 
     Raises:
         DynslamError: The folder cannot be written.
@@ -39,7 +41,9 @@ def write_keyframes_csv(path: Path, outputs: MapOutputs) -> None:
     for record in outputs.keyframes:
         translation, quaternion = se3.to_quaternion(record.T_world_cam)
         numbers = [f"{value:.9f}" for value in (*translation, *quaternion)]
-        when = [record.frame, f"{record.timestamp:.6f}"] if record.frame >= 0 else ["", ""]
+        when: list[object] = ["", ""]
+        if record.frame >= 0:
+            when = [record.frame, format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp))]
         writer.writerow([record.id, *when, *numbers, record.features, record.observations, record.map])
     write_atomic(path, text.getvalue())
 
