@@ -41,6 +41,8 @@ HintId = Literal[
 
 MIN_POSES = 8
 """With fewer poses that have truth nothing is said of their motion."""
+FARTHEST_M = 1e12
+"""Squares of larger numbers are no numbers any more."""
 PAIR_S = 2.0
 """Motions from pose to pose are taken over a third of the trajectory, at most over this many seconds."""
 ROTATES_DEG, MOVES_M = 1.5, 0.01
@@ -52,6 +54,8 @@ MOSTLY = 0.25
 """Share of the displacements that may stay unexplained where a time shift or a scale is said to explain them."""
 VARIES, TIE = 0.7, 0.1
 """Least correlation of motions that are explained, and the errors between which the path does not tell."""
+STEADY = 1e-3
+"""Displacements whose variance is a smaller share of their squares are one steady motion."""
 LONGEST_SHIFT_S = 5.0
 SHORTEST_SHIFT_S = 0.02
 """The clocks of recordings differ by some milliseconds, and a rolling shutter adds half its readout time."""
@@ -88,6 +92,9 @@ class Hint:
     text: str
     numbers: dict[str, float] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        return f"{self.id}: {self.text}"
+
 
 def hints(
     estimate: Trajectory,
@@ -111,7 +118,7 @@ def hints(
     found = _several_recordings(estimate, ground_truth, notes)
     truth = _Track(ground_truth.timestamps, ground_truth.T_world_cam)
     inside = truth.covers(estimate.timestamps)
-    if inside.sum() < MIN_POSES:
+    if inside.sum() < MIN_POSES or np.abs(estimate.positions).max() > FARTHEST_M:
         return tuple(found)
     stamps, poses = estimate.timestamps[inside], estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
@@ -127,7 +134,7 @@ def hints(
     covered = truth.covers(stamps + shift)
     stamps, poses = stamps[covered] + shift, poses[covered]
     if not sim3 and left < MOSTLY:
-        found += _scale(poses, truth.at(stamps))
+        found += _scale(stamps, poses, truth)
     return (*found, *_below_noise(stamps, poses, truth))
 
 
@@ -501,10 +508,17 @@ def _fit(poses: Array, truth: Array) -> _Fit:
     return _Fit(scale, se3_m, sim3_m, float(np.sqrt(extent)))
 
 
-def _scale(poses: Array, truth: Array) -> list[Hint]:
-    fit = _fit(poses, truth)
+def _scale(stamps: Array, poses: Array, truth: _Track) -> list[Hint]:
+    fit = _fit(poses, truth.at(stamps))
     scale, before, after = fit.scale, fit.se3_m, fit.sim3_m
-    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and after < 0.4 * min(before, fit.extent_m)):
+    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and after < min(0.4 * before, 0.2 * fit.extent_m)):
+        return []
+    window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
+    moved, true = (_displacements(track, stamps, window) for track in (_Track(stamps, poses), truth))
+    both = np.isfinite(moved[:, 0]) & np.isfinite(true[:, 0])
+    varying, varied = (each[both] - each[both].mean(axis=0) for each in (moved, true))
+    steady = both.sum() < MIN_POSES or (varying**2).sum() < STEADY * (moved[both] ** 2).sum()
+    if steady or _unexplained(varying, varied[None])[0] > MOSTLY:  # a steady motion fits many paths at some scale
         return []
     unit = next((name for name, size in _UNITS.items() if abs(np.log(scale / size)) < 0.1), "")
     cure = (

@@ -1,4 +1,4 @@
-"""A small exact scene for conformance checks: a camera moves before a textured corner, a panel moves within."""
+"""Small exact scenes for conformance checks: a camera moves before a textured corner, with and without a moving panel."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+TURNING_CAMERA = Camera(320, 240, 267.7, 269.6, 159.8, 123.6)
 
 
 class CornerSequence:
@@ -35,7 +37,7 @@ class CornerSequence:
         self.camera = camera.undistorted()
         self._count = frames
         self.timestamps: NDArray[np.float64] = np.round(100.0 + np.arange(frames) / 30, 6)
-        poses = np.stack([_pose(index) for index in range(frames)])
+        poses = np.stack([self._pose(index) for index in range(frames)])
         self.ground_truth: Trajectory | None = Trajectory(self.timestamps, poses)
 
     @property
@@ -52,8 +54,42 @@ class CornerSequence:
 
     def __getitem__(self, index: int) -> Frame:
         index = range(self._count)[index]
-        rgb, depth, _ = _draw(self.camera, index)
+        rgb, depth, _ = self._draw(index)
         return Frame(index, float(self.timestamps[index]), rgb.copy(), depth.copy())
+
+    def _pose(self, index: int) -> NDArray[np.float64]:
+        return _pose(index)
+
+    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+        return _draw(self.camera, index)
+
+
+class TurningSequence(CornerSequence):
+    """The corner without the panel, filmed in small images by a camera that moves along and turns about all axes.
+
+    World-to-camera poses, other axes and other units are told apart from right ones by its path.
+
+    Args:
+        frames: Number of frames at 30 Hz.
+    """
+
+    def __init__(self, frames: int = 24) -> None:
+        super().__init__(frames, TURNING_CAMERA, "synthetic/conformance_turning")
+
+    def digest(self) -> str:
+        """A function of the parameters."""
+        return f"turning-{self._count}"
+
+    def _pose(self, index: int) -> NDArray[np.float64]:
+        a = 2 * np.pi * index / 24
+        place = 0.12 * np.sin(a), 0.06 * np.sin(2 * a), 0.08 * (1 - np.cos(a))
+        turn = 0.05 * np.sin(2 * a), 0.1 * np.sin(a + 1), 0.08 * np.cos(a)
+        return se3.exp(np.array([*place, *turn]))
+
+    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+        depth, x, y = _walls(self.camera, self._pose(index))
+        rgb = _sample(_texture(), x / 2, y / 2)  # half the pixels, half the detail
+        return rgb, depth.astype(np.float32), np.zeros(depth.shape, bool)
 
 
 class _Masks:
@@ -61,8 +97,8 @@ class _Masks:
         self._sequence = sequence
 
     def __getitem__(self, index: int) -> FrameMasks:
-        panel = _draw(self._sequence.camera, range(len(self._sequence))[index])[2]
-        return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index else ()))
+        panel = self._sequence._draw(range(len(self._sequence))[index])[2]
+        return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ()))
 
 
 def grey(frame: Frame) -> NDArray[np.uint8]:
@@ -96,13 +132,10 @@ def _pose(index: int) -> NDArray[np.float64]:
 @lru_cache(maxsize=12)
 def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
     """Colour, depth and the panel's mask."""
-    centre = _pose(index)[:3, 3]
-    v, u = np.mgrid[: camera.height, : camera.width]
-    ray_x, ray_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
-    walls = [(2.6 + slope * centre[0] - centre[2]) / (1 - slope * ray_x) for slope in (0.5, -0.7)]
-    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
-    x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
+    pose = _pose(index)
+    centre = pose[:3, 3]
+    depth, x, y = _walls(camera, pose)
+    ray_x, ray_y, _ = _rays(camera)
     left = -0.35 + 0.03 * index
     panel_depth = 1.5 - centre[2]
     panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
@@ -110,6 +143,22 @@ def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.flo
     depth = np.where(panel, panel_depth, depth)
     rgb = _sample(_texture(), np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y))
     return rgb, depth.astype(np.float32), panel
+
+
+def _rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Directions of the pixels in the camera, with z-component 1."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0
+
+
+def _walls(camera: Camera, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Depth ``[H, W]`` of the walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; x and y there."""
+    rays = _rays(camera)
+    to_x, to_y, to_z = (sum(row[axis] * ray for axis, ray in enumerate(rays)) for row in T_world_cam[:3, :3])
+    centre = T_world_cam[:3, 3]
+    walls = [(2.6 + slope * centre[0] - centre[2]) / (to_z - slope * to_x) for slope in (0.5, -0.7)]
+    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
+    return depth, centre[0] + depth * to_x, centre[1] + depth * to_y
 
 
 @lru_cache(maxsize=1)
