@@ -63,8 +63,11 @@ DISPLACEMENT_S = 0.5
 LAG_S = 0.04
 SCALE_FACTOR = 1.15
 """Scales closer to 1 than this factor are errors of a tracker."""
-COPY_SHARE, COPY_M = 1e-3, 1e-4
-"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once."""
+COPY_SHARE, COPY_M, EXACT_M = 1e-3, 1e-4, 1e-6
+"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once; where the truth
+shows no noise of its own, as that of rendered images, as a thousandth of a millimetre."""
+NOISE_M = 1e-5
+"""A truth with less noise than this was not measured."""
 MEASURED_S = 1 / 60
 """Of a truth with longer steps than this, fast motion and noise are not told apart."""
 OTHER_RECORDING_S = 10.0
@@ -542,14 +545,14 @@ def _below_noise(stamps: Array, poses: Array, truth: _Track) -> list[Hint]:
     nearest = truth.poses[truth.nearest(stamps)]
     fits = [_fit(poses, true) for true in (between, nearest)]
     error = min(fit.sim3_m for fit in fits)
-    least = min(COPY_M, COPY_SHARE * fits[0].extent_m)
+    inside = (truth.stamps >= stamps[0]) & (truth.stamps <= stamps[-1])
+    noise = _jitter(truth.positions[inside], 5) if truth.step < MEASURED_S else 0.0
+    least = min(COPY_M if noise > NOISE_M else EXACT_M, COPY_SHARE * fits[0].extent_m)
     if error < least:
         text = f"the error of {1000 * error:.3g} mm is below what trackers reach: were the poses read from the truth?"
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
-    inside = (truth.stamps >= stamps[0]) & (truth.stamps <= stamps[-1])
-    noise = _jitter(truth.positions[inside], 5) if truth.step < MEASURED_S else 0.0
     own = min(_jitter(align(poses, true, "se3").apply(poses)[:, :3, 3] - true[:, :3, 3], 3) for true in (between, nearest))
-    if own < 0.5 * noise and noise > 1e-5:
+    if own < 0.5 * noise and noise > NOISE_M:
         text = (
             f"from frame to frame the error changes by {1000 * own:.3g} mm, less than the truth's own noise of "
             f"{1000 * noise:.3g} mm: were the poses made from the truth?"

@@ -1,4 +1,4 @@
-"""Small exact scenes for conformance checks: a camera moves before a textured corner, with and without a moving panel."""
+"""Small exact scenes for conformance checks: before a corner with a moving panel, and in a room where nothing moves."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class CornerSequence:
 
 
 class TurningSequence(CornerSequence):
-    """The corner without the panel, filmed in small images by a camera that moves along and turns about all axes.
+    """A room, filmed in small images by a camera that moves along all axes and turns about them.
 
     World-to-camera poses, other axes and other units are told apart from right ones by its path.
 
@@ -87,8 +87,8 @@ class TurningSequence(CornerSequence):
         return se3.exp(np.array([*place, *turn]))
 
     def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-        depth, x, y = _walls(self.camera, self._pose(index))
-        rgb = _sample(_texture(), x / 2, y / 2)  # half the pixels, half the detail
+        depth, x, y = _room(self.camera, self._pose(index))
+        rgb = _sample(_texture(), x / 3, y / 3)  # no more detail than there are pixels
         return rgb, depth.astype(np.float32), np.zeros(depth.shape, bool)
 
 
@@ -132,10 +132,13 @@ def _pose(index: int) -> NDArray[np.float64]:
 @lru_cache(maxsize=12)
 def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
     """Colour, depth and the panel's mask."""
-    pose = _pose(index)
-    centre = pose[:3, 3]
-    depth, x, y = _walls(camera, pose)
-    ray_x, ray_y, _ = _rays(camera)
+    centre = _pose(index)[:3, 3]
+    v, u = np.mgrid[: camera.height, : camera.width]
+    ray_x, ray_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
+    walls = [(2.6 + slope * centre[0] - centre[2]) / (1 - slope * ray_x) for slope in (0.5, -0.7)]
+    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
+    x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
     left = -0.35 + 0.03 * index
     panel_depth = 1.5 - centre[2]
     panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
@@ -145,20 +148,19 @@ def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.flo
     return rgb, depth.astype(np.float32), panel
 
 
-def _rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Directions of the pixels in the camera, with z-component 1."""
+def _room(camera: Camera, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Depth ``[H, W]`` of a box-shaped room that is seen from inside, and the two coordinates of what is seen there."""
     v, u = np.mgrid[: camera.height, : camera.width]
-    return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0
-
-
-def _walls(camera: Camera, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Depth ``[H, W]`` of the walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; x and y there."""
-    rays = _rays(camera)
-    to_x, to_y, to_z = (sum(row[axis] * ray for axis, ray in enumerate(rays)) for row in T_world_cam[:3, :3])
-    centre = T_world_cam[:3, 3]
-    walls = [(2.6 + slope * centre[0] - centre[2]) / (to_z - slope * to_x) for slope in (0.5, -0.7)]
-    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
-    return depth, centre[0] + depth * to_x, centre[1] + depth * to_y
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = rays @ T_world_cam[:3, :3].T
+    side = np.where(rays > 0, (1.0, 0.8, 3.5), (-1.0, -0.8, -1.0))  # x to the right, y down, z ahead
+    each = (side - T_world_cam[:3, 3]) / np.where(rays == 0, 1e-12, rays)
+    depth = each.min(axis=-1)
+    seen = T_world_cam[:3, 3] + depth[..., None] * rays
+    facing = each.argmin(axis=-1)
+    other = 0.9 * np.where(np.take_along_axis(side, facing[..., None], axis=-1)[..., 0] > 0, facing, facing + 3)
+    x, y = np.where(facing == 0, seen[..., 2], seen[..., 0]), np.where(facing == 1, seen[..., 2], seen[..., 1])
+    return depth, x + other, y + other  # no two sides look alike
 
 
 @lru_cache(maxsize=1)
