@@ -1,13 +1,13 @@
 """Hints: faults of a trajectory file that its numbers show, each with the measured evidence and the cure.
 
 An estimate may be scored without a word although its stamps are late, its unit is the millimetre or its poses are
-world-to-camera: an alignment and a short path hide much of it. Here the same trajectory is compared with the truth as if
-one such fault were undone. A hint is given only where that explains the true motion and the trajectory as it stands does
-not; a tracker that is merely bad gets none. Hints never change a number.
+world-to-camera: an alignment and a short path hide much of it. Here the same trajectory is compared with the truth as
+if one such fault were undone. A hint is given only where that explains the true motion and the trajectory as it stands
+does not; a tracker that is merely bad gets none. Hints never change a number.
 
-Motions are compared from pose to pose, over some seconds at most, so that drift and the choice of the world frame do not
-matter. Time shifts follow from the displacements' correlation over lags (as in Furgale et al., IROS 2013, coarse to
-fine), scales from Umeyama's alignment.
+Motions are compared from pose to pose, over some seconds at most, so that drift and the choice of the world frame do
+not matter. Time shifts follow from the correlation of displacements over lags, coarse to fine, scales from Umeyama's
+alignment.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ VARIES, TIE = 0.7, 0.1
 STEADY = 1e-3
 """Displacements whose variance is a smaller share of their squares are one steady motion."""
 LONGEST_SHIFT_S = 5.0
-SHORTEST_SHIFT_S = 0.02
-"""The clocks of recordings differ by some milliseconds, and a rolling shutter adds half its readout time."""
+SHORTEST_SHIFT_S = 0.03
+"""The clocks of good recordings differ by up to 25 ms, and a rolling shutter adds half its readout time."""
 DISPLACEMENT_S = 0.5
 LAG_S = 0.04
 SCALE_FACTOR = 1.15
 """Scales closer to 1 than this factor are errors of a tracker."""
 COPY_SHARE, COPY_M, EXACT_M = 1e-3, 1e-4, 1e-6
-"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once; where the truth
-shows no noise of its own, as that of rendered images, as a thousandth of a millimetre."""
+"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once; where the
+truth shows no noise of its own, as that of rendered images, as a thousandth of a millimetre."""
 NOISE_M = 1e-5
 """A truth with less noise than this was not measured."""
 MEASURED_S = 1 / 60
@@ -192,7 +192,9 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
     numbers: dict[str, float] = {}
     if 0 < len(outside) < len(parts):
         rows = sum(map(len, outside))
-        evidence.append(f"{rows} of {len(stamps)} poses, in {len(outside)} stretches of time, lie outside of the truth's")
+        evidence.append(
+            f"{rows} of {len(stamps)} poses, in {len(outside)} stretches of time, lie outside of the truth's"
+        )
         numbers |= {"poses_outside": float(rows), "stretches_outside": float(len(outside))}
     if notes is not None and back > OTHER_RECORDING_S:
         repeated = f", {notes.duplicates} of {notes.lines} lines repeat a stamp" if notes.duplicates else ""
@@ -221,42 +223,9 @@ class _Motions:
         self.pairs = starts[keep][::step], ends[starts[keep][::step]]
         self.true = _relative(truth.at(stamps), self.pairs)
 
-    def compare(self, poses: Array, true: Array | None = None, R_est_cam: Array | None = None) -> tuple[float, float]:
-        """How far the motions are from the true ones, and how well they vary with them.
-
-        Scales are left out. Of rotations and translations those count that are larger than noise.
-
-        Args:
-            poses: Camera-to-world ``[N, 4, 4]``.
-            true: True motions ``[P, 4, 4]``; by default those at the stamps.
-            R_est_cam: Rotation from the camera's axes to those that the poses are given in.
-
-        Returns:
-            Median error over the median motion, of the moving half of the pairs, rotations or translations, whichever
-            is worse: infinite if nothing moves. And the best correlation of the two about their means: low where the
-            motion is always the same, and then many wrong poses explain it.
-        """
-        true = self.true if true is None else true
-        motions = _relative(poses, self.pairs)
-        if R_est_cam is not None:
-            motions[:, :3, :3] = R_est_cam.T @ motions[:, :3, :3] @ R_est_cam
-            motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
-        if len(true) < MIN_POSES:
-            return np.inf, 0.0
-        found = []
-        angle = np.rad2deg(se3.rotation_angle(true))
-        moving = angle >= np.median(angle)
-        if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
-            off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
-            found.append((float(np.median(off)) / turned, _correlation(_axis(motions), _axis(true))))
-        length = np.linalg.norm(true[:, :3, 3], axis=1)
-        moving = length >= np.median(length)
-        moved, estimated = true[moving, :3, 3], motions[moving, :3, 3]
-        way = float(np.median(np.linalg.norm(estimated, axis=1)))
-        if (true_way := float(np.median(length[moving]))) > MOVES_M:
-            off = np.linalg.norm(estimated * (true_way / way) - moved, axis=1) if way > 0 else length[moving]
-            found.append((float(np.median(off)) / true_way, _correlation(motions[:, :3, 3], true[:, :3, 3])))
-        return max((error for error, _ in found), default=np.inf), max((good for _, good in found), default=0.0)
+    def compare(self, poses: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
+        """`_compare` with the true motions at the stamps."""
+        return _compare(_relative(poses, self.pairs), self.true, R_est_cam)
 
     def wrong_convention(self, shift: float) -> tuple[Hint, Array] | None:
         """The convention that explains motions which the poses as they stand do not, and the poses brought in order.
@@ -287,9 +256,9 @@ class _Motions:
         """The error of the poses as they stand beside the true motions at another time."""
         covered = self.truth.covers(self.stamps + shift)
         keep = covered[self.pairs[0]] & covered[self.pairs[1]]
-        late = _Motions.__new__(_Motions)
-        late.pairs = self.pairs[0][keep], self.pairs[1][keep]
-        return late.compare(self.poses, _relative(self.truth.at(self.stamps + shift), late.pairs))[0]
+        pairs = self.pairs[0][keep], self.pairs[1][keep]
+        true = _relative(self.truth.at(self.stamps + shift), pairs)
+        return _compare(_relative(self.poses, pairs), true)[0]
 
     def _other_axes(self, as_read: float) -> tuple[Hint, Array] | None:
         """The same where the truth is that of a body with axes of its own, such as a set of markers."""
@@ -311,15 +280,50 @@ class _Motions:
         u, _, vt = np.linalg.svd(estimated.T @ true)
         return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
-    def _hint(
-        self, name: HintId, as_read: float, undone: float, axes: str = "", others: Sequence[str] = ()
-    ) -> Hint:
+    def _hint(self, name: HintId, as_read: float, undone: float, axes: str = "", others: Sequence[str] = ()) -> Hint:
         what, cure = _CURES[name]
         text = (
             f"{what.format(axes=axes)}: the motions are off by {100 * as_read:.0f} % of the true ones, "
             f"by {100 * undone:.0f} % {cure}"
         ) + "".join(f" (or {other}: the path does not tell)" for other in others)
         return Hint(name, text, {"motion_error": as_read, "motion_error_undone": undone})
+
+
+def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
+    """How far the motions are from the true ones, and how well they vary with them.
+
+    Scales are left out. Of rotations and translations those count that are larger than noise.
+
+    Args:
+        motions: Of the estimate, ``[P, 4, 4]``.
+        true: The true ones.
+        R_est_cam: Rotation from the camera's axes to those that the motions are given in.
+
+    Returns:
+        Median error over the median motion, of the moving half of the pairs, rotations or translations, whichever
+        is worse: infinite if nothing moves. And the best correlation of the two about their means: low where the
+        motion is always the same, and then many wrong poses explain it.
+    """
+    if R_est_cam is not None:
+        motions = motions.copy()
+        motions[:, :3, :3] = R_est_cam.T @ motions[:, :3, :3] @ R_est_cam
+        motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
+    if len(true) < MIN_POSES:
+        return np.inf, 0.0
+    found = []
+    angle = np.rad2deg(se3.rotation_angle(true))
+    moving = angle >= np.median(angle)
+    if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
+        off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
+        found.append((float(np.median(off)) / turned, _correlation(_axis(motions), _axis(true))))
+    length = np.linalg.norm(true[:, :3, 3], axis=1)
+    moving = length >= np.median(length)
+    moved, estimated = true[moving, :3, 3], motions[moving, :3, 3]
+    way = float(np.median(np.linalg.norm(estimated, axis=1)))
+    if (true_way := float(np.median(length[moving]))) > MOVES_M:
+        off = np.linalg.norm(estimated * (true_way / way) - moved, axis=1) if way > 0 else length[moving]
+        found.append((float(np.median(off)) / true_way, _correlation(motions[:, :3, 3], true[:, :3, 3])))
+    return max((error for error, _ in found), default=np.inf), max((good for _, good in found), default=0.0)
 
 
 def _reordered(poses: Array) -> Array:
@@ -551,7 +555,9 @@ def _below_noise(stamps: Array, poses: Array, truth: _Track) -> list[Hint]:
     if error < least:
         text = f"the error of {1000 * error:.3g} mm is below what trackers reach: were the poses read from the truth?"
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
-    own = min(_jitter(align(poses, true, "se3").apply(poses)[:, :3, 3] - true[:, :3, 3], 3) for true in (between, nearest))
+    own = min(
+        _jitter(align(poses, true, "se3").apply(poses)[:, :3, 3] - true[:, :3, 3], 3) for true in (between, nearest)
+    )
     if own < 0.5 * noise and noise > NOISE_M:
         text = (
             f"from frame to frame the error changes by {1000 * own:.3g} mm, less than the truth's own noise of "

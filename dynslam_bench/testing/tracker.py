@@ -193,8 +193,8 @@ def _conventions(subject: TrackerSpec | Callable[[], Tracker], settings: Any, se
     estimate = Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
     assert clip.ground_truth is not None
     found = hints(estimate, clip.ground_truth, "tum-rgbd/v1-sim3" if sim3 else "tum-rgbd/v1")
-    told = [hint for hint in found if hint.id not in ("time-shift", "below-truth-noise")]  # late or exact is no fault here
-    require(not told, "; ".join(hint.text for hint in told))
+    conventions = [hint for hint in found if hint.id not in ("time-shift", "below-truth-noise")]
+    require(not conventions, "; ".join(hint.text for hint in conventions))
 
 
 def _frames_left_alone(run: _Runner) -> None:

@@ -124,9 +124,10 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
         parts.append(f"{SEEN_NOTE} {rule} Instances 100-199 are held out.")
     if hinted := _hinted(board.rows):
+        runs = _count(sum(bool(row.hints) for row in board.rows), "run")
         parts.append(
-            f"{HINTED} The trajectories of {_count(sum(bool(row.hints) for row in board.rows), 'run')} are probably faulty "
-            f"({hinted}), as the diagnostics say; no number is changed for that."
+            f"{HINTED} The trajectories of {runs} are probably faulty ({hinted}), as the diagnostics say; no number is "
+            "changed for that."
         )
     return " ".join(parts)
 

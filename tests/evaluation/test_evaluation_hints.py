@@ -127,7 +127,8 @@ def test_a_truth_with_axes_of_its_own_is_no_fault_of_the_estimate():
 def test_several_recordings_in_a_file(tmp_path):
     other = Trajectory(TRUTH.timestamps + 3600, ESTIMATE.T_world_cam)
     both = Trajectory(
-        np.concatenate([ESTIMATE.timestamps, other.timestamps]), np.concatenate([ESTIMATE.T_world_cam, other.T_world_cam])
+        np.concatenate([ESTIMATE.timestamps, other.timestamps]),
+        np.concatenate([ESTIMATE.T_world_cam, other.T_world_cam]),
     )
     (hint,) = hints(both, TRUTH)
     assert hint.id == "several-recordings" and hint.numbers["poses_outside"] == len(other)
