@@ -282,7 +282,7 @@ class MetricRecord(Record):
         online: Evaluation of the online trajectory; None if it cannot be evaluated.
         final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
         reasons: Why an evaluation is missing, by ``online`` and ``final``.
-        hints: What is probably wrong with the trajectory that the protocol asks for, a line each; see `evaluation.hints`.
+        hints: What is probably wrong with the trajectory that the protocol asks for, a line each; see `hints`.
     """
 
     schema_version: int = schema(METRIC_SCHEMA)
