@@ -34,19 +34,25 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Evaluate a trajectory file against a ground-truth file."""
+    from dynslam_bench.evaluation import get_protocol, hints
     from dynslam_bench.evaluation.evaluate import evaluate_loaded
+    from dynslam_bench.evaluation.prepare import truth_of_file
     from dynslam_bench.runs import read_trajectory
 
     read, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
     result = evaluate_loaded(read, truth, protocol)
+    known = truth_of_file(truth.trajectory, get_protocol(protocol))
+    found = hints(read.trajectory, known, protocol, notes=read.notes)
     if as_json:
-        write_json(result)
+        write_json(result.model_dump(mode="json") | {"hints": [asdict(hint) for hint in found]})
         return
     write(result.summary())
     write(result.protocol)
     write_table(("metric", "value"), list(result.metrics.items()))
     for line in result.diagnostics:
         write(line)
+    for hint in found:
+        write(f"hint: {hint}")
 
 
 @protocols.command("list")

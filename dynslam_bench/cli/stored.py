@@ -85,6 +85,8 @@ def show(
         write_table(("metric", "value"), sorted(evaluation.metrics.items()))
         for line in evaluation.diagnostics:
             write(f"  {line}")
+    for line in metrics.hints:
+        write(f"hint: {line}")
 
 
 @app.command()

@@ -3,6 +3,7 @@
 from .compare_protocols import ComparisonRow, compare_protocols
 from .evaluate import Evaluation, evaluate, evaluate_files, pose_errors
 from .frames import common_frames, coverage, hold
+from .hints import Hint, hints
 from .masks import MaskCounts, compare_masks
 from .never_move import never_move
 from .online import OnlineError, OnlineSample
@@ -12,6 +13,7 @@ __all__ = [
     "PROTOCOLS",
     "ComparisonRow",
     "Evaluation",
+    "Hint",
     "MaskCounts",
     "OnlineError",
     "OnlineSample",
@@ -24,6 +26,7 @@ __all__ = [
     "evaluate",
     "evaluate_files",
     "get_protocol",
+    "hints",
     "hold",
     "never_move",
     "pose_errors",

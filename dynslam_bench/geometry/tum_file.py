@@ -45,6 +45,7 @@ class FileNotes:
         duplicates: Lines replaced by a later line with the same stamp.
         out_of_order: Lines whose stamp is before the previous line's; they were sorted.
         renormalised: Quaternions whose norm was off by more than 1 %.
+        back_s: Longest step back in time from one line to the next, seconds.
     """
 
     lines: int = 0
@@ -53,6 +54,7 @@ class FileNotes:
     duplicates: int = 0
     out_of_order: int = 0
     renormalised: int = 0
+    back_s: float = 0.0
 
     def describe(self) -> list[str]:
         """One phrase for every count that is not zero, e.g. ``3 of 800 lines skipped: not finite``."""
@@ -119,6 +121,7 @@ def load_tum(path: str | Path) -> TumFile:
         **counted,
         duplicates=int((~last_of_stamp).sum()),
         out_of_order=int((np.diff(ns) < 0).sum()),
+        back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
     )
     poses = se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8])
     return TumFile(Trajectory(to_seconds(exact), poses, exact), notes)

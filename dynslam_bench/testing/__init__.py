@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .flow import check_flow, flow_report
     from .isolated import isolated_tracker_report
     from .report import Check, ConformanceError, ConformanceReport
-    from .scenes import CornerSequence, hard_frames
+    from .scenes import CornerSequence, TurningSequence, hard_frames
     from .segmenter import check_segmenter, segmenter_report
     from .sequence import check_sequence, sequence_report
     from .tracker import check_tracker, tracker_report
@@ -30,6 +30,7 @@ _HOMES = {
     "ConformanceError": "report",
     "ConformanceReport": "report",
     "CornerSequence": "scenes",
+    "TurningSequence": "scenes",
     "features_report": "features",
     "filter_report": "filter",
     "filter_scene": "filter",
@@ -46,6 +47,7 @@ __all__ = [
     "ConformanceError",
     "ConformanceReport",
     "CornerSequence",
+    "TurningSequence",
     "check_features",
     "check_filter",
     "check_flow",

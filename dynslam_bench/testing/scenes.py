@@ -1,4 +1,4 @@
-"""A small exact scene for conformance checks: a camera moves before a textured corner, a panel moves within."""
+"""Small exact scenes for conformance checks: before a corner with a moving panel, and in a room where nothing moves."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+TURNING_CAMERA = Camera(320, 240, 267.7, 269.6, 159.8, 123.6)
 
 
 class CornerSequence:
@@ -35,7 +37,7 @@ class CornerSequence:
         self.camera = camera.undistorted()
         self._count = frames
         self.timestamps: NDArray[np.float64] = np.round(100.0 + np.arange(frames) / 30, 6)
-        poses = np.stack([_pose(index) for index in range(frames)])
+        poses = np.stack([self._pose(index) for index in range(frames)])
         self.ground_truth: Trajectory | None = Trajectory(self.timestamps, poses)
 
     @property
@@ -52,8 +54,42 @@ class CornerSequence:
 
     def __getitem__(self, index: int) -> Frame:
         index = range(self._count)[index]
-        rgb, depth, _ = _draw(self.camera, index)
+        rgb, depth, _ = self._draw(index)
         return Frame(index, float(self.timestamps[index]), rgb.copy(), depth.copy())
+
+    def _pose(self, index: int) -> NDArray[np.float64]:
+        return _pose(index)
+
+    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+        return _draw(self.camera, index)
+
+
+class TurningSequence(CornerSequence):
+    """A room, filmed in small images by a camera that moves along all axes and turns about them.
+
+    World-to-camera poses, other axes and other units are told apart from right ones by its path.
+
+    Args:
+        frames: Number of frames at 30 Hz.
+    """
+
+    def __init__(self, frames: int = 24) -> None:
+        super().__init__(frames, TURNING_CAMERA, "synthetic/conformance_turning")
+
+    def digest(self) -> str:
+        """A function of the parameters."""
+        return f"turning-{self._count}"
+
+    def _pose(self, index: int) -> NDArray[np.float64]:
+        a = 2 * np.pi * index / 24
+        place = 0.12 * np.sin(a), 0.06 * np.sin(2 * a), 0.08 * (1 - np.cos(a))
+        turn = 0.05 * np.sin(2 * a), 0.1 * np.sin(a + 1), 0.08 * np.cos(a)
+        return se3.exp(np.array([*place, *turn]))
+
+    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+        depth, x, y = _room(self.camera, self._pose(index))
+        rgb = _sample(_texture(), x / 3, y / 3)  # no more detail than there are pixels
+        return rgb, depth.astype(np.float32), np.zeros(depth.shape, bool)
 
 
 class _Masks:
@@ -61,8 +97,8 @@ class _Masks:
         self._sequence = sequence
 
     def __getitem__(self, index: int) -> FrameMasks:
-        panel = _draw(self._sequence.camera, range(len(self._sequence))[index])[2]
-        return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index else ()))
+        panel = self._sequence._draw(range(len(self._sequence))[index])[2]
+        return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ()))
 
 
 def grey(frame: Frame) -> NDArray[np.uint8]:
@@ -110,6 +146,21 @@ def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.flo
     depth = np.where(panel, panel_depth, depth)
     rgb = _sample(_texture(), np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y))
     return rgb, depth.astype(np.float32), panel
+
+
+def _room(camera: Camera, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Depth ``[H, W]`` of a box-shaped room that is seen from inside, and the two coordinates of what is seen there."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = rays @ T_world_cam[:3, :3].T
+    side = np.where(rays > 0, (1.0, 0.8, 3.5), (-1.0, -0.8, -1.0))  # x to the right, y down, z ahead
+    each = (side - T_world_cam[:3, 3]) / np.where(rays == 0, 1e-12, rays)
+    depth = each.min(axis=-1)
+    seen = T_world_cam[:3, 3] + depth[..., None] * rays
+    facing = each.argmin(axis=-1)
+    other = 0.9 * np.where(np.take_along_axis(side, facing[..., None], axis=-1)[..., 0] > 0, facing, facing + 3)
+    x, y = np.where(facing == 0, seen[..., 2], seen[..., 0]), np.where(facing == 1, seen[..., 2], seen[..., 1])
+    return depth, x + other, y + other  # no two sides look alike
 
 
 @lru_cache(maxsize=1)

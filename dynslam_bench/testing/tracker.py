@@ -12,11 +12,11 @@ import numpy as np
 from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
 from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
 from dynslam_bench.core.settings import Settings, apply_overrides, build
-from dynslam_bench.geometry.se3 import inverse
+from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 from .report import ConformanceError, ConformanceReport, NotApplicable, require, still_alive
-from .scenes import CornerSequence, hard_frames
+from .scenes import CornerSequence, TurningSequence, hard_frames
 from .steering import check_steering
 
 Subject = TrackerSpec | str | Callable[[], Tracker]
@@ -73,6 +73,7 @@ def tracker_report(
     run = _Runner(construct, scene, frames, seed)
     if not report.run("results", lambda: _results(run)):
         return report
+    report.run("camera to world", lambda: _conventions(subject if spec is None else spec, settings, seed))
     report.run("same stats on every frame", lambda: _same_keys(run))
     report.run("frames are left alone", lambda: _frames_left_alone(run))
     report.run("results are kept", lambda: _results_are_kept(run))
@@ -167,7 +168,6 @@ def _results(run: _Runner) -> None:
     states = [result.state for result in results]
     cause = "on this scene features abound and depth is exact"
     require("ok" in states, f"no frame of an easy scene was tracked: {states}", cause)
-    _direction(run, results)
 
 
 def _same_keys(run: _Runner) -> None:
@@ -179,26 +179,22 @@ def _same_keys(run: _Runner) -> None:
         require(not changed, found, "the keys must be the same on every frame; use 0 where there is nothing to say")
 
 
-def _direction(run: _Runner, results: list[TrackResult]) -> None:
-    """Recognise world-to-camera poses by how they move."""
-    truth = run.scene.ground_truth
-    posed = [(frame.timestamp, result.T_world_cam) for frame, result in zip(run.frames, results, strict=True)]
-    ends = [
-        (stamp, pose) for stamp, pose in posed if pose is not None and truth is not None and stamp in truth.timestamps
-    ]
-    if truth is None or len(ends) < 2:
-        return
-    (t0, first), (t1, last) = ends[0], ends[-1]
-    true = [truth.T_world_cam[np.searchsorted(truth.timestamps, stamp)] for stamp in (t0, t1)]
-    motion = inverse(true[0]) @ true[1]
-    distance = np.linalg.norm(motion[:3, 3])
-    error = np.linalg.norm((inverse(first) @ last - motion)[:3, 3])
-    error_inverse = np.linalg.norm((first @ inverse(last) - motion)[:3, 3])
-    found = (
-        f"the camera moved {distance:.3f} m; the poses are off by {error:.3f} m, their inverses by {error_inverse:.3f}"
-    )
-    inverted = error > distance > 0 and error_inverse < 0.3 * error
-    require(not inverted, found, "the poses are world-to-camera; return their inverse")
+def _conventions(subject: TrackerSpec | Callable[[], Tracker], settings: Any, seed: int) -> None:
+    """Recognise world-to-camera poses, other axes and other units by the path of a camera that turns."""
+    clip = TurningSequence()
+    sim3 = isinstance(subject, TrackerSpec) and subject.sensors == "rgb"
+    context = TrackerContext(clip.id, clip.masks, fps=clip.fps)
+    construct = _Builder(subject, settings, context) if isinstance(subject, TrackerSpec) else subject
+    run = _Runner(construct, clip, len(clip), seed)
+    results = run.track(run.frames)
+    posed = [(f.timestamp, r.T_world_cam) for f, r in zip(run.frames, results, strict=True) if r.state == "ok"]
+    if len(posed) < len(clip) // 2:
+        raise NotApplicable(f"only {len(posed)} of the {len(clip)} frames of a camera that turns were tracked")
+    estimate = Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
+    assert clip.ground_truth is not None
+    found = hints(estimate, clip.ground_truth, "tum-rgbd/v1-sim3" if sim3 else "tum-rgbd/v1")
+    conventions = [hint for hint in found if hint.id not in ("time-shift", "below-truth-noise")]
+    require(not conventions, "; ".join(hint.text for hint in conventions))
 
 
 def _frames_left_alone(run: _Runner) -> None:

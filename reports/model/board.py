@@ -161,9 +161,9 @@ def make_board(
 
     Args:
         rows: One a run.
-        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Real-time runs, imports
-            and runs by an older program are never it. Where it was not run on every ranked sequence, a static camera
-            takes its place.
+        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Real-time runs,
+            imports and runs by an older program are never it. Where it was not run on every ranked sequence, a static
+            camera takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 

@@ -85,7 +85,8 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         log=log_of(store, record.run_id),
         command=command_line(record.command),
         machine=machine_words(record),
-        notes=_notes(record, evaluation),
+        notes=_notes(record, evaluation, scored),
+        hints=scored.hints,
     )
 
 
@@ -114,10 +115,11 @@ def _counts(record: RunRecord, final: Evaluation | None) -> dict[str, Any]:
     return counts
 
 
-def _notes(record: RunRecord, evaluation: Evaluation | None) -> list[str]:
+def _notes(record: RunRecord, evaluation: Evaluation | None, scored: MetricRecord) -> list[str]:
     """What a reader should know of a run: whose trial it is, its own remarks, those of its evaluation."""
+    hints = [f"hint: {line}" for line in scored.hints]
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
-    return [*trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
+    return [*hints, *trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
 
 
 def log_of(store: RunStore, run_id: str) -> str:

@@ -16,6 +16,8 @@ Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
 SEEN = "§"
 """Behind trackers and numbers whose masks come from a network that was trained on the scene."""
+HINTED = "‡"
+"""Behind trackers with runs whose trajectories are probably faulty."""
 
 
 class RunRow(Record):
@@ -82,6 +84,7 @@ class RunRow(Record):
         command: Command line that made it.
         machine: Computer and versions in words.
         notes: Diagnostics of the evaluation and of the run.
+        hints: What is probably wrong with the trajectory, see `evaluation.hints`.
     """
 
     run_id: str
@@ -141,6 +144,7 @@ class RunRow(Record):
     command: str = ""
     machine: str = ""
     notes: list[str] = Field(default_factory=list)
+    hints: list[str] = Field(default_factory=list)
 
     @property
     def column_id(self) -> str:

@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
 from ..model.cell import Cell, mean_skipped
-from ..model.row import SEEN, RunRow
+from ..model.row import HINTED, SEEN, RunRow
 from ..model.statistics import FEWEST, Interval, Standing
 from .formats import percent
 from .table import Column, Emphasis, Table, TableCell, number
@@ -123,7 +123,19 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
     if any(row.seen_in_training for row in board.rows):
         rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
         parts.append(f"{SEEN_NOTE} {rule} Instances 100-199 are held out.")
+    if hinted := _hinted(board.rows):
+        runs = _count(sum(bool(row.hints) for row in board.rows), "run")
+        parts.append(
+            f"{HINTED} The trajectories of {runs} are probably faulty ({hinted}), as the diagnostics say; no number is "
+            "changed for that."
+        )
     return " ".join(parts)
+
+
+def _hinted(rows: Iterable[RunRow]) -> str:
+    """What is probably wrong with trajectories, with the number of runs; empty if nothing is."""
+    counts = Counter(line.partition(":")[0] for row in rows for line in row.hints)
+    return ", ".join(f"{name} {count}" for name, count in counts.most_common())
 
 
 def _no_better_than_still(board: Board) -> str:
@@ -140,7 +152,8 @@ def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[T
     runs = board.runs(key)
     good = sum(not row.failed for row in runs)
     success = TableCell(f"{good}/{len(runs)}", value=good / len(runs))
-    name = TableCell(board.labels[key], tip=board.first(key).tracker)
+    hinted = _hinted(runs)
+    name = TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=board.first(key).tracker)
     if key in board.hopeless:
         return [TableCell("–"), success, name, TableCell("nothing succeeded", emphasis="failed"), *[TableCell()] * 3]
     if standing is None:

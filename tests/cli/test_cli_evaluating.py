@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from cli_errors import one_line
 
+from dynslam_bench.evaluation import evaluate_files
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import write_tum
 from dynslam_bench.runs.exchange.pose_tables import write_euroc, write_vslam_lab
+from dynslam_bench.sequences import open_sequence
 
 
 @pytest.fixture
@@ -39,6 +41,28 @@ def test_stamps_that_are_no_seconds_are_refused(cli, pair, tmp_path):
         write_tum(tmp_path / f"{name}.txt", Trajectory(1e9 * trajectory.timestamps, trajectory.T_world_cam))
     code, _, err = cli("eval", tmp_path / "estimate.txt", tmp_path / "truth.txt")
     assert code == 1 and "stamps up to 1.305e+18, which are no seconds" in one_line(err) and "nanoseconds?" in err
+
+
+def test_hints_are_shown_of_files_runs_and_boards(cli, tmp_path):
+    sequence = "synthetic/walking_rpy?frames=60"
+    truth = open_sequence(sequence).ground_truth
+    noise = se3.exp(np.random.default_rng(0).normal(0, 1e-3, (60, 6)))
+    write_tum(tmp_path / "truth.txt", truth)
+    write_tum(tmp_path / "inverted.txt", Trajectory(truth.timestamps, se3.inverse(truth.T_world_cam @ noise)))
+    files = tmp_path / "inverted.txt", tmp_path / "truth.txt"
+    code, out, err = cli("eval", *files)
+    assert code == 0 and "hint: inverted-poses: " in out, err
+    code, out, err = cli("eval", *files, "--json")
+    assert [hint["id"] for hint in json.loads(out)["hints"]] == ["inverted-poses"]
+    assert json.loads(out)["metrics"] == pytest.approx(evaluate_files(*files).metrics)
+    results = "--results", tmp_path / "results"
+    code, _, err = cli("import", files[0], "--tracker", "theirs", "--sequence", sequence, *results)
+    assert code == 0, err
+    assert "hint: inverted-poses: " in cli("runs", "show", *results)[1]
+    code, _, err = cli("report", tmp_path / "results", "-o", tmp_path / "report")
+    assert code == 0, err
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "‡" in text and "inverted-poses 1" in text
 
 
 def test_a_protocol_for_some_sequences_says_so(cli, pair, tmp_path):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import DynslamError, EvaluationError
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
+from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 
@@ -47,6 +48,7 @@ def evaluate_run(
     """
     found: dict[Which, Evaluation | None] = {}
     reasons: dict[str, str] = {}
+    lines: list[str] = []
     which: Which
     for which in ("online", "final"):
         try:
@@ -62,6 +64,9 @@ def evaluate_run(
             found[which] = evaluate(trajectory, truth, protocol, input_timestamps=inputs)
         except DynslamError as error:
             found[which], reasons[which] = None, str(error)
+            continue
+        if which == protocol.trajectory or not found.get(protocol.trajectory):
+            lines = [str(hint) for hint in hints(trajectory, truth, protocol)]
     return MetricRecord(
         run_id=record.run_id,
         protocol_id=protocol.id,
@@ -70,4 +75,5 @@ def evaluate_run(
         online=found.get("online"),
         final=found.get("final"),
         reasons=reasons,
+        hints=lines,
     )

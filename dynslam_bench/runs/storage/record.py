@@ -314,6 +314,7 @@ class MetricRecord(Record):
         online: Evaluation of the online trajectory; None if it cannot be evaluated.
         final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
         reasons: Why an evaluation is missing, by ``online`` and ``final``.
+        hints: What is probably wrong with the trajectory that the protocol asks for, a line each; see `hints`.
     """
 
     schema_version: int = schema(METRIC_SCHEMA)
@@ -326,6 +327,7 @@ class MetricRecord(Record):
     online: Evaluation | None = None
     final: Evaluation | None = None
     reasons: dict[str, str] = Field(default_factory=dict)
+    hints: list[str] = Field(default_factory=list)
 
     @property
     def primary(self) -> Evaluation | None:

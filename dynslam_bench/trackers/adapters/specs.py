@@ -62,8 +62,8 @@ SUBPROCESS = TrackerSpec(
     parameter="command",
     files=f"{_HERE}.subprocess_tracker:files",
     remarks=(
-        "The program, its libraries, the files and folders among its arguments and what scripts and configurations name "
-        "are part of a run's identity; change the setting `version` when something else that it opens has changed."
+        "The program, its libraries, the files and folders among its arguments and what scripts and configurations "
+        "name are part of a run's identity; change the setting `version` when something else that it opens has changed."
     ),
 )
 
