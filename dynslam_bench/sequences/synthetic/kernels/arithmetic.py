@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import reduce
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,14 +104,22 @@ def _angles(y: Array, x: Array, out: Array) -> None:
         out[i] = atan2(y[i], x[i])
 
 
-def sin(x: Any) -> Any:
+@overload
+def sin(x: float) -> float: ...
+@overload
+def sin(x: Array) -> Array: ...
+def sin(x: float | Array) -> float | Array:
     """Sine of a number or of an array, radians; x within 1e6."""
-    return _of_each(_sines, x, 0) if isinstance(x, np.ndarray) else _sine(float(x), 0)
+    return _of_each(_sines, x, 0) if isinstance(x, np.ndarray) else float(_sine(float(x), 0))
 
 
-def cos(x: Any) -> Any:
+@overload
+def cos(x: float) -> float: ...
+@overload
+def cos(x: Array) -> Array: ...
+def cos(x: float | Array) -> float | Array:
     """Cosine of a number or of an array, radians; x within 1e6."""
-    return _of_each(_sines, x, 1) if isinstance(x, np.ndarray) else _sine(float(x), 1)
+    return _of_each(_sines, x, 1) if isinstance(x, np.ndarray) else float(_sine(float(x), 1))
 
 
 def exp(x: Array) -> Array:
