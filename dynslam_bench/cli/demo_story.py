@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from statistics import mean
 from typing import TYPE_CHECKING
 
@@ -23,12 +24,12 @@ STUDIED_S = 0.09
 """Processor seconds of a frame, reading it included: of the runs, and of those of the study."""
 COMPILE_S = 80.0
 """Processor seconds until all kernels are compiled."""
-PROBE_FRAMES, PROBE_S = 8, 0.075
+PROBE_FRAMES, PROBE_S = 16, 0.075
 """Frames that `measure` renders, and processor seconds of one on the same machine."""
 
 
 def measure(jobs: int) -> tuple[float, bool]:
-    """Render a few frames on `jobs` threads.
+    """Render a few frames, `jobs` at a time.
 
     Returns:
         How many times as long as on our machine a job takes now, beside whatever else this one does; and
@@ -37,13 +38,13 @@ def measure(jobs: int) -> tuple[float, bool]:
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.sequences.synthetic.kernels.raycast import shade_pixels
 
-    sequence = open_synthetic(f"synthetic/walking_xyz?frames={PROBE_FRAMES + 1}", None, threads=jobs)
+    sequence = open_synthetic(f"synthetic/walking_xyz?frames={PROBE_FRAMES + 1}", None, threads=1)
     sequence[0]
-    begun = time.perf_counter()
-    for index in range(PROBE_FRAMES):
-        sequence[index + 1]
-    took = (time.perf_counter() - begun) / PROBE_FRAMES
-    return took * jobs / PROBE_S, bool(shade_pixels.stats.cache_misses)
+    with ThreadPoolExecutor(jobs) as pool:
+        begun = time.perf_counter()
+        list(pool.map(sequence.__getitem__, range(1, PROBE_FRAMES + 1)))
+        took = time.perf_counter() - begun
+    return took * jobs / (PROBE_FRAMES * PROBE_S), bool(shade_pixels.stats.cache_misses)
 
 
 def estimate(frames: int, study_frames: int, trials: int, jobs: int, *, slowness: float, compiles: bool) -> str:
