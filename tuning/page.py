@@ -272,6 +272,11 @@ def warnings_of(tuner: Tuner) -> list[str]:
         )
     elif broken:
         notes.append(f"{len(broken)} trials violate a constraint and are not candidates.")
+    if "speed" in tuner.spec.objectives:
+        notes.append(
+            "Trials ran at different times: what else the machine did then is in their ratios of processor time. On "
+            "the blocks of the choice and on held-out ones the default and the candidates ran in turn: those count."
+        )
     return notes
 
 

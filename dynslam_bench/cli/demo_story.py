@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from statistics import mean
 from typing import TYPE_CHECKING
 
@@ -16,33 +18,56 @@ TELLING = 1.5
 """Single runs scatter by some thirty per cent: a smaller factor shows nothing."""
 SEQUENCES, STUDY_SCENES, SINGLE_RUNS = 2, 6, 24
 RENDER_S, START_S, REPORT_S = 0.12, 1.0, 15.0
-"""Processor seconds of a rendered frame, of a run's start, and of the pages, on a two-core machine."""
+"""Processor seconds of a rendered and stored frame, of a run's start, and of the pages, on our machine."""
 TRACK_S = {"never-move": 0.015, PLAIN: 0.035, "mask-rcnn": 0.13, "emfoa-oft": 0.16}
 STUDIED_S = 0.09
 """Processor seconds of a frame, reading it included: of the runs, and of those of the study."""
 COMPILE_S = 80.0
 """Processor seconds until all kernels are compiled."""
+PROBE_FRAMES, PROBE_S = 16, 0.075
+"""Frames that `measure` renders, and processor seconds of one on the same machine."""
 
 
-def estimate(frames: int, study_frames: int, trials: int, jobs: int) -> str:
-    """How long the demonstration takes on a quiet machine, and what it does in that time.
+def measure(jobs: int) -> tuple[float, bool]:
+    """Render a few frames, `jobs` at a time.
+
+    Returns:
+        How many times as long as on our machine a job takes now, beside whatever else this one does; and
+        whether kernels had to be compiled.
+    """
+    from dynslam_bench.sequences.synthetic import open_synthetic
+    from dynslam_bench.sequences.synthetic.kernels.raycast import shade_pixels
+
+    sequence = open_synthetic(f"synthetic/walking_xyz?frames={PROBE_FRAMES + 1}", None, threads=1)
+    sequence[0]
+    with ThreadPoolExecutor(jobs) as pool:
+        begun = time.perf_counter()
+        list(pool.map(sequence.__getitem__, range(1, PROBE_FRAMES + 1)))
+        took = time.perf_counter() - begun
+    return took * jobs / (PROBE_FRAMES * PROBE_S), bool(shade_pixels.stats.cache_misses)
+
+
+def estimate(frames: int, study_frames: int, trials: int, jobs: int, *, slowness: float, compiles: bool) -> str:
+    """How long the demonstration takes, and what it does in that time.
 
     Args:
         frames: Of each sequence.
         study_frames: Of a block of the study.
         trials: Of the study, trial 0 included.
         jobs: Runs at a time.
+        slowness: See `measure`.
+        compiles: Whether kernels have to be compiled.
     """
     rendered = SEQUENCES * frames + STUDY_SCENES * study_frames
     runs = SEQUENCES * len(TRACK_S)
     studied = SINGLE_RUNS + 3 * (trials - 2)
     seconds = rendered * RENDER_S + (runs + studied) * START_S + REPORT_S
     seconds += SEQUENCES * frames * sum(TRACK_S.values()) + studied * study_frames * STUDIED_S
-    minutes, first = (max(1, math.ceil(each / max(jobs, 1) / 60)) for each in (seconds, seconds + COMPILE_S))
-    machine = f"{jobs} quiet core{'s' * (jobs != 1)}"
+    minutes = max(1, math.ceil((seconds + COMPILE_S * compiles) * slowness / jobs / 60))
     return (
-        f"about {minutes} minute{'s' * (minutes > 1)} on {machine}, {first} when it first compiles; "
-        f"{rendered} frames are rendered, {runs} runs made, and {trials} trials of a study"
+        f"about {minutes} minute{'s' * (minutes > 1)} at the speed at which this machine rendered {PROBE_FRAMES} "
+        f"frames just now{', compiling included' * compiles}; {rendered} frames are rendered, {runs} runs "
+        f"made, and {trials} trials of a study"
     )
 
 
@@ -81,10 +106,11 @@ def _verdict(factor: float) -> str:
 
 
 def _costs(records: Sequence[RunRecord]) -> list[str]:
-    """Milliseconds of the median frame, of systems that ran; a mean would count the compiling of a first run."""
+    """Processor time of the median frame: a mean would count the compiling of a first run, a frame time other work."""
     spent: dict[str, list[float]] = {}
     for record in records:
-        if not record.failed and record.frame_time_s is not None and record.tracker.id in (PLAIN, *CULLING):
-            spent.setdefault(record.tracker.id, []).append(1e3 * record.frame_time_s)
+        times = record.timings.get("processor")
+        if not record.failed and times is not None and record.tracker.id in (PLAIN, *CULLING):
+            spent.setdefault(record.tracker.id, []).append(1e3 * times.median_s)
     costs = [f"{mean(spent[name]):.0f} ms ({name})" for name in (PLAIN, *CULLING) if name in spent]
-    return [f"What it costs, at the median frame: {', '.join(costs)}."] if len(costs) > 1 else []
+    return [f"What it costs, in processor time of the median frame: {', '.join(costs)}."] if len(costs) > 1 else []

@@ -196,10 +196,8 @@ def demo(
     trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
-    from .demo import run_demo, study_frames
-    from .demo_story import estimate
+    from .demo import run_demo
 
-    write(estimate(frames, study_frames(frames), trials, jobs), now=True)
     outcome = run_demo(results, frames=frames, jobs=jobs, trials=trials)
     write()
     write(outcome.leaderboard)

@@ -202,8 +202,8 @@ class BundleAdjustmentSettings(Settings):
     """Local bundle adjustment at each keyframe; its work is bounded by counts, never by the clock."""
 
     enabled: bool = tunable(True, meaning="whether to refine keyframes and points at each keyframe")
-    solver: Literal["schur", "gtsam"] = tunable(
-        "schur", when=ADJUSTED, meaning="own vectorised Schur complement, or gtsam"
+    solver: Literal["schur", "gtsam"] = Field(
+        "schur", description="own vectorised Schur complement; gtsam is the reference that it is compared with"
     )
     window: int = tunable(
         8,

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from dynslam_bench.cli.demo_story import estimate, tell
+from dynslam_bench.cli import demo_story
+from dynslam_bench.cli.demo_story import PROBE_FRAMES, PROBE_S, estimate, measure, tell
 from dynslam_bench.reports.model.row import RunRow
 
 
@@ -44,8 +45,9 @@ def test_every_sequence_has_its_sentence_and_what_did_not_run_has_none() -> None
 
 
 def test_what_culling_costs_is_the_median_frame_of_the_runs_that_ended_well() -> None:
-    def record(tracker: str, frame_time_s: float | None, failed: bool = False) -> SimpleNamespace:
-        return SimpleNamespace(tracker=SimpleNamespace(id=tracker), frame_time_s=frame_time_s, failed=failed)
+    def record(tracker: str, median_s: float, failed: bool = False) -> SimpleNamespace:
+        timings = {"processor": SimpleNamespace(median_s=median_s)}
+        return SimpleNamespace(tracker=SimpleNamespace(id=tracker), timings=timings, failed=failed)
 
     records = [
         record("orb-slam2", 0.03),
@@ -54,9 +56,21 @@ def test_what_culling_costs_is_the_median_frame_of_the_runs_that_ended_well() ->
         record("mask-rcnn", 9, True),
     ]
     *_, costs, _ = tell([row("orb-slam2", 0.02)], records)
-    assert costs == "What it costs, at the median frame: 40 ms (orb-slam2), 100 ms (mask-rcnn)."
+    assert costs == "What it costs, in processor time of the median frame: 40 ms (orb-slam2), 100 ms (mask-rcnn)."
 
 
 def test_the_estimate_grows_with_what_is_asked_for() -> None:
-    assert estimate(80, 20, 6, 2).startswith("about 2 minutes on 2 quiet cores, 3 when it first compiles; 280 frames")
-    assert estimate(600, 150, 30, 1).startswith("about 38 minutes on 1 quiet core,")
+    def minutes(*asked: int, slowness: float = 1.0, compiles: bool = False) -> int:
+        return int(estimate(*asked, slowness=slowness, compiles=compiles).split()[1])
+
+    usual = minutes(80, 20, 6, 2)
+    assert usual < minutes(80, 20, 6, 2, compiles=True) < minutes(80, 20, 6, 2, compiles=True, slowness=3.0)
+    assert minutes(600, 150, 30, 1) > 10 * usual
+    assert "280 frames" in estimate(80, 20, 6, 2, slowness=1.0, compiles=False)
+
+
+def test_the_speed_of_the_machine_is_measured_before_a_time_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([10.0, 10.0 + 3 * PROBE_S * PROBE_FRAMES])
+    monkeypatch.setattr(demo_story, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    slowness, compiles = measure(1)
+    assert slowness == pytest.approx(3.0) and isinstance(compiles, bool)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,7 @@ def test_run_id_tells_the_packages_that_change_the_bits(toy_folder: str, monkeyp
         ids[name] = resolve(spec).run_id
     assert len(set(ids.values())) == len(ids) - 1 and ids["gtsam"] == ids["nothing"]
     assert {"numpy", "scipy", "opencv", "torch", "numba"} == set(identity.LIBRARIES) <= set(known)
+    assert ("gtsam" in known) == (find_spec("gtsam") is not None)
 
 
 def test_a_part_has_one_run_id_however_it_is_written() -> None:

@@ -21,10 +21,11 @@ from .ids import SyntheticId
 from .kernels import motion as motion_kernels
 from .kernels import raycast as kernels
 from .kernels import sensors
+from .kernels.arithmetic import cos, exp, norm, power, product, sin
 from .scenes.parts import QUAD, ROUND_CONE
 from .scenes.scene import Scene, Snapshot
 from .scenes.textures import Atlas
-from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
+from .settings import CAMERA, FPS, RenderSettings
 from .views import View, rolling_flow, view_of
 
 _BAND = 48
@@ -32,6 +33,8 @@ _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 
 
 _MEAN_GREY = 105.0
 """What automatic exposure aims at."""
+_NOISE_VERSION = 5
+"""Seeds the noise of the sensors. It stays while versions of the renderer differ in last bits only."""
 _SLACK_M = 0.01
 """How much nearer than in the rows that were looked at a thing may be in another one."""
 Tiles = tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
@@ -77,7 +80,7 @@ class Renderer:
         self.threads = threads or default_threads()
         self._pool: ThreadPoolExecutor | None = None
         self._pool_process = 0
-        text = f"{RENDERER_VERSION}/{sequence.name}@{sequence.instance}"
+        text = f"{_NOISE_VERSION}/{sequence.name}@{sequence.instance}"
         text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
@@ -198,9 +201,11 @@ class Renderer:
             The tiles, and the maps from the camera to what lies in them (`View.local`).
         """
         scene, snap = self.scene, view.middle
-        world = (scene.corners * scene.scale[:, None, :]) @ np.swapaxes(snap.rotation, 1, 2) + snap.origin[:, None, :]
+        world = (
+            product(scene.corners * scene.scale[:, None, :], np.swapaxes(snap.rotation, 1, 2)) + snap.origin[:, None, :]
+        )
         chosen = np.linspace(0, len(view.poses) - 1, 9 if view.rolling else 1).astype(int)
-        bounds = [bounds_of((world - pose[:3, 3]) @ pose[:3, :3]) for pose in view.poses[chosen]]
+        bounds = [bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.poses[chosen]]
         nearest, low_u, low_v = (np.min([each[k] for each in bounds], axis=0) for k in range(3))
         high_u, high_v = (np.max([each[k] for each in bounds], axis=0) for k in (3, 4))
         if view.rolling:
@@ -239,37 +244,39 @@ class Renderer:
 
     def _motion(self, now: Snapshot, other: Snapshot) -> NDArray[np.float64]:
         """Maps ``[P, 12]`` from points in this camera's frame, fixed to a primitive, to the other camera's frame."""
-        turn = other.rotation @ np.swapaxes(now.rotation, 1, 2)
-        shift = other.origin - (turn @ now.origin[:, :, None])[:, :, 0]
+        turn = product(other.rotation, np.swapaxes(now.rotation, 1, 2))
+        shift = other.origin - product(turn, now.origin[:, :, None])[:, :, 0]
         to_other = other.T_world_cam[:3, :3].T
         result = np.empty((len(shift), 3, 4))
-        result[:, :, :3] = to_other @ turn @ now.T_world_cam[:3, :3]
-        moved = (turn @ now.T_world_cam[:3, 3]) + shift - other.T_world_cam[:3, 3]
-        result[:, :, 3] = moved @ to_other.T
+        result[:, :, :3] = product(to_other, turn, now.T_world_cam[:3, :3])
+        moved = product(turn, now.T_world_cam[:3, 3]) + shift - other.T_world_cam[:3, 3]
+        result[:, :, 3] = product(moved, to_other.T)
         return np.ascontiguousarray(result.reshape(-1, 12))
 
     def _lights(self, snap: Snapshot, time: float) -> NDArray[np.float64]:
         """Directions to the lights in the camera frame, and strengths; row 0 is the ambient light."""
         rows = _LAMPS.copy()
-        rows[:, :3] /= np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
+        rows[:, :3] /= norm(rows[:, :3])[:, None]
         if self.settings.lighting_change:
-            rows[:, 3] *= 0.78 + 0.22 * math.cos(2 * math.pi * time / 7.0)
-            if math.sin(2 * math.pi * time / 4.7) > 0.3:
+            rows[:, 3] *= 0.78 + 0.22 * cos(2 * math.pi * time / 7.0)
+            if sin(2 * math.pi * time / 4.7) > 0.3:
                 rows[2, 3] += 0.25
-        rows[:, :3] = rows[:, :3] @ snap.T_world_cam[:3, :3]
+        rows[:, :3] = product(rows[:, :3], snap.T_world_cam[:3, :3])
         return np.ascontiguousarray(rows)
 
     def _facets(self, snap: Snapshot, lights: NDArray[np.float64]) -> NDArray[np.float64]:
         """What is the same all over a face ``[P, 6, 5]``: normal in the camera frame, light, texels a pixel at 1 m."""
         scene = self.scene
-        axes = (snap.T_world_cam[:3, :3].T @ snap.rotation).transpose(0, 2, 1)
+        axes = product(snap.T_world_cam[:3, :3].T, snap.rotation).transpose(0, 2, 1)
         facets = np.empty((len(axes), 6, 5))
         facets[:, 0::2, :3], facets[:, 1::2, :3] = -axes, axes
         facets[scene.kind == QUAD, 4:, :3] = axes[scene.kind == QUAD, 2:]
         seen = snap.T_world_cam[:3, 3] - snap.origin
-        behind = (np.einsum("pij,pi->pj", snap.rotation, seen) < 0)[:, 2] & (scene.kind == QUAD)
+        behind = (product(seen[:, None, :], snap.rotation) < 0)[:, 0, 2] & (scene.kind == QUAD)
         facets[behind, 4:, :3] *= -1
-        facets[:, :, 3] = lights[0, 3] + np.maximum(facets[:, :, :3] @ lights[1:, :3].T, 0) @ lights[1:, 3]
+        facets[:, :, 3] = lights[0, 3] + product(
+            np.maximum(product(facets[:, :, :3], lights[1:, :3].T), 0), lights[1:, 3]
+        )
         facets[:, :, 4] = self._density
         return facets
 
@@ -287,10 +294,10 @@ class Renderer:
     def _shadow(self, snap: Snapshot, time: float, depth: NDArray[np.float64], color: NDArray[np.float32]) -> None:
         """Soft shadows of things outside the picture, sweeping over the room."""
         light = _LAMPS[1, :3] / _LAMPS[1, 2]
-        sweep = 1.6 * math.sin(2 * math.pi * time / 6.3)
+        sweep = 1.6 * sin(2 * math.pi * time / 6.3)
         spots = np.array(
             [
-                [sweep + light[0] * 1.2, 0.7 + 0.3 * math.sin(1.1 * time), 1.0, 0.5],
+                [sweep + light[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5],
                 [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4],
             ]
         )
@@ -300,13 +307,13 @@ class Renderer:
     def _glare(self, snap: Snapshot, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the room's back wall, brightening and fading."""
         window = np.array(self.scene.world.window)
-        x, y, z = (window - snap.T_world_cam[:3, 3]) @ snap.T_world_cam[:3, :3]
+        x, y, z = product(window - snap.T_world_cam[:3, 3], snap.T_world_cam[:3, :3])
         if z <= 0.1:
             return np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
         u, v = x / z * CAMERA.fx + CAMERA.cx, y / z * CAMERA.fy + CAMERA.cy
-        strength = 110 * (0.6 + 0.4 * math.sin(2 * math.pi * time / 5.3))
-        across = np.exp(-(((np.arange(CAMERA.width) - u) / 210.0) ** 2))
-        down = np.exp(-(((np.arange(CAMERA.height) - v) / 180.0) ** 2))
+        strength = 110 * (0.6 + 0.4 * sin(2 * math.pi * time / 5.3))
+        across = exp(-(((np.arange(CAMERA.width) - u) / 210.0) ** 2))
+        down = exp(-(((np.arange(CAMERA.height) - v) / 180.0) ** 2))
         return np.asarray((strength * down[:, None] * across[None, :])[..., None], np.float32)
 
     def _measure(
@@ -344,12 +351,12 @@ class Renderer:
         rows = np.arange(CAMERA.height)
         time = index / FPS + rows / CAMERA.height / FPS * 0.9
         gain = 1 + sensor.exposure_drift * (
-            0.7 * np.sin(2 * math.pi * time / 6.1) + 0.3 * np.sin(2 * math.pi * time / 1.9 + 1.0)
+            0.7 * sin(2 * math.pi * time / 6.1) + 0.3 * sin(2 * math.pi * time / 1.9 + 1.0)
         )
-        gain *= 1 + sensor.flicker * np.sin(2 * math.pi * 100.0 * time * 1.0013)
+        gain *= 1 + sensor.flicker * sin(2 * math.pi * 100.0 * time * 1.0013)
         if optics.gain != 1 or optics.auto_exposure:
             mean = max(float(color.mean(dtype=np.float64)) * optics.gain, 1.0)
-            gain *= optics.gain * (_MEAN_GREY / mean) ** optics.auto_exposure
+            gain *= optics.gain * power(_MEAN_GREY / mean, optics.auto_exposure)
         gains = np.repeat(gain[:, None], 3, axis=1)
         offset = np.zeros_like(gains)
         rgb = np.empty(color.shape, np.uint8)

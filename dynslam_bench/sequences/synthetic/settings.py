@@ -9,7 +9,7 @@ from pydantic import Field
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
 
-RENDERER_VERSION = 5
+RENDERER_VERSION = 6
 """Raised whenever any pixel, pose or mask of any sequence changes; part of every digest and cache folder."""
 
 CAMERA = Camera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6, depth_factor=5000.0)

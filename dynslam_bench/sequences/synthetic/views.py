@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernels.arithmetic import product
 from .scenes.scene import Scene, Snapshot
 from .settings import CAMERA, FPS
 
@@ -49,7 +50,7 @@ class View:
         poses = np.repeat(self.poses[:, None, :3], len(seen), axis=1)
         poses[..., 3] -= self.middle.origin[seen]
         local = np.empty((len(self.poses), len(self.scale), 12))
-        local[:, seen] = (inverse @ poses).reshape(len(poses), -1, 12)
+        local[:, seen] = (product(inverse, poses)).reshape(len(poses), -1, 12)
         return local
 
     def at_row(self, row: int) -> Snapshot:
@@ -80,11 +81,11 @@ def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
     turns, places = now.poses[:, :3, :3], now.poses[:, :3, 3]
-    world = np.einsum("rij,rcj->rci", turns, rays * depth[..., None]) + places[:, None]
-    turn = other.middle.rotation @ np.swapaxes(now.middle.rotation, 1, 2)
-    shift = other.middle.origin - (turn @ now.middle.origin[:, :, None])[:, :, 0]
+    world = product(rays * depth[..., None], np.swapaxes(turns, 1, 2)) + places[:, None]
+    turn = product(other.middle.rotation, np.swapaxes(now.middle.rotation, 1, 2))
+    shift = other.middle.origin - product(turn, now.middle.origin[:, :, None])[:, :, 0]
     primitive = np.maximum(hit >> 3, 0)
-    world = np.einsum("rcij,rcj->rci", turn[primitive], world) + shift[primitive]
+    world = product(turn[primitive], world[..., None])[..., 0] + shift[primitive]
     row, last = v.copy(), CAMERA.height - 1
     for _ in range(_ROUNDS):
         first = np.clip(np.floor(row), 0, last - 1).astype(np.int64)
@@ -92,7 +93,7 @@ def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -
         ends = []
         for near in (first, first + 1):
             away = world - other.poses[near, :3, 3]
-            ends.append(np.einsum("rcji,rcj->rci", other.poses[near, :3, :3], away))
+            ends.append(product(away[..., None, :], other.poses[near, :3, :3])[..., 0, :])
         points = (1 - share) * ends[0] + share * ends[1]
         w = np.where(points[..., 2] > 0.05, points[..., 2], np.nan)
         x, row_now = points[..., 0] / w * CAMERA.fx + CAMERA.cx, points[..., 1] / w * CAMERA.fy + CAMERA.cy

@@ -9,6 +9,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import product, sin
 from ..scenes.camera_paths import EYE_HEIGHT_M, TILT_RAD, camera_axes, hand, rotations
 from ..scenes.plan import pick, plan_room
 from ..scenes.room import build_room
@@ -50,16 +51,16 @@ def fast_camera(variant: str, instance: int, times: Array) -> Array:
     for amplitudes, values in ((shifts, offset), (turns, angles)):
         for axis, amplitude in enumerate(amplitudes):
             main, second = pick(rng, instance, 0.45, 0.7), pick(rng, instance, 0.8, 1.1)
-            values[:, axis] += 0.75 * amplitude * np.sin(2 * math.pi * (main * t + rng.random()))
-            values[:, axis] += 0.4 * amplitude * np.sin(2 * math.pi * (second * t + rng.random()))
+            values[:, axis] += 0.75 * amplitude * sin(2 * math.pi * (main * t + rng.random()))
+            values[:, axis] += 0.4 * amplitude * sin(2 * math.pi * (second * t + rng.random()))
     yaw, place = np.zeros((len(t), 3)), np.array([0.0, 0.0, EYE_HEIGHT_M])
     if variant == "spin":
         yaw[:, 2] = pick(rng, instance, 1.3, 1.6) * t
         place = np.array([2.7, 0.2, EYE_HEIGHT_M])
     poses = np.tile(np.eye(4), (len(t), 1, 1))
-    base = rotations(yaw) @ camera_axes(TILT_RAD)
-    poses[:, :3, :3] = base @ rotations(angles)
-    poses[:, :3, 3] = place + np.einsum("nij,nj->ni", base, offset)
+    base = product(rotations(yaw), camera_axes(TILT_RAD))
+    poses[:, :3, :3] = product(base, rotations(angles))
+    poses[:, :3, 3] = place + product(base, offset[..., None])[..., 0]
     return poses
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import atan2, cos, norm, sin
 from ..scenes.interiors import Point, add_floor, add_wall, cartons, corridor_bay, notices, office_bay, office_chair
 from ..scenes.parts import BOX, Parts, turn
 from ..scenes.plan import pick, plan_room
@@ -73,7 +74,7 @@ def _moves(building: _Building, walk: Walk, moved: bool) -> list[Callable[[float
         places = [(turn(yaw), np.array([*at, 0.0]))]
         for _ in range(2):
             angle = np.radians(pick(rng, building.instance, 0.0, 360.0))
-            away = pick(rng, building.instance, 0.3, 0.55) * np.array([np.cos(angle), np.sin(angle), 0.0])
+            away = pick(rng, building.instance, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
             places.append((turn(yaw + pick(rng, building.instance, 40.0, 320.0)), np.array([*at, 0.0]) + away))
         near = walk.time_nearest(at)
         paths.append(partial(_stand, places if moved else places[:1], near, walk.lap_s))
@@ -124,8 +125,8 @@ def _corridor(b: _Building) -> Walk:
         for start, end in _around(x + sign * width, y + sign * width):
             add_wall(b.parts, start, end, plan)
             way = np.array(end) - start
-            length = float(np.hypot(*way))
-            yaw = float(np.degrees(np.arctan2(way[1], way[0]))) + (0 if sign < 0 else 180)
+            length = float(norm(way))
+            yaw = float(np.degrees(atan2(way[1], way[0]))) + (0 if sign < 0 else 180)
             inward = sign * np.array([-way[1], way[0]]) / length * 0.05
             count = int(length / 2.3)
             for k in range(count):

@@ -14,6 +14,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import cos
 from ..people.bodies import draw_person
 from ..people.script import Key, posture
 from ..scenes.camera_paths import camera_poses
@@ -131,7 +132,7 @@ def _trolley(j: Draw, instance: int, plan: Plan) -> Cast:
     stops = ((0, -2.0, 0), (1.5, -2.0, 0), (6.0, 0.15, 0), (8.0, 0.2, 6), (11.5, 2.3, 0), (12.5, 2.3, 180),
              (15.5, 0.1, 180), (16.5, 0.05, 174), (19.5, -2.0, 180), (20.0, -2.0, 360))  # fmt: skip
     keys = tuple(At(t, x, y, 0.0, yaw) for t, x, yaw in stops)
-    walker = tuple(Key(k.t, k.x - 0.75 * np.cos(np.radians(k.yaw)), y, k.yaw - 90.0) for k in keys)
+    walker = tuple(Key(k.t, k.x - 0.75 * cos(np.radians(k.yaw)), y, k.yaw - 90.0) for k in keys)
     return (_body(1, "trolley", trolley(1, instance, plan), keys),), walker
 
 

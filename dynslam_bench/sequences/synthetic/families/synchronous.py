@@ -10,6 +10,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import product, sin
 from ..people.bodies import Posture, draw_person
 from ..scenes.camera_paths import EYE_HEIGHT_M, TILT_RAD, camera_axes, hand, rotations
 from ..scenes.plan import pick, plan_room
@@ -29,7 +30,7 @@ class Step:
 
     def at(self, times: Array) -> Array:
         """Offset along x at times (seconds)."""
-        swing = np.sin(2 * math.pi * (np.asarray(times) / self.period + self.phase))
+        swing = sin(2 * math.pi * (np.asarray(times) / self.period + self.phase))
         return np.asarray(self.reach * swing * (1.5 - 0.5 * swing * swing))
 
 
@@ -51,7 +52,7 @@ def _stepping(step: Step, place: tuple[float, float], time: float) -> Posture:
 def _camera(step: Step, instance: int, times: Array) -> Array:
     rng, t = stream(instance, "synthetic", "camera", "synchronous"), np.asarray(times, dtype=np.float64)
     poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = camera_axes(TILT_RAD) @ rotations(hand(rng, t, math.radians(0.5), 3))
+    poses[:, :3, :3] = product(camera_axes(TILT_RAD), rotations(hand(rng, t, math.radians(0.5), 3)))
     poses[:, :3, 3] = hand(rng, t, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
     poses[:, 0, 3] += step.at(t)
     return poses

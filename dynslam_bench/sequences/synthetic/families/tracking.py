@@ -10,6 +10,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import atan2
 from ..people.bodies import Posture, draw_person
 from ..scenes.plan import pick
 from ..scenes.walks import Walk, walking_camera
@@ -32,7 +33,7 @@ def build_tracking(variant: str, instance: int) -> World:
 def _walking(walk: Walk, lead_s: float, time: float) -> Posture:
     place, ahead = walk.at(np.array([time + lead_s, time + lead_s + 0.3]))
     way = ahead - place
-    facing = math.degrees(math.atan2(way[1], way[0])) - 90.0
+    facing = math.degrees(atan2(way[1], way[0])) - 90.0
     stride = 0.45 * (time + lead_s) * 2 * math.pi / 1.0
     return Posture(float(place[0]), float(place[1]), facing, stride, 0.6, 0.0, 0.0, time)
 

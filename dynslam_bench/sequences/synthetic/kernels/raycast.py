@@ -16,6 +16,7 @@ import numpy as np
 from dynslam_bench.core.compiled import dividing_kernel
 
 from ..scenes.parts import BOX, ROUND_CONE
+from .arithmetic import atan2
 from .arrays import Intrinsics, Ints, Reals
 from .hits import NEAR_M, hit_box, hit_round_cone
 
@@ -201,7 +202,7 @@ def shade_pixels(
                                 nz = lz - h
                             elif lz > r1 * s:
                                 nz = s * (r1 - s * lz) / (1.0 - s * s)
-                        u += math.atan2(lx, ly) * _PER_TURN * su
+                        u += atan2(lx, ly) * _PER_TURN * su
                         v -= lz * sv
                         # Normal into the camera frame: transpose of the (camera to local) linear part.
                         nu = local[p, 0] * lx + local[p, 4] * ly + local[p, 8] * nz

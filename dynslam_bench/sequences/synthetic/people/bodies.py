@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import cos, power, product, sin
 from ..scenes.parts import ROUND_CONE, Parts, along, turn
 from ..scenes.plan import pick, pick_one
 
@@ -111,13 +112,13 @@ def draw_person(instance: int, index: int) -> Person:
 
 def _pitch(angle: float) -> Array:
     """About the person's right-hand axis; positive swings a hanging limb forward."""
-    c, s = math.cos(angle), math.sin(angle)
+    c, s = cos(angle), sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def _roll(angle: float) -> Array:
     """About the person's forward axis; positive swings a hanging limb to the left (-x)."""
-    c, s = math.cos(angle), math.sin(angle)
+    c, s = cos(angle), sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
@@ -145,12 +146,12 @@ class _Figure:
         sway = (1 - gait) * (1 - 0.85 * sit)
         supple = 1 - 0.8 * sit
         swaying = np.array([0.012 * sway * wave(0.31, 0.0), 0.012 * sway * wave(0.23, 2.0), 0.0])
-        self.root = np.array([how.x, how.y, pelvis_z]) + body @ swaying
-        twist = gait * 0.1 * math.sin(how.stride) + supple * lively * 0.12 * wave(0.27, 0.4)
+        self.root = np.array([how.x, how.y, pelvis_z]) + product(body, swaying)
+        twist = gait * 0.1 * sin(how.stride) + supple * lively * 0.12 * wave(0.27, 0.4)
         lean = 0.05 * gait + sit * 0.06 + supple * (0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2))
-        self.trunk = body @ _yaw(twist) @ _pitch(-lean) @ _roll(0.02 * supple * wave(0.17, 0.7))
-        self.hipline = body @ _yaw(-twist)
-        self.neck = self.root + self.trunk @ np.array([0.0, -0.005, 0.46 * k + 0.05 * k])
+        self.trunk = product(body, _yaw(twist), _pitch(-lean), _roll(0.02 * supple * wave(0.17, 0.7)))
+        self.hipline = product(body, _yaw(-twist))
+        self.neck = self.root + product(self.trunk, np.array([0.0, -0.005, 0.46 * k + 0.05 * k]))
         self.jeans: Style = self._style("denim", who.trousers, repeat=(2.0, 3.0))
         self.shirt: Style = self._style(who.shirt, who.shirt_tint)
         self.bare: Style = self._style("plain", who.skin)
@@ -167,18 +168,18 @@ class _Figure:
         self.knees: list[float] = []
         for side in (-1, 1):
             swing = phase + (0.0 if side < 0 else math.pi)
-            hip = gait * (0.08 + 0.46 * math.sin(swing))
-            knee = gait * (0.12 + 0.85 * max(0.0, math.cos(swing)) ** 2) + 0.03
+            hip = gait * (0.08 + 0.46 * sin(swing))
+            knee = gait * (0.12 + 0.85 * max(0.0, cos(swing)) * max(0.0, cos(swing))) + 0.03
             self.hips.append(hip * (1 - sit) + sit * (1.45 + 0.03 * side))
             self.knees.append(knee * (1 - sit) + sit * (1.35 + 0.12 * side))
         bent = zip(self.hips, self.knees, strict=True)
-        standing = max(thigh * math.cos(h) + shin * math.cos(h - n) for h, n in bent) + foot
+        standing = max(thigh * cos(h) + shin * cos(h - n) for h, n in bent) + foot
         seat = 0.485 + 0.085 * self.b
         return standing * (1 - sit) + sit * seat
 
     def wave(self, f: float, p: float) -> float:
         """Idle movement: a sine of frequency f in Hz and phase p."""
-        return math.sin(2 * math.pi * f * self.how.clock + p + self.seed)
+        return sin(2 * math.pi * f * self.how.clock + p + self.seed)
 
     def limb(self, a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> None:
         """A round cone from a to c; its section is `flat` times as wide across `side`'s normal."""
@@ -203,25 +204,25 @@ def add_person(parts: Parts, who: Person, how: Posture) -> None:
 def _add_trunk(f: _Figure) -> None:
     """Pelvis, belly, chest, shoulders; wider than deep."""
     k, b, root, trunk, hipline = f.k, f.b, f.root, f.trunk, f.hipline
-    right = trunk @ _X
+    right = product(trunk, _X)
     f.limb(
-        root + hipline @ np.array([-0.055 * k, 0, 0.01]),
-        root + hipline @ np.array([0.055 * k, 0, 0.01]),
+        root + product(hipline, np.array([-0.055 * k, 0, 0.01])),
+        root + product(hipline, np.array([0.055 * k, 0, 0.01])),
         0.115 * k * b,
         0.115 * k * b,
-        hipline @ np.array([0.0, 0.0, 1.0]),
+        product(hipline, np.array([0.0, 0.0, 1.0])),
         0.95,
         **f.jeans,
     )
-    waist = root + trunk @ np.array([0.0, 0.0, 0.08 * k])
-    chest = root + trunk @ np.array([0.0, 0.005, 0.36 * k])
+    waist = root + product(trunk, np.array([0.0, 0.0, 0.08 * k]))
+    chest = root + product(trunk, np.array([0.0, 0.005, 0.36 * k]))
     f.limb(waist, chest, 0.148 * k * b, 0.168 * k * b, right, 0.68, repeat=(5.0, 6.0), **f.shirt)
     f.limb(
-        chest - right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
-        chest + right * 0.11 * k * b + trunk @ np.array([0, 0, 0.05 * k]),
+        chest - right * 0.11 * k * b + product(trunk, np.array([0, 0, 0.05 * k])),
+        chest + right * 0.11 * k * b + product(trunk, np.array([0, 0, 0.05 * k])),
         0.088 * k * b,
         0.088 * k * b,
-        trunk @ _Y,
+        product(trunk, _Y),
         1.0,
         repeat=(3.0, 6.0),
         **f.shirt,
@@ -231,16 +232,16 @@ def _add_trunk(f: _Figure) -> None:
 def _add_head(f: _Figure) -> None:
     """Neck and head, which looks about."""
     k, who, trunk, neck, gait, lively = f.k, f.who, f.trunk, f.neck, f.how.gait, f.how.gesture
-    right = trunk @ _X
-    skull = neck + trunk @ np.array([0.0, 0.015 * k, 0.15 * k])
-    head = (
-        trunk
-        @ _yaw(0.3 * f.wave(0.13, 0.9) * (1 - gait) + 0.1 * lively * f.wave(0.4, 0.1))
-        @ _pitch(0.06 * f.wave(0.29, 0.3) - 0.03)
+    right = product(trunk, _X)
+    skull = neck + product(trunk, np.array([0.0, 0.015 * k, 0.15 * k]))
+    head = product(
+        trunk,
+        _yaw(0.3 * f.wave(0.13, 0.9) * (1 - gait) + 0.1 * lively * f.wave(0.4, 0.1)),
+        _pitch(0.06 * f.wave(0.29, 0.3) - 0.03),
     )
     f.limb(
-        neck - trunk @ np.array([0, 0, 0.04 * k]),
-        skull - trunk @ np.array([0, 0.01, 0.03 * k]),
+        neck - product(trunk, np.array([0, 0, 0.04 * k])),
+        skull - product(trunk, np.array([0, 0.01, 0.03 * k])),
         0.058 * k,
         0.052 * k,
         right,
@@ -256,10 +257,12 @@ def _add_head(f: _Figure) -> None:
         repeat=(1.0, 0.5),
         shift=(0.5, 0.5),
     )
-    f.ball(skull + head @ np.array([0, 0.092 * k, -0.012 * k]), head, (0.015 * k, 0.022 * k, 0.026 * k), **f.bare)
+    f.ball(
+        skull + product(head, np.array([0, 0.092 * k, -0.012 * k])), head, (0.015 * k, 0.022 * k, 0.026 * k), **f.bare
+    )
     for side in (-1, 1):
         f.ball(
-            skull + head @ np.array([side * 0.077 * k, -0.005, -0.01]),
+            skull + product(head, np.array([side * 0.077 * k, -0.005, -0.01])),
             head,
             (0.012 * k, 0.024 * k, 0.033 * k),
             **f.bare,
@@ -271,30 +274,30 @@ def _add_hair(f: _Figure, skull: Array, head: Array) -> None:
     k, who = f.k, f.who
     mane: Style = {"instance": who.instance, "texture": "hair", "repeat": (3.0, 0.5), "tint": who.hair}
     f.ball(
-        skull + head @ np.array([0, -0.018 * k, 0.03 * k]),
-        head @ _pitch(0.35),
+        skull + product(head, np.array([0, -0.018 * k, 0.03 * k])),
+        product(head, _pitch(0.35)),
         (0.086 * k, 0.101 * k, 0.108 * k),
         **mane,
     )
     if who.long_hair:
         f.limb(
-            skull + head @ np.array([0, -0.06, 0.0]),
-            skull + head @ np.array([0, -0.075, -0.15 * k]),
+            skull + product(head, np.array([0, -0.06, 0.0])),
+            skull + product(head, np.array([0, -0.075, -0.15 * k])),
             0.075 * k,
             0.055 * k,
-            head @ _X,
+            product(head, _X),
             0.6,
             **{**mane, "repeat": (4.0, 2.0)},
         )
     if who.cap:
         f.ball(
-            skull + head @ np.array([0, 0.01, 0.075 * k]),
-            head @ _pitch(0.15),
+            skull + product(head, np.array([0, 0.01, 0.075 * k])),
+            product(head, _pitch(0.15)),
             (0.088 * k, 0.108 * k, 0.065 * k),
             **{**mane, "tint": who.trousers},
         )
         f.ball(
-            skull + head @ np.array([0, 0.12 * k, 0.06 * k]),
+            skull + product(head, np.array([0, 0.12 * k, 0.06 * k])),
             head,
             (0.07 * k, 0.06 * k, 0.008 * k),
             **{**mane, "tint": who.trousers},
@@ -306,34 +309,30 @@ def _add_arm(f: _Figure, side: int) -> None:
     k, b, who, trunk, neck = f.k, f.b, f.who, f.trunk, f.neck
     gait, sit, lively, upper, fore = f.how.gait, f.how.sit, f.how.gesture, 0.29 * k, 0.26 * k
     swing = f.how.stride + (math.pi if side < 0 else 0.0)
-    talk = lively * (0.5 + 0.5 * f.wave(0.11, 1.5 * side)) ** 0.7
-    pitch = (
-        gait * 0.42 * math.sin(swing)
-        + sit * (1 - talk) * 0.35
-        + talk * (0.45 + 0.35 * f.wave(0.47 + 0.06 * side, side))
-    )
+    talk = lively * power(0.5 + 0.5 * f.wave(0.11, 1.5 * side), 0.7)
+    pitch = gait * 0.42 * sin(swing) + sit * (1 - talk) * 0.35 + talk * (0.45 + 0.35 * f.wave(0.47 + 0.06 * side, side))
     abduct = side * (0.14 + 0.05 * (1 - gait) + talk * (0.12 + 0.15 * f.wave(0.33, 2.0 * side)))
     bend = (
         0.2
-        + gait * (0.25 + 0.15 * math.sin(swing))
+        + gait * (0.25 + 0.15 * sin(swing))
         + sit * (1 - talk) * 0.95
         + talk * (1.35 + 0.5 * f.wave(0.61, 1.1 * side))
     )
-    shoulder = neck + trunk @ np.array([side * 0.185 * k * b, 0.0, -0.055 * k])
-    arm = trunk @ _roll(-abduct) @ _pitch(pitch)
-    elbow = shoulder + arm @ np.array([0, 0, -upper])
-    lower = arm @ _roll(side * 0.35 * min(bend, 1.0)) @ _pitch(bend)
-    wrist = elbow + lower @ np.array([0, 0, -fore])
-    f.limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, arm @ _Y, repeat=(2.0, 6.0), **f.shirt)
+    shoulder = neck + product(trunk, np.array([side * 0.185 * k * b, 0.0, -0.055 * k]))
+    arm = product(trunk, _roll(-abduct), _pitch(pitch))
+    elbow = shoulder + product(arm, np.array([0, 0, -upper]))
+    lower = product(arm, _roll(side * 0.35 * min(bend, 1.0)), _pitch(bend))
+    wrist = elbow + product(lower, np.array([0, 0, -fore]))
+    f.limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, product(arm, _Y), repeat=(2.0, 6.0), **f.shirt)
     if who.long_sleeves:
-        f.limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, lower @ _Y, repeat=(2.0, 6.0), **f.shirt)
+        f.limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, product(lower, _Y), repeat=(2.0, 6.0), **f.shirt)
     else:
-        f.limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, lower @ _Y, **f.bare)
-    hand = lower @ _pitch(0.25 * f.wave(0.7, side))
-    f.ball(wrist + hand @ np.array([0, 0.005, -0.055 * k]), hand, (0.022 * k, 0.038 * k, 0.058 * k), **f.bare)
+        f.limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, product(lower, _Y), **f.bare)
+    hand = product(lower, _pitch(0.25 * f.wave(0.7, side)))
+    f.ball(wrist + product(hand, np.array([0, 0.005, -0.055 * k])), hand, (0.022 * k, 0.038 * k, 0.058 * k), **f.bare)
     f.ball(
-        wrist + hand @ np.array([0.0, 0.035 * k, -0.035 * k]),
-        hand @ _pitch(0.6),
+        wrist + product(hand, np.array([0.0, 0.035 * k, -0.035 * k])),
+        product(hand, _pitch(0.6)),
         (0.011 * k, 0.013 * k, 0.034 * k),
         **f.bare,
     )
@@ -342,16 +341,26 @@ def _add_arm(f: _Figure, side: int) -> None:
 def _add_leg(f: _Figure, side: int, index: int) -> None:
     k, b, who, root, hipline, sit = f.k, f.b, f.who, f.root, f.hipline, f.how.sit
     thigh, shin, hip, knee = 0.43 * k, 0.41 * k, f.hips[index], f.knees[index]
-    joint = root + hipline @ np.array([side * 0.095 * k * b, 0.0, -0.01])
-    upper_leg = hipline @ _roll(-side * (0.02 + 0.1 * sit)) @ _pitch(hip)
-    knee_at = joint + upper_leg @ np.array([0, 0, -thigh])
-    lower_leg = upper_leg @ _pitch(-knee)
-    ankle = knee_at + lower_leg @ np.array([0, 0, -shin])
-    f.limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, upper_leg @ _Y, **f.jeans)
-    f.limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, lower_leg @ _Y, **f.jeans)
-    ground = hipline @ _pitch((hip - knee) * 0.6 * (1 - sit))
+    joint = root + product(hipline, np.array([side * 0.095 * k * b, 0.0, -0.01]))
+    upper_leg = product(hipline, _roll(-side * (0.02 + 0.1 * sit)), _pitch(hip))
+    knee_at = joint + product(upper_leg, np.array([0, 0, -thigh]))
+    lower_leg = product(upper_leg, _pitch(-knee))
+    ankle = knee_at + product(lower_leg, np.array([0, 0, -shin]))
+    f.limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, product(upper_leg, _Y), **f.jeans)
+    f.limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, product(lower_leg, _Y), **f.jeans)
+    ground = product(hipline, _pitch((hip - knee) * 0.6 * (1 - sit)))
     heel, toe = (
-        ankle + ground @ np.array([0, -0.03, -0.035 * k]),
-        ankle + ground @ np.array([0, 0.15 * k, -0.05 * k]),
+        ankle + product(ground, np.array([0, -0.03, -0.035 * k])),
+        ankle + product(ground, np.array([0, 0.15 * k, -0.05 * k])),
     )
-    f.limb(heel, toe, 0.045 * k, 0.034 * k, ground @ _X, 0.95, instance=who.instance, texture="plain", tint=who.shoes)
+    f.limb(
+        heel,
+        toe,
+        0.045 * k,
+        0.034 * k,
+        product(ground, _X),
+        0.95,
+        instance=who.instance,
+        texture="plain",
+        tint=who.shoes,
+    )

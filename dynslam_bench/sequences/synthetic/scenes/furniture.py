@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arithmetic import norm, product
 from .parts import BOX, ROUND_CONE, Parts, turn
 from .plan import Plan
 
@@ -87,7 +88,7 @@ def _add_monitors(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, 
             parts.add(
                 BOX,
                 facing,
-                np.array([mx, my, top + 0.3]) + facing @ np.array([dx, -0.012, dz]),
+                np.array([mx, my, top + 0.3]) + product(facing, np.array([dx, -0.012, dz])),
                 (hx, 0.024, hz),
                 tint=tint["plastic"],
             )
@@ -245,16 +246,16 @@ def add_cabinet(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -
     parts.add(ROUND_CONE, eye, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))
     for _ in range(9):
         a, lean = rng.random() * 360, 0.3 + 0.7 * rng.random()
-        tip = pot + turn(a) @ np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()])
+        tip = pot + product(turn(a), np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()]))
         base = pot + np.array([0, 0, 0.14])
-        z = (tip - base) / np.linalg.norm(tip - base)
-        u = np.cross(z, turn(a) @ np.array([0.0, 1.0, 0.0]))
-        u = u / np.linalg.norm(u)
+        z = (tip - base) / norm(tip - base)
+        u = np.cross(z, product(turn(a), np.array([0.0, 1.0, 0.0])))
+        u = u / norm(u)
         parts.add(
             ROUND_CONE,
             np.stack([u, np.cross(z, u), z], 1),
             base,
-            (float(np.linalg.norm(tip - base)), 0.012, 0.04),
+            (float(norm(tip - base)), 0.012, 0.04),
             scale=(0.25, 1.0, 1.0),
             tint=np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random()),
         )
@@ -306,9 +307,9 @@ def add_chair(parts: Parts, instance: int, tint: Array, metal: Array) -> None:
     parts.add(ROUND_CONE, eye, np.array([0, 0, 0.1]), (0.32, 0.03, 0.028), instance=instance, tint=metal)
     for k in range(5):
         a = turn(72 * k + 18)
-        tip = a @ np.array([0.28, 0, 0.05])
-        z = (tip - (0, 0, 0.09)) / np.linalg.norm(tip - (0, 0, 0.09))
-        u = a @ np.array([0.0, 1.0, 0.0])
+        tip = product(a, np.array([0.28, 0, 0.05]))
+        z = (tip - (0, 0, 0.09)) / norm(tip - (0, 0, 0.09))
+        u = product(a, np.array([0.0, 1.0, 0.0]))
         parts.add(
             ROUND_CONE,
             np.stack([u, np.cross(z, u), z], 1),

@@ -13,6 +13,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import atan2
 from .furniture import add_cabinet, add_chair, add_desk, add_posters, add_shelf
 from .parts import BOX, QUAD, Parts, turn, wall
 from .plan import Plan, plan_room
@@ -44,8 +45,8 @@ def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[fl
         doors: Middles of the doorways, metres from `start`.
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
-    length = math.hypot(dx, dy)
-    facing, way = turn(math.degrees(math.atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
+    length = math.sqrt(dx * dx + dy * dy)
+    facing, way = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
 
     def piece(a: float, b: float, bottom: float) -> None:
         half = ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arithmetic import cos, product, sin
+
 Array = NDArray[np.float64]
 
 BOX, ROUND_CONE, QUAD = 0, 1, 2
@@ -86,14 +88,14 @@ class Parts:
             self.origin += other.origin
         else:
             body = turn(yaw)
-            self.rotation += [body @ rotation for rotation in other.rotation]
-            self.origin += [body @ origin + shift for origin in other.origin]
+            self.rotation += [product(body, rotation) for rotation in other.rotation]
+            self.origin += [product(body, origin) + shift for origin in other.origin]
 
 
 def turn(degrees: float) -> Array:
     """Rotation about the world's z axis."""
     a = np.radians(degrees)
-    c, s = np.cos(a), np.sin(a)
+    c, s = cos(a), sin(a)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -106,10 +108,10 @@ def wall(x_axis: tuple[float, float, float], y_axis: tuple[float, float, float])
 def along(start: Array, end: Array, side: Array) -> tuple[Array, float]:
     """Frame whose z axis runs from start to end, its x axis towards `side`; and the length."""
     z = end - start
-    length = float(np.sqrt(z @ z))
+    length = float(np.sqrt(product(z, z)))
     z = z / length
-    x = side - (side @ z) * z
-    x = x / np.sqrt(x @ x)
+    x = side - (product(side, z)) * z
+    x = x / np.sqrt(product(x, x))
     return np.stack([x, _cross(z, x), z], axis=1), length
 
 

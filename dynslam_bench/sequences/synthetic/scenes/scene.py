@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
+from ..kernels.arithmetic import norm, product
 from ..people.bodies import add_person
 from ..settings import FPS, RenderSettings
 from . import textures
@@ -108,8 +109,8 @@ class Scene:
         rotations, origins = [self._fixed_rotation], [self._fixed_origin]
         for (rotation, origin), body in zip(self._bodies, self.world.bodies, strict=True):
             turned, shift = body.path(t)
-            rotations.append(turned @ rotation)
-            origins.append(origin @ turned.T + shift)
+            rotations.append(product(turned, rotation))
+            origins.append(product(origin, turned.T) + shift)
         if parts.rotation:
             rotations.append(np.stack(parts.rotation))
             origins.append(np.stack(parts.origin))
@@ -124,8 +125,8 @@ class Scene:
         rotation, origin = self.place(time)
         inverse = np.swapaxes(rotation, 1, 2) / self.scale[:, :, None]
         local = np.empty((len(origin), 3, 4))
-        local[:, :, :3] = inverse @ pose[:3, :3]
-        local[:, :, 3] = (inverse @ (pose[:3, 3] - origin)[:, :, None])[:, :, 0]
+        local[:, :, :3] = product(inverse, pose[:3, :3])
+        local[:, :, 3] = product(inverse, (pose[:3, 3] - origin)[:, :, None])[:, :, 0]
         return Snapshot(pose, rotation, origin, np.ascontiguousarray(local.reshape(-1, 12)))
 
     def moving(self, index: int) -> frozenset[int]:
@@ -134,9 +135,9 @@ class Scene:
             return frozenset()
         before, after = self.place((index - 1) / FPS), self.place(index / FPS)
         box = self.corners[:, :, :] * self.scale[:, None, :]
-        moved = np.linalg.norm(
-            box @ np.swapaxes(after[0] - before[0], 1, 2) + (after[1] - before[1])[:, None, :], axis=2
-        ).max(axis=1)
+        moved = norm(product(box, np.swapaxes(after[0] - before[0], 1, 2)) + (after[1] - before[1])[:, None, :]).max(
+            axis=1
+        )
         return frozenset(int(k) for k in np.unique(self.instance[moved > MOVED_M]) if k > 0)
 
     def _corners(self) -> Array:

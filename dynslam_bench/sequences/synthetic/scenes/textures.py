@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arithmetic import exp, sin
+
 Image = NDArray[np.float64]
 """Float ``[S, S, 3]`` in 0-255, S a power of two; it wraps around."""
 
@@ -100,7 +102,7 @@ def wood(rng: np.random.Generator, size: int = 256) -> Image:
     """Wood grain along u."""
     warp = 6 * fractal(rng, size, 4, 2)
     v = np.arange(size)[:, None] + warp
-    rings = np.sin(v * 2 * np.pi * 9 / size) * 0.5 + np.sin(v * 2 * np.pi * 23 / size + 1.3) * 0.3
+    rings = sin(v * 2 * np.pi * 9 / size) * 0.5 + sin(v * 2 * np.pi * 23 / size + 1.3) * 0.3
     streak = smooth_noise(rng, size, 8, 128)
     return _gray(198 + 16 * rings + 14 * streak)
 
@@ -109,7 +111,7 @@ def carpet(rng: np.random.Generator, size: int = 512) -> Image:
     """Office carpet tiles: speckle, faint tile joints."""
     values = 200 + 14 * fractal(rng, size, 24, 3) + 12 * (rng.random((size, size)) - 0.5)
     joint = np.minimum(np.arange(size) % (size // 2), size // 2 - np.arange(size) % (size // 2))
-    values -= 10 * np.exp(-((joint[:, None] / 1.5) ** 2)) + 10 * np.exp(-((joint[None, :] / 1.5) ** 2))
+    values -= 10 * exp(-((joint[:, None] / 1.5) ** 2)) + 10 * exp(-((joint[None, :] / 1.5) ** 2))
     return _gray(values)
 
 
@@ -177,7 +179,8 @@ def books(rng: np.random.Generator, size: int = 256) -> Image:
     u = 0
     while u < size:
         w = int(rng.integers(size // 24, size // 10))
-        top = int(size * 0.3 * rng.random() ** 2)
+        share = rng.random()
+        top = int(size * 0.3 * share * share)
         color = 50 + 170 * rng.random(3)
         image[top:, u : u + w] = color
         image[top:, u : u + 1] = color * 0.5
