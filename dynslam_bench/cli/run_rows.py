@@ -91,8 +91,8 @@ def seen_note(records: Sequence[RunRecord]) -> str:
         return ""
     return (
         f"{len(seen)} of {len(records)} runs have masks of a network that was trained on their scene, the first on "
-        f"{seen[0]}: a best case, which reports mark and do not rank; instances 100-199 are held out, e.g. "
-        f"{seen[0].partition('?')[0].partition('@')[0]}@100"
+        f"{seen[0]}: a best case, which reports mark and do not rank; scenes 100-199 are held out, e.g. "
+        f"{seen[0].partition('?')[0].partition('@')[0]}?scene=100"
     )
 
 

@@ -32,7 +32,7 @@ CACHED_MARK = "†"
 CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 SEEN_NOTE = (
     f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
-    "instances 0-99): its best case, no judgement."
+    "scenes 0-99): its best case, no judgement."
 )
 
 

@@ -78,13 +78,15 @@ def test_sequences_are_grouped_from_static_to_dynamic():
 
 
 def test_names_lose_what_all_share():
-    names = ["synthetic/walking_xyz@0?frames=60", "synthetic/sitting_xyz@0?frames=60"]
+    names = ["synthetic/walking_xyz?scene=0&frames=60", "synthetic/sitting_xyz?scene=0&frames=60"]
     assert list(shortened(names).values()) == ["walking_xyz", "sitting_xyz"]
-    assert list(shortened([*names, "synthetic/sitting_xyz@1"]).values()) == [
-        "walking_xyz@0?frames=60",
-        "sitting_xyz@0?frames=60",
-        "sitting_xyz@1",
+    assert list(shortened([*names, "synthetic/sitting_xyz?scene=1"]).values()) == [
+        "walking_xyz?scene=0&frames=60",
+        "sitting_xyz?scene=0&frames=60",
+        "sitting_xyz?scene=1",
     ]
+    rendered = [f"synthetic/walking_xyz?scene={scene}&frames=60" for scene in (100, 101)]
+    assert list(shortened(rendered).values()) == ["walking_xyz?scene=100", "walking_xyz?scene=101"]
     assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
     assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
     assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}
