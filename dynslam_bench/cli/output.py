@@ -49,6 +49,12 @@ def note(text: str) -> None:
         complain(text)
 
 
+def announce(text: str) -> None:
+    """Write a line for people to standard error, a terminal or not; none with ``--json``."""
+    if not _for_scripts:
+        complain(text)
+
+
 def complain(text: str) -> None:
     """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
     sys.stderr.write(printable(text) + "\n")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import typer
@@ -44,13 +45,14 @@ from .options import (
     Video,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, note, progress
+from .output import SOME_RUNS_FAILED, announce, note, progress
 from .panels import MEASURE
 from .run_rows import drift_note, seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.core.records import Record
-    from dynslam_bench.runs import RunEvent, RunRecord, RunSpec
+    from dynslam_bench.runs import RunEvent, RunRecord, RunSpec, RunStore
+    from dynslam_bench.runs.identity import ResolvedRun
 
 R = TypeVar("R", bound="Record")
 
@@ -310,12 +312,63 @@ def make_runs(
                     note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
             advance(sum(shares.values()), event.total, run_words(event))
 
+        def planned(runs: Collection[ResolvedRun]) -> None:
+            announce(plan_words(runs, store, jobs))
+
         with_executor: dict[str, Any] = {}
         if scheduler is not None:
             with_executor["executor"] = dask_executor(scheduler)
         return run_many(
-            specs, results=store, jobs=jobs, retry=tuple(retry), on_event=told, protocol=protocol, **with_executor
-        )
+            specs, results=store, jobs=jobs, retry=tuple(retry), on_plan=planned, on_event=told, protocol=protocol,
+            **with_executor,
+        )  # fmt: skip
+
+
+MOST_LOOKED_AT, MOST_ALIKE = 100, 5
+"""Stored runs, the newest first, that are looked through for those of a tracker, and how many of these count."""
+
+
+def plan_words(runs: Collection[ResolvedRun], store: RunStore, jobs: int) -> str:
+    """How many frames are to be tracked, and how long that takes by what stored runs of the same trackers took."""
+    from dynslam_bench.runs.one import PROGRESS_EVERY
+
+    frames = sum(len(run.sequence) for run in runs)
+    words = f"{len(runs)} run{'s' * (len(runs) != 1)} to make, {frames} frames in all"
+    measured = frame_times(runs, store)
+    known = [run for run in runs if _kind(run) in measured]
+    if not known:
+        return f"{words}; nothing was measured here yet, the time left is shown after the first {PROGRESS_EVERY} frames"
+    expected_s = sum(len(run.sequence) * measured[_kind(run)] for run in known) / min(jobs, len(runs))
+    slowest, fastest = max(measured.values()), min(measured.values())
+    rate = f"{_seconds(fastest)}" + (f" to {_seconds(slowest)}" if slowest > fastest else "")
+    rest = f" for {len(known)} of them" if len(known) < len(runs) else ""
+    return f"{words}; about {_seconds(expected_s)}{rest}, by the {rate} a frame of stored runs on this machine"
+
+
+def frame_times(runs: Collection[ResolvedRun], store: RunStore) -> dict[tuple[str, str], float]:
+    """Seconds of wall-clock time a frame of stored runs on a machine like this: the median by tracker and masks."""
+    from dynslam_bench.core.machine import this_machine
+
+    wanted, times = {_kind(run) for run in runs}, dict[tuple[str, str], list[float]]()
+    newest = sorted(store.ids(), key=lambda run_id: -store.folder(run_id).stat().st_mtime)
+    machine = this_machine()
+    for record in filter(None, map(store.get, newest[:MOST_LOOKED_AT])):
+        kind = (record.tracker.id, record.segmentation)
+        here = record.machine is not None and (record.machine.cpu, record.machine.cores) == (machine.cpu, machine.cores)
+        if kind in wanted and here and record.status in ("ok", "lost") and record.n_processed and record.wall_s:
+            times.setdefault(kind, []).append(record.wall_s / record.n_processed)
+    return {kind: median(found[:MOST_ALIKE]) for kind, found in times.items()}
+
+
+def _kind(run: ResolvedRun) -> tuple[str, str]:
+    return run.tracker.id, run.segmentation
+
+
+def _seconds(value: float) -> str:
+    for unit, seconds in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
+        if value >= 1.5 * seconds:
+            return f"{value / seconds:.3g} {unit}" if value < 10 * seconds else f"{value / seconds:.0f} {unit}"
+    return f"{1000 * value:.0f} ms"
 
 
 def dask_executor(address: str) -> Any:
@@ -325,11 +378,12 @@ def dask_executor(address: str) -> Any:
         RunError: ``distributed`` is not installed, or the scheduler does not answer.
     """
     from dynslam_bench.core.errors import RunError
+    from dynslam_bench.core.version import install_hint
 
     try:
         from distributed import Client
     except ImportError as error:
-        raise RunError("--scheduler needs the package distributed", "pip install 'dynslam-bench[cluster]'") from error
+        raise RunError("--scheduler needs the package distributed", install_hint("cluster")) from error
     try:
         logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it tells of a lost scheduler by a traceback
         return Client(address, timeout="10s").get_executor()
