@@ -60,6 +60,11 @@ def complain(text: str) -> None:
     sys.stderr.write(printable(text) + "\n")
 
 
+def can_ask() -> bool:
+    """Whether somebody sits at a terminal who can answer a question, and no script reads what is written."""
+    return sys.stdin.isatty() and sys.stderr.isatty() and not _for_scripts
+
+
 def write_json(value: Any) -> None:
     """Write a value as JSON; pydantic models and paths included."""
     sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")

@@ -43,9 +43,10 @@ from .options import (
     TimeLimit,
     Trackers,
     Video,
+    Yes,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, announce, note, progress
+from .output import SOME_RUNS_FAILED, announce, can_ask, complain, note, progress
 from .panels import MEASURE
 from .run_rows import drift_note, seen_note, show_pictures, show_runs
 
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from dynslam_bench.core.records import Record
     from dynslam_bench.runs import RunEvent, RunRecord, RunSpec, RunStore
     from dynslam_bench.runs.identity import ResolvedRun
+    from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
 
 R = TypeVar("R", bound="Record")
 
@@ -102,6 +104,7 @@ def run(
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
@@ -122,7 +125,7 @@ def run(
         for number in (seed or [0])
         for skipped in (offset or [0])
     ]
-    finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json)
+    finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, yes=yes, as_json=as_json)
 
 
 def checked(kind: type[R], **values: Any) -> R:
@@ -223,6 +226,7 @@ def bench(
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a suite: every tracker on every sequence with every seed; calling it again goes on where it stopped."""
@@ -244,8 +248,9 @@ def bench(
     limits = {spec.limits: checked(Limits, **(spec.limits.model_dump() | changes)) for spec in specs}
     specs = [spec.model_copy(update={"limits": limits[spec.limits]}) for spec in specs]
     finish(
-        specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json, scheduler=scheduler
-    )
+        specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, yes=yes, as_json=as_json,
+        scheduler=scheduler,
+    )  # fmt: skip
 
 
 def finish(
@@ -255,17 +260,27 @@ def finish(
     jobs: int,
     retry: Sequence[str],
     protocol: str,
+    yes: bool,
     as_json: bool,
     scheduler: str | None = None,
 ) -> None:
     """Make runs, show them, and exit with 3 if some failed or were lost, or have no map though it was asked for."""
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.many import pictures_asked
+    from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
+    from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
     from dynslam_bench.slam.mapping.saved_map import MAP_FILE
 
     store = RunStore(results)
     reused: set[str] = set()
-    records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, scheduler=scheduler, reused=reused)
+    asked: dict[str, Any] = {"jobs": jobs, "retry": retry, "protocol": protocol, "scheduler": scheduler}
+    try:
+        records = make_runs(specs, store, reused=reused, **asked)
+    except NetworkNotFetched as error:  # raised before the first run
+        if not (yes or agreed_to_fetch(error.checkpoint)):
+            raise
+        fetch_checkpoint(error.checkpoint)
+        records = make_runs(specs, store, reused=reused, **asked)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
     missing = show_pictures(records, store, pictures_asked(specs[0]), as_json=as_json)
     made = [record for record in records if record.run_id not in reused]  # what is stored already was said then
@@ -275,6 +290,19 @@ def finish(
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def agreed_to_fetch(checkpoint: Checkpoint) -> bool:
+    """Ask on a terminal whether a network may be downloaded; nobody is asked elsewhere, and nothing is downloaded."""
+    from dynslam_bench.core.folders import weights_folder
+
+    if not can_ask():
+        return False
+    complain(
+        f"Masks of people need the network '{checkpoint.id}': {checkpoint.megabytes} MB from {checkpoint.url} "
+        f"({checkpoint.license}, {checkpoint.trained_on}), kept in {weights_folder()}."
+    )
+    return typer.confirm("Download it?", default=True, err=True)
 
 
 def run_words(event: RunEvent) -> str:
@@ -333,16 +361,17 @@ def plan_words(runs: Collection[ResolvedRun], store: RunStore, jobs: int) -> str
     from dynslam_bench.runs.one import PROGRESS_EVERY
 
     frames = sum(len(run.sequence) for run in runs)
-    words = f"{len(runs)} run{'s' * (len(runs) != 1)} to make, {frames} frames in all"
-    measured = frame_times(runs, store)
-    known = [run for run in runs if _kind(run) in measured]
+    words = f"{len(runs)} run{'s' * (len(runs) != 1)}, {frames} frames"
+    times = frame_times(runs, store)
+    known = [run for run in runs if _kind(run) in times]
     if not known:
-        return f"{words}; nothing was measured here yet, the time left is shown after the first {PROGRESS_EVERY} frames"
-    expected_s = sum(len(run.sequence) * measured[_kind(run)] for run in known) / min(jobs, len(runs))
-    slowest, fastest = max(measured.values()), min(measured.values())
-    rate = f"{_seconds(fastest)}" + (f" to {_seconds(slowest)}" if slowest > fastest else "")
-    rest = f" for {len(known)} of them" if len(known) < len(runs) else ""
-    return f"{words}; about {_seconds(expected_s)}{rest}, by the {rate} a frame of stored runs on this machine"
+        later = f"; how long it takes is known after the first {PROGRESS_EVERY}" if frames > PROGRESS_EVERY else ""
+        return words + later
+    expected_s = sum(len(run.sequence) * times[_kind(run)] for run in known) / min(jobs, len(runs))
+    low, high = _seconds(min(times.values())), _seconds(max(times.values()))
+    rate = low if low == high else f"{low} to {high}"
+    some = f" for {len(known)} of them" if len(known) < len(runs) else ""
+    return f"{words}, about {_seconds(expected_s)}{some} (stored runs on this machine took {rate} a frame)"
 
 
 def frame_times(runs: Collection[ResolvedRun], store: RunStore) -> dict[tuple[str, str], float]:
@@ -367,7 +396,7 @@ def _kind(run: ResolvedRun) -> tuple[str, str]:
 def _seconds(value: float) -> str:
     for unit, seconds in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
         if value >= 1.5 * seconds:
-            return f"{value / seconds:.3g} {unit}" if value < 10 * seconds else f"{value / seconds:.0f} {unit}"
+            return f"{value / seconds:.2g} {unit}" if value < 10 * seconds else f"{value / seconds:.0f} {unit}"
     return f"{1000 * value:.0f} ms"
 
 

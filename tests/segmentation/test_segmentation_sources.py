@@ -223,7 +223,7 @@ def test_auto(monkeypatch, tmp_path):
     monkeypatch.setattr(building, "embedded_weights", lambda: None)
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "oracle"
     with pytest.raises(
-        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*embedded.*needs no masks"
+        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*without masks: a system"
     ):
         resolve_source(auto, "bonn/crowd")
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
