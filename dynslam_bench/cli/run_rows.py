@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from dynslam_bench.core.toml import label_text
 
 from .output import complain, write, write_columns, write_json
 
@@ -57,10 +60,20 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
         return
     names = {name: title for name, title in TITLES.items() if name != "part" or any(row["part"] for row in rows)}
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
-    columns = [(title, [row[name] for row in rows]) for name, title in names.items()]
+    columns = [(title, [_shown(name, row[name]) for row in rows]) for name, title in names.items()]
     write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
     if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
         write("ATE: of the tracked frames alone; not moving: of all. A report counts a lost frame as not having moved.")
+
+
+_FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
+
+
+def _shown(name: str, value: Any) -> Any:
+    """A cell of the table: paths without their folders, which ``--json`` and ``runs show`` have."""
+    if name in ("tracker", "masks"):
+        return label_text(value)
+    return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 
 def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> set[str]:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import typer
 
+from dynslam_bench.core.toml import label_text
+
 from . import completion
 from .options import (
     AsJson,
@@ -307,7 +309,7 @@ def agreed_to_fetch(checkpoint: Checkpoint) -> bool:
 
 def run_words(event: RunEvent) -> str:
     """What is going on in a run, in words."""
-    words = f"{event.spec.tracker} on {event.spec.sequence}"
+    words = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind != "progress" or event.partial is None:
         return words
     return f"{words}, frame {event.partial['frames_done']} of {event.partial['frames']}"

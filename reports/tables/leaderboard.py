@@ -9,6 +9,7 @@ from statistics import median
 
 import numpy as np
 
+from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
@@ -165,7 +166,7 @@ def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
     ended = [row for row in runs if not row.failed]
     kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
     provenance = runs[0].provenance
-    masks = " + ".join(sorted({row.segmentation for row in runs if row.segmentation not in ("", "none")}))
+    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
     masks_words = f"{masks} masks" if masks else ""
     return [
         TableCell(f"{100 * coverage:.1f} %", value=coverage),

@@ -55,6 +55,17 @@ def test_frames_and_measured_time_are_said_before_the_run(cli, walk):
     assert cli(*command, "frames=5", "--json")[2] == ""
 
 
+def test_a_row_names_files_without_their_folders(cli, walk):
+    command = ("run", f"replay:{walk / 'groundtruth.txt'}", walk, "--set", "tolerance_s=0.02")
+    code, out, _ = cli(*command)
+    assert code == 0 and "replay:groundtruth.txt" in out and str(walk) not in out
+    (row,) = json.loads(cli(*command, "--json")[1])
+    assert row["tracker"] == f"replay:{walk / 'groundtruth.txt'}", "scripts get the whole name"
+    assert run_rows._shown("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
+        "a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n"
+    )
+
+
 def test_runs_list_refuses_what_is_not_there(cli, walk):
     code, out, err = cli("runs", "list", "--results", "nowhere")
     assert code == 1 and out == "" and "there are no runs in" in one_line(err)

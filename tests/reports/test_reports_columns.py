@@ -6,6 +6,7 @@ from reports_rows import PROTOCOL, row, rows_of
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import name_columns, shortened
+from dynslam_bench.reports.model.labels import make_labels
 from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.runs.storage.store import RunStore
@@ -105,3 +106,25 @@ def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tm
     (mine,) = (each for each in rows if (each.tracker, each.sequence) == ("mine", "s/a"))
     assert run_command(mine) == f"dynslam-bench run {given} s/a --set loop=true"
     assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
+
+
+def test_labels_name_files_without_their_folders_unless_two_would_be_alike(tmp_path):
+    def labels(*sources):
+        rows = [row(tracker="mask-rcnn", variant={"segmentation.source": source}) for source in sources]
+        return sorted(make_labels(rows).values())
+
+    assert labels("onnx:/home/me/nets/yolov8n-seg.onnx", "recorded:/data/masks/", "none") == [
+        f"MASK-RCNN · segmentation.source={each}" for each in ("none", "onnx:yolov8n-seg", "recorded:masks")
+    ]
+    assert labels("onnx:/a/best.onnx", "onnx:/b/best.onnx") == [
+        f"MASK-RCNN · segmentation.source=onnx:/{folder}/best.onnx" for folder in "ab"
+    ]
+
+
+def test_the_board_names_masks_without_their_folders(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "mask-rcnn", "s/a", masks="onnx:/home/me/nets/yolov8n-seg.onnx")
+    add_run(store, "orb-slam2", "s/a")
+    paths = build_report(store, tmp_path / "report")
+    assert "onnx:yolov8n-seg masks" in paths.markdown.read_text()
+    assert "/home/me" not in paths.markdown.read_text() + paths.csv["leaderboard"].read_text()
