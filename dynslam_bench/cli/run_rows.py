@@ -60,7 +60,7 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
         return
     names = {name: title for name, title in TITLES.items() if name != "part" or any(row["part"] for row in rows)}
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
-    columns = [(title, [_shown(name, row[name]) for row in rows]) for name, title in names.items()]
+    columns = [(title, [shown_cell(name, row[name]) for row in rows]) for name, title in names.items()]
     write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
     if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
         write("ATE: of the tracked frames alone; not moving: of all. A report counts a lost frame as not having moved.")
@@ -69,7 +69,7 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
 
-def _shown(name: str, value: Any) -> Any:
+def shown_cell(name: str, value: Any) -> Any:
     """A cell of the table: paths without their folders, which ``--json`` and ``runs show`` have."""
     if name in ("tracker", "masks"):
         return label_text(value)

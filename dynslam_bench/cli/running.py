@@ -289,9 +289,20 @@ def finish(
     for caution in (seen_note(records), drift_note(made, store)):
         if caution:
             note(caution)
+    announce_unscored(records, store)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def announce_unscored(records: Sequence[RunRecord], store: RunStore) -> None:
+    """Say of runs on recordings without ground truth why they have no error, and where the first trajectory lies."""
+    without = [record for record in records if not record.sequence.ground_truth and not record.failed]
+    if without:
+        path = store.folder(without[0].run_id) / "trajectory_online.txt"
+        announce(
+            f"{without[0].sequence.id} has no ground truth, so nothing is scored; the estimated trajectory: {path}"
+        )
 
 
 def agreed_to_fetch(checkpoint: Checkpoint) -> bool:

@@ -54,7 +54,7 @@ def resolve_source(
     if cached_checkpoint(COCO) is not None:
         return "coco"
     options = [
-        "segmentation.source=coco downloads it once; so do `run --yes` and `bench --yes`",
+        "--yes (run, bench) or segmentation.source=coco downloads it once",
         "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
         "segmentation.source=recorded:DIR takes masks that were stored before",
     ]

@@ -179,7 +179,7 @@ def _open_whole(
             "a path names a folder, see docs/sequences.md",
         )
     known = [*sequence_ids(), *by_folder()]
-    raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, known))
+    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, known))
 
 
 def _is_path(name: str) -> bool:

@@ -5,6 +5,7 @@ import hashlib
 import http.server
 import json
 import re
+import shutil
 import sys
 import threading
 import time
@@ -17,6 +18,7 @@ from cli_errors import one_line
 from dynslam_bench.cli import output, run_rows, running
 from dynslam_bench.cli.output import progress
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.geometry.tum_file import read_tum
 from dynslam_bench.segmentation import build_segmenter
 from dynslam_bench.segmentation.networks import checkpoints
 
@@ -61,9 +63,27 @@ def test_a_row_names_files_without_their_folders(cli, walk):
     assert code == 0 and "replay:groundtruth.txt" in out and str(walk) not in out
     (row,) = json.loads(cli(*command, "--json")[1])
     assert row["tracker"] == f"replay:{walk / 'groundtruth.txt'}", "scripts get the whole name"
-    assert run_rows._shown("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
+    assert run_rows.shown_cell("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
         "a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n"
     )
+
+
+def test_a_recording_without_ground_truth_says_where_its_trajectory_is(cli, walk, tmp_path):
+    shutil.copytree(walk, tmp_path / "mine")
+    (tmp_path / "mine" / "groundtruth.txt").unlink()
+    code, out, err = cli("run", "never-move", "mine")
+    told = err.splitlines()[-1]
+    assert code == 0 and "ok" in out and told.startswith("folder/mine has no ground truth")
+    assert len(read_tum(Path(told.rpartition(": ")[2]))) == 4
+
+
+def test_a_folder_whose_camera_is_not_known_says_how_to_name_it(cli, walk, tmp_path):
+    shutil.copytree(walk, tmp_path / "mine")
+    (tmp_path / "mine" / "camera.toml").rename("cam.toml")
+    code, _, err = cli("run", "never-move", "mine")
+    first, *options = err.splitlines()
+    assert code == 1 and "the camera of" in first and len(options) == 2 and "tum-fr1" in options[0]
+    assert cli("run", "never-move", "mine", "--camera", "cam.toml")[0] == 0
 
 
 def test_runs_list_refuses_what_is_not_there(cli, walk):
