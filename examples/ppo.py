@@ -42,12 +42,12 @@ def earned(env: gym.Env, policy) -> float:
 
 
 def main(steps: str | int = 2000, frames: int = 60, rooms: int = 4) -> None:
-    train = [f"synthetic/sitting_xyz@{room}" for room in range(rooms)]
+    train = [f"synthetic/sitting_xyz?scene={room}" for room in range(rooms)]
     env = Monitor(SequenceSampler(make(train[0], frames), train))
     agent = PPO("MlpPolicy", env, n_steps=min(256, int(steps)), batch_size=min(64, int(steps)), seed=0, device="cpu")
     agent.learn(int(steps))
 
-    unseen = make("synthetic/sitting_xyz@100", frames)
+    unseen = make("synthetic/sitting_xyz?scene=100", frames)
     print(f"settings as they are: {earned(unseen, lambda _: unseen.unwrapped.neutral_action):.4f} m")
     print(f"after {steps} steps:     {earned(unseen, lambda seen: agent.predict(seen, deterministic=True)[0]):.4f} m")
 

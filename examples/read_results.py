@@ -1,6 +1,6 @@
 """What was stored, as pandas frames, and two figures of it.
 
-dynslam-bench run orb-slam2 synthetic/walking_xyz@100 --frames 0:60        # or any other runs
+dynslam-bench run orb-slam2 'synthetic/walking_xyz?scene=100' --frames 0:60        # or any other runs
 python examples/read_results.py [RESULTS] [FOLDER FOR THE FIGURES]
 """
 

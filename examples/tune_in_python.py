@@ -20,8 +20,11 @@ def error_and_time(run: Outcome) -> float:
 def main(results: str = "results", frames: int = 20) -> None:
     study = Study(
         name="in-python", tracker="constant-velocity", results=results, trials=4, pilot=False, recorded=(),
-        tune=[Block("synthetic/walking_xyz@0", frames=(0, frames)), f"synthetic/sitting_xyz@1-2?frames={frames}"],
-        held_out=[f"synthetic/walking_xyz@100-102?frames={frames}"],
+        tune=[
+            Block("synthetic/walking_xyz?scene=0", frames=(0, frames)),
+            f"synthetic/sitting_xyz?scene=1-2&frames={frames}",
+        ],
+        held_out=[f"synthetic/walking_xyz?scene=100-102&frames={frames}"],
         objective=error_and_time,
         sampler=optuna.samplers.RandomSampler(seed=1),
         callbacks=[lambda _, trial: print(f"trial {trial.number}: {trial.params}")],

@@ -1,11 +1,11 @@
-"""The unit of a study: part of one sequence from one start, as ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``."""
+"""The unit of a study: part of a sequence, one start, ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 from collections.abc import Sequence as PySequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, cast
@@ -21,9 +21,9 @@ from dynslam_bench.sequences.view import SequenceView
 
 FEWEST_FRAMES = 2
 """A shorter block has no motion."""
-_TEXT = re.compile(r"(?P<name>[^\[\]?]+?)(?:@(?P<instances>[0-9,-]+))?(?:\[(?P<frames>[^\]]*)\])?(?:\?(?P<query>.*))?")
-_OPTIONS = ("frames", "offsets", "stride", "seeds", "degrade", "noise")
-_FORM = 'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz@0-19?frames=80&offsets=0-4"'
+_TEXT = re.compile(r"(?P<name>[^\[\]?]+?)(?:@(?P<scenes>[0-9,-]+))?(?:\[(?P<frames>[^\]]*)\])?(?:\?(?P<query>.*))?")
+_OPTIONS = ("scene", "frames", "offsets", "stride", "seeds", "degrade", "noise")
+_FORM = 'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
 
 
 @dataclass(frozen=True, order=True)
@@ -108,9 +108,10 @@ class Block:
 def parse_blocks(text: str, *, offsets: PySequence[int] = (0,), seeds: PySequence[int] = (0,)) -> tuple[Block, ...]:
     """Read one text of a study file.
 
-    ``[A:B]`` takes a part of any sequence, ``?frames=N`` its first N frames (a rendered one is made that long);
-    ``@0-19`` names instances of a rendered one, ``?noise=SEED`` a draw of its noise. ``offsets`` and ``seeds`` are
-    numbers and ranges (``0-4,7``), ``degrade`` strengths (``blur:0.5,glare:0.2``), ``stride`` a step between frames.
+    ``[A:B]`` takes a part of any sequence, ``?frames=N`` its first N frames (a rendered one is made that long).
+    ``?scene=0-19`` names scenes of a rendered one (``@0-19`` is read as well), ``noise=SEED`` a draw of its noise.
+    ``scene``, ``offsets`` and ``seeds`` are numbers and ranges (``0-4,7``), ``degrade`` strengths
+    (``blur:0.5,glare:0.2``), ``stride`` a step between frames.
 
     Args:
         text: Of a study's `tune`, `confirm` or `held_out`.
@@ -118,7 +119,7 @@ def parse_blocks(text: str, *, offsets: PySequence[int] = (0,), seeds: PySequenc
         seeds: Seeds where the text names none.
 
     Returns:
-        The blocks: for each instance in turn all offsets with all seeds.
+        The blocks: for each scene in turn all offsets with all seeds.
 
     Raises:
         StudyError: It cannot be read; says how it is written.
@@ -131,19 +132,24 @@ def parse_blocks(text: str, *, offsets: PySequence[int] = (0,), seeds: PySequenc
     options = _query(match["query"], text)
     frames = None if match["frames"] is None else _frames(match["frames"], text)
     rendered = match["name"].startswith("synthetic/")
-    if match["instances"] is not None and not rendered:
-        return _all(text, (f"{match['name']}@{match['instances']}",), frames, options, offsets, seeds)
+    if match["scenes"] is not None and not rendered:
+        return _all(text, (f"{match['name']}@{match['scenes']}",), frames, options, offsets, seeds)
     if not rendered:
-        if "noise" in options:
-            raise StudyError(f"'{text}': noise is a draw of rendered sequences only", _FORM)
+        for option in {"scene", "noise"} & options.keys():
+            raise StudyError(f"'{text}': rendered sequences alone have a {option}", _FORM)
         if "frames" in options:
             if frames is not None:
                 raise StudyError(f"'{text}' names its frames twice", "write [A:B] or ?frames=N")
             frames = (0, _number(options["frames"], "frames", text))
         return _all(text, (match["name"],), frames, options, offsets, seeds)
-    query = "&".join(f"{key}={options[key]}" for key in ("frames", "noise") if key in options)
-    instances = [""] if match["instances"] is None else [f"@{i}" for i in _numbers(match["instances"], text)]
-    names = tuple(f"{match['name']}{instance}{'?' + query if query else ''}" for instance in instances)
+    if match["scenes"] is not None:
+        if "scene" in options:
+            raise StudyError(f"'{text}' names its scenes twice", "write ?scene=0-19")
+        options["scene"] = match["scenes"]
+    chosen = [f"scene={scene}" for scene in _numbers(options["scene"], text)] if "scene" in options else [""]
+    others = [f"{key}={options[key]}" for key in ("frames", "noise") if key in options]
+    queries = ["&".join(filter(None, [scene, *others])) for scene in chosen]
+    names = tuple(f"{match['name']}{'?' + query if query else ''}" for query in queries)
     return _all(text, names, frames, options, offsets, seeds)
 
 
@@ -157,7 +163,7 @@ def scene_of(name: str) -> str:
             parsed = parse_synthetic_id(name)
         except SequenceError:
             return name  # refused with a did-you-mean where it is opened
-        return f"synthetic/{parsed.name}@{parsed.instance}"
+        return replace(parsed, noise=None).whole
     entry = entry_of(name)
     return entry.id if entry is not None else str(Path(name).expanduser().resolve())
 

@@ -9,6 +9,7 @@ import optuna
 from optuna.trial import FrozenTrial
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.version import install_hint
 
 
 class TensorBoard:
@@ -29,9 +30,7 @@ class TensorBoard:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
-            raise StudyError(
-                "the callback needs the package tensorboard", "pip install 'dynslam-bench[tensorboard]'"
-            ) from error
+            raise StudyError("the callback needs the package tensorboard", install_hint("tensorboard")) from error
         self._writer: Any = SummaryWriter
 
     def __call__(self, study: optuna.Study, trial: FrozenTrial) -> None:

@@ -63,7 +63,7 @@ class Objective:
         if not counted:
             raise StudyError(
                 f"objective '{self.name}' counts degraded blocks alone, but none of the study's is",
-                'name some, e.g. "synthetic/walking_xyz@0-3?frames=80&degrade=blur:0.5"',
+                'name some, e.g. "synthetic/walking_xyz?scene=0-3&frames=80&degrade=blur:0.5"',
             )
         return centre(counted)
 

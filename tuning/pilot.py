@@ -167,7 +167,7 @@ def judge_pilot(
     if count < FEWEST:
         raise StudyError(
             f"a pilot over {count} scene{'s' * (count != 1)} says nothing, it takes {FEWEST}",
-            'name more instances, e.g. "synthetic/walking_xyz@0-5?frames=80&offsets=0-2"',
+            'name more scenes, e.g. "synthetic/walking_xyz?scene=0-5&frames=80&offsets=0-2"',
         )
     found = np.array([spread(logs) for logs in pairs])
     within, between = (float(value) for value in np.sqrt((found**2).mean(axis=0)))

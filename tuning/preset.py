@@ -56,6 +56,12 @@ def _tables(tuned: Mapping[str, Any]) -> Iterable[str]:
 
 def _listed(blocks: Sequence[str]) -> str:
     """Blocks by their sequences, with their number."""
-    names = list(dict.fromkeys(text.partition("?")[0] for text in blocks))
+    names = list(dict.fromkeys(_scene(text) for text in blocks))
     shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     return f"{len(blocks)} block{'s' * (len(blocks) != 1)} of {shown}"
+
+
+def _scene(block: str) -> str:
+    """A block's text without its options but for the scene."""
+    name, _, query = block.partition("?")
+    return "?".join([name, *(option for option in query.split("&") if option.startswith("scene="))])

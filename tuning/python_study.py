@@ -41,7 +41,7 @@ class Study:
     """A study, to be run or to be looked at.
 
     Example:
-        ``Study(tracker="orb-slam2", tune=["synthetic/walking_xyz@0-3?frames=80"], name="few").run(jobs=2).finish()``
+        ``Study(tracker="orb-slam2", tune=["synthetic/walking_xyz?scene=0-3&frames=80"], name="few").run().finish()``
 
     Args:
         spec: The study, or its TOML file; None if the fields say it all.

@@ -39,7 +39,7 @@ def seen_note(splits: Sequence[str]) -> str:
         return ""
     named = " and ".join({"tune": "race", "confirm": "choice", "held_out": "held-out blocks"}[name] for name in splits)
     judged = (
-        "so nothing here judges the masks: held-out blocks are rendered instances from 100 on"
+        "so nothing here judges the masks: held-out blocks are rendered scenes from 100 on"
         if "held_out" in splits
         else "so the errors there flatter it, and the held-out blocks, which it has not seen, may gain less"
     )

@@ -1,4 +1,4 @@
-"""Whether a study's blocks are what they say: apart by content, by the catalogue, by the instances."""
+"""Whether a study's blocks are what they say: apart by content, by the catalogue, by the scenes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def check_splits(
     Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
     a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
     names, other stamps or other image files (`same_recording`). `tune` and `confirm` may share a scene, but no frames
-    from the same start. A sequence that the catalogue, or its instance, gives to one split must not stand in the other.
+    from the same start. A sequence that the catalogue, or its scene, gives to one split must not stand in the other.
 
     Args:
         name: Of the study.
@@ -99,7 +99,7 @@ def _misplaced(name: str, used: str, own: str) -> str:
     who = "the catalogue"
     if name.startswith("synthetic/"):
         own_range = HELD_OUT_INSTANCES if own == "held-out" else TUNE_INSTANCES
-        who = f"its instance ({own_range.start}-{own_range.stop - 1})"
+        who = f"its scene ({own_range.start}-{own_range.stop - 1})"
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 

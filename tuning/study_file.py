@@ -48,14 +48,14 @@ class StudySpec(_Part):
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
         tune: Blocks that trials run on, written as `blocks.parse_blocks` reads them:
-            ``synthetic/walking_xyz@0-19?frames=80&offsets=0-4``.
+            ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
         confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
             for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
         held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.
         recorded: Blocks of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.
         space: Which settings are tuned.
-        allow_overlap: Accept splits that share content, or sequences that the catalogue or their instance gives to the
+        allow_overlap: Accept splits that share content, or sequences that the catalogue or their scene gives to the
             other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
             minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in

@@ -90,7 +90,7 @@ def start(arguments: list[str] | None = None) -> None:
             leave_interrupted()
         if not isinstance(error, DynslamError):
             raise
-        _say(f"error: {error}")
+        _say(f"error: {error.headline}", *error.options)
         sys.exit(1)
     except SystemExit as ended:  # typer turns an interrupt within a command into this
         if ended.code == INTERRUPT_CODE:
@@ -119,6 +119,8 @@ def expand_lists(arguments: list[str]) -> list[str]:
     return expanded
 
 
-def _say(text: str) -> None:
+def _say(text: str, *options: str) -> None:
     line = printable(" ".join(text.split()))
     sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")
+    for option in options:
+        sys.stderr.write(f"  - {printable(' '.join(option.split()))}\n")

@@ -72,7 +72,7 @@ def run_demo(results: Path | str = "results", *, frames: int = 60, jobs: int = 2
     from dynslam_bench.suites import load_suite
 
     specs = [
-        spec.model_copy(update={"sequence": f"{spec.sequence}?frames={frames}", "frames": None})
+        spec.model_copy(update={"sequence": f"{spec.sequence}&frames={frames}", "frames": None})
         for spec in load_suite("demo").specs()
     ]
     store = RunStore(results)
@@ -116,8 +116,8 @@ def tune_a_little(results: Path, *, frames: int, jobs: int, trials: int) -> tupl
     spec = StudySpec(
         name=f"demo-{state}",
         tracker=STUDIED,
-        tune=(f"synthetic/walking_xyz@1-3?frames={frames}",),
-        held_out=(f"synthetic/walking_xyz@101-103?frames={frames}",),
+        tune=(f"synthetic/walking_xyz?scene=1-3&frames={frames}",),
+        held_out=(f"synthetic/walking_xyz?scene=101-103&frames={frames}",),
         recorded=(),
         objectives=("accuracy",),
         space=SpaceSpec(include=TUNED),

@@ -81,7 +81,7 @@ def tell(rows: Iterable[RunRow], records: Sequence[RunRecord]) -> list[str]:
     errors: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.score_m is not None:
-            errors.setdefault(row.sequence.partition("?")[0].rpartition("/")[2], {})[row.tracker] = row.score_m
+            errors.setdefault(row.sequence.partition("&")[0].rpartition("/")[2], {})[row.tracker] = row.score_m
     lines = [_sequence(name, found) for name, found in sorted(errors.items(), reverse=True) if PLAIN in found]
     return [*lines, *_costs(records), "One run each shows, and proves nothing: `dynslam-bench bench dynamic` repeats."]
 

@@ -34,6 +34,10 @@ Camera = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml.", rich_help_panel=FRAMES),
 ]
+Yes = Annotated[
+    bool,
+    typer.Option("--yes", "-y", help="Download the network for masks without asking.", rich_help_panel=MACHINE),
+]
 Frames = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(

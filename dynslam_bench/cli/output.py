@@ -49,9 +49,20 @@ def note(text: str) -> None:
         complain(text)
 
 
+def announce(text: str) -> None:
+    """Write a line for people to standard error, a terminal or not; none with ``--json``."""
+    if not _for_scripts:
+        complain(text)
+
+
 def complain(text: str) -> None:
     """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
     sys.stderr.write(printable(text) + "\n")
+
+
+def can_ask() -> bool:
+    """Whether somebody sits at a terminal who can answer a question, and no script reads what is written."""
+    return sys.stdin.isatty() and sys.stderr.isatty() and not _for_scripts
 
 
 def write_json(value: Any) -> None:

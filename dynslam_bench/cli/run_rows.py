@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from dynslam_bench.core.toml import label_text
 
 from .output import complain, write, write_columns, write_json
 
@@ -69,7 +72,7 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
         return
     names = {name: title for name, title in TITLES.items() if name != "frames" or any(row["frames"] for row in rows)}
     names |= {name: title for name, title in WHERE_SAID.items() if any(row.get(name) for row in rows)}
-    columns = [(title, [row[name] for row in rows]) for name, title in names.items()]
+    columns = [(title, [shown_cell(name, row[name]) for row in rows]) for name, title in names.items()]
     write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)
     pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in rows]
     worse = sum(static is not None and error is not None and error > (1 + 1e-9) * static for error, static in pairs)
@@ -77,6 +80,16 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str, *, as_json: b
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
     if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
         write("ATE: of the tracked frames alone; static camera: of all. A report holds lost frames at the last pose.")
+
+
+_FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
+
+
+def shown_cell(name: str, value: Any) -> Any:
+    """A cell of the table: paths without their folders, which ``--json`` and ``runs show`` have."""
+    if name in ("tracker", "masks"):
+        return label_text(value)
+    return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 
 def show_pictures(records: Sequence[RunRecord], store: RunStore, names: Sequence[str], *, as_json: bool) -> set[str]:
@@ -107,8 +120,8 @@ def seen_note(records: Sequence[RunRecord]) -> str:
         return ""
     return (
         f"{len(seen)} of {len(records)} runs have masks of a network that was trained on their scene, the first on "
-        f"{seen[0]}: a best case, which reports mark and do not rank; instances 100-199 are held out, e.g. "
-        f"{seen[0].partition('?')[0].partition('@')[0]}@100"
+        f"{seen[0]}: a best case, which reports mark and do not rank; scenes 100-199 are held out, e.g. "
+        f"{seen[0].partition('?')[0].partition('@')[0]}?scene=100"
     )
 
 

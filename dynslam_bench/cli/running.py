@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import typer
+
+from dynslam_bench.core.toml import label_text
 
 from . import completion
 from .options import (
@@ -42,16 +45,19 @@ from .options import (
     TimeLimit,
     Trackers,
     Video,
+    Yes,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, complain, note, progress
+from .output import SOME_RUNS_FAILED, announce, can_ask, complain, note, progress
 from .panels import MEASURE
 from .run_rows import drift_note, seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.core.errors import DynslamError
     from dynslam_bench.core.records import Record
-    from dynslam_bench.runs import RunEvent, RunRecord, RunSpec
+    from dynslam_bench.runs import RunEvent, RunRecord, RunSpec, RunStore
+    from dynslam_bench.runs.identity import ResolvedRun
+    from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
 
 R = TypeVar("R", bound="Record")
 
@@ -101,6 +107,7 @@ def run(
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
@@ -121,7 +128,7 @@ def run(
         for number in (seed or [0])
         for skipped in (offset or [0])
     ]
-    finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json)
+    finish(specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, yes=yes, as_json=as_json)
 
 
 def checked(kind: type[R], **values: Any) -> R:
@@ -222,6 +229,7 @@ def bench(
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
     protocol: ProtocolId = "tum-rgbd/v1",
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a suite: every tracker on every sequence with every seed; calling it again goes on where it stopped."""
@@ -243,8 +251,9 @@ def bench(
     limits = {spec.limits: checked(Limits, **(spec.limits.model_dump() | changes)) for spec in specs}
     specs = [spec.model_copy(update={"limits": limits[spec.limits]}) for spec in specs]
     finish(
-        specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, as_json=as_json, scheduler=scheduler
-    )
+        specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol, yes=yes, as_json=as_json,
+        scheduler=scheduler,
+    )  # fmt: skip
 
 
 def finish(
@@ -254,19 +263,29 @@ def finish(
     jobs: int,
     retry: Sequence[str],
     protocol: str,
+    yes: bool,
     as_json: bool,
     scheduler: str | None = None,
 ) -> None:
     """Make runs, show them, and exit with 3 if some failed, were lost or cannot be made, or lack a map asked for."""
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.many import pictures_asked
+    from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
+    from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
     from dynslam_bench.slam.mapping.saved_map import MAP_FILE
 
     store = RunStore(results)
     reused: set[str] = set()
     faults: list[str] = []
-    made_with: dict[str, Any] = {"scheduler": scheduler, "reused": reused, "faults": faults}
-    records = make_runs(specs, store, jobs=jobs, retry=retry, protocol=protocol, **made_with)
+    asked: dict[str, Any] = {"jobs": jobs, "retry": retry, "protocol": protocol, "scheduler": scheduler}
+    asked |= {"reused": reused, "faults": faults}
+    try:
+        records = make_runs(specs, store, **asked)
+    except NetworkNotFetched as error:  # raised before the first run
+        if not (yes or agreed_to_fetch(error.checkpoint)):
+            raise
+        fetch_checkpoint(error.checkpoint)
+        records = make_runs(specs, store, **asked)
     if not records:
         raise typer.Exit(1)
     show_runs(records, store, protocol, as_json=as_json, reused=reused)
@@ -275,14 +294,38 @@ def finish(
     for caution in (seen_note(records), drift_note(made, store)):
         if caution:
             note(caution)
+    announce_unscored(records, store)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if faults or MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
 
 
+def announce_unscored(records: Sequence[RunRecord], store: RunStore) -> None:
+    """Say of runs on recordings without ground truth why they have no error, and where the first trajectory lies."""
+    without = [record for record in records if not record.sequence.ground_truth and not record.failed]
+    if without:
+        path = store.folder(without[0].run_id) / "trajectory_online.txt"
+        announce(
+            f"{without[0].sequence.id} has no ground truth, so nothing is scored; the estimated trajectory: {path}"
+        )
+
+
+def agreed_to_fetch(checkpoint: Checkpoint) -> bool:
+    """Ask on a terminal whether a network may be downloaded; nobody is asked elsewhere, and nothing is downloaded."""
+    from dynslam_bench.core.folders import weights_folder
+
+    if not can_ask():
+        return False
+    complain(
+        f"Masks of people need the network '{checkpoint.id}': {checkpoint.megabytes} MB from {checkpoint.url} "
+        f"({checkpoint.license}, {checkpoint.trained_on}), kept in {weights_folder()}."
+    )
+    return typer.confirm("Download it?", default=True, err=True)
+
+
 def run_words(event: RunEvent) -> str:
     """What is going on in a run, in words."""
-    words = f"{event.spec.tracker} on {event.spec.sequence}"
+    words = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind != "progress" or event.partial is None:
         return words
     return f"{words}, frame {event.partial['frames_done']} of {event.partial['frames']}"
@@ -325,12 +368,64 @@ def make_runs(
                 faults.append(str(error))
                 complain(f"error: {error}")
 
+        def planned(runs: Collection[ResolvedRun]) -> None:
+            announce(plan_words(runs, store, jobs))
+
         with_executor: dict[str, Any] = {} if faults is None else {"on_fault": fault}
         if scheduler is not None:
             with_executor["executor"] = dask_executor(scheduler)
         return run_many(
-            specs, results=store, jobs=jobs, retry=tuple(retry), on_event=told, protocol=protocol, **with_executor
-        )
+            specs, results=store, jobs=jobs, retry=tuple(retry), on_plan=planned, on_event=told, protocol=protocol,
+            **with_executor,
+        )  # fmt: skip
+
+
+MOST_LOOKED_AT, MOST_ALIKE = 100, 5
+"""Stored runs, the newest first, that are looked through for those of a tracker, and how many of these count."""
+
+
+def plan_words(runs: Collection[ResolvedRun], store: RunStore, jobs: int) -> str:
+    """How many frames are to be tracked, and how long that takes by what stored runs of the same trackers took."""
+    from dynslam_bench.runs.one import PROGRESS_EVERY
+
+    frames = sum(len(run.sequence) for run in runs)
+    words = f"{len(runs)} run{'s' * (len(runs) != 1)}, {frames} frames"
+    times = frame_times(runs, store)
+    known = [run for run in runs if _kind(run) in times]
+    if not known:
+        later = f"; how long it takes is known after the first {PROGRESS_EVERY}" if frames > PROGRESS_EVERY else ""
+        return words + later
+    expected_s = sum(len(run.sequence) * times[_kind(run)] for run in known) / min(jobs, len(runs))
+    low, high = _seconds(min(times.values())), _seconds(max(times.values()))
+    rate = low if low == high else f"{low} to {high}"
+    some = f" for {len(known)} of them" if len(known) < len(runs) else ""
+    return f"{words}, about {_seconds(expected_s)}{some} (stored runs on this machine took {rate} a frame)"
+
+
+def frame_times(runs: Collection[ResolvedRun], store: RunStore) -> dict[tuple[str, str], float]:
+    """Seconds of wall-clock time a frame of stored runs on a machine like this: the median by tracker and masks."""
+    from dynslam_bench.core.machine import this_machine
+
+    wanted, times = {_kind(run) for run in runs}, dict[tuple[str, str], list[float]]()
+    newest = sorted(store.ids(), key=lambda run_id: -store.folder(run_id).stat().st_mtime)
+    machine = this_machine()
+    for record in filter(None, map(store.get, newest[:MOST_LOOKED_AT])):
+        kind = (record.tracker.id, record.segmentation)
+        here = record.machine is not None and (record.machine.cpu, record.machine.cores) == (machine.cpu, machine.cores)
+        if kind in wanted and here and record.status in ("ok", "lost") and record.n_processed and record.wall_s:
+            times.setdefault(kind, []).append(record.wall_s / record.n_processed)
+    return {kind: median(found[:MOST_ALIKE]) for kind, found in times.items()}
+
+
+def _kind(run: ResolvedRun) -> tuple[str, str]:
+    return run.tracker.id, run.segmentation
+
+
+def _seconds(value: float) -> str:
+    for unit, seconds in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
+        if value >= 1.5 * seconds:
+            return f"{value / seconds:.2g} {unit}" if value < 10 * seconds else f"{value / seconds:.0f} {unit}"
+    return f"{1000 * value:.0f} ms"
 
 
 def dask_executor(address: str) -> Any:
@@ -340,11 +435,12 @@ def dask_executor(address: str) -> Any:
         RunError: ``distributed`` is not installed, or the scheduler does not answer.
     """
     from dynslam_bench.core.errors import RunError
+    from dynslam_bench.core.version import install_hint
 
     try:
         from distributed import Client
     except ImportError as error:
-        raise RunError("--scheduler needs the package distributed", "pip install 'dynslam-bench[cluster]'") from error
+        raise RunError("--scheduler needs the package distributed", install_hint("cluster")) from error
     try:
         logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it tells of a lost scheduler by a traceback
         return Client(address, timeout="10s").get_executor()

@@ -178,7 +178,7 @@ def unpack(
 
 @app.command()
 def render(
-    names: Annotated[list[str], typer.Argument(help="Such as 'synthetic/walking_xyz@0?frames=600'.")],
+    names: Annotated[list[str], typer.Argument(help="Such as 'synthetic/walking_xyz?scene=0&frames=600'.")],
     data_root: DataRoot = None,
     threads: Annotated[Optional[int], typer.Option(min=1, help="Frames rendered at a time.")] = None,  # noqa: UP045
 ) -> None:

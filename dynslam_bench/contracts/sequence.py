@@ -62,7 +62,7 @@ class Sequence(Protocol):
 
     @property
     def id(self) -> str:
-        """For example ``tum/fr3/walking_xyz`` or ``synthetic/walking_xyz@0?frames=600``."""
+        """For example ``tum/fr3/walking_xyz`` or ``synthetic/walking_xyz?scene=0&frames=600``."""
         ...
 
     @property

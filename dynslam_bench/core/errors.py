@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 from .passwords import without_passwords
 
@@ -19,18 +20,25 @@ class DynslamError(Exception):
     Args:
         message: One line with the measured numbers and the expectation.
         hint: One line that says how to cure it; empty if there is nothing to add.
+        options: Several cures to choose from, a line each; the command line writes them below each other.
     """
 
-    def __init__(self, message: str, hint: str = "") -> None:
+    def __init__(self, message: str, hint: str = "", *, options: Iterable[str] = ()) -> None:
         super().__init__(_one_line(str(message)))
         self.hint = _one_line(hint)
+        self.options = tuple(_one_line(option) for option in options)
 
-    def __str__(self) -> str:
+    @property
+    def headline(self) -> str:
+        """The message with its hint, without the options."""
         message = str(self.args[0])
         return f"{message} ({self.hint})" if self.hint else message
 
-    def __reduce__(self) -> tuple[type[DynslamError], tuple[str, str]]:
-        return type(self), (str(self.args[0]), self.hint)
+    def __str__(self) -> str:
+        return self.headline + (f" (choose: {'; '.join(self.options)})" if self.options else "")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self.args[0]), self.hint), {"options": self.options}
 
 
 LONGEST = 1000

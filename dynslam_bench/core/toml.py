@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,10 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+
+_PREFIXED = re.compile(r"[a-z][a-z0-9_-]*:")
+_NETWORK = re.compile(r"\.(?:onnx|pt|pth)$")
 
 
 def read_toml(path: Path, *, kind: type[DynslamError] = SequenceError) -> dict[str, Any]:
@@ -65,6 +70,21 @@ def read_settings(path: Path) -> dict[str, Any]:
 def setting_text(value: Any) -> str:
     """A setting's value for people and for ``--set``: ``true``, ``null``, a table in JSON; a text without quotes."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def label_text(value: Any) -> str:
+    """A setting's value, or a tracker's id, for tables: paths without their folders, networks without their ending.
+
+    Example:
+        >>> label_text("onnx:/home/me/yolov8n-seg.onnx"), label_text("replay:/data/run 3.txt"), label_text(0.5)
+        ('onnx:yolov8n-seg', 'replay:run 3.txt', '0.5')
+    """
+    text = setting_text(value)
+    prefix, separator, path = text.partition(":") if _PREFIXED.match(text) else ("", "", text)
+    if not path.startswith(("/", "~", "./", "../")):
+        return text
+    name = path.rstrip("/").rpartition("/")[2]
+    return f"{prefix}{separator}{_NETWORK.sub('', name) if prefix else name}"
 
 
 def assignments(values: Mapping[str, Any]) -> list[str]:

@@ -19,6 +19,11 @@ def version() -> str:
         return UNKNOWN
 
 
+def install_hint(extra: str) -> str:
+    """How to install one of this package's extras: from the checkout, since it is on no index yet."""
+    return f"pip install '.[{extra}]' in the checkout of dynslam-bench"
+
+
 def release() -> str:
     """The release that the version belongs to, three numbers such as ``0.1.0``: the same for all its development.
 

@@ -61,6 +61,7 @@ def run_many(
     jobs: int = 1,
     executor: Executor | None = None,
     retry: Collection[str] = (),
+    on_plan: Callable[[Collection[ResolvedRun]], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
@@ -85,6 +86,7 @@ def run_many(
             Dask's ``client.get_executor()``. Workers return records as bytes; they need the sequences, not the results
             folder. Partial metrics stay on the worker, so `on_progress` is not called.
         retry: Statuses to run again although they are stored; ``failed`` stands for all of `FAILED`.
+        on_plan: Told once which runs will be made, before the first of them; not called where all are stored.
         on_event: Told of everything that happens, from several threads but never two at a time.
         on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
         protocol: Protocol to score under.
@@ -120,6 +122,8 @@ def run_many(
             done[run.run_id] = bench.reuse(run, stored)
         else:
             todo[run.run_id] = run
+    if todo and on_plan is not None:
+        on_plan(todo.values())
     done |= bench.run_remotely(todo, executor) if executor is not None else bench.run_here(todo, jobs)
     if bench.faults and on_fault is None:
         raise bench.faults[0]

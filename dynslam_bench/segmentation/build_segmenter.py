@@ -12,13 +12,19 @@ from dynslam_bench.core.errors import DynslamError, SegmentationError
 from dynslam_bench.core.plugins import load_object
 
 from .masks.postprocess import select
-from .networks.checkpoints import COCO, cached_checkpoint, embedded_weights, fetch_checkpoint
+from .networks.checkpoints import COCO, Checkpoint, cached_checkpoint, embedded_weights, fetch_checkpoint
 from .registry import SEGMENTERS, SegmenterContext
 from .settings import SegmentationSettings
 
 SYNTHETIC = "synthetic/"
 LOWEST_CONFIDENCE = 0.1
 """Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
+
+
+class NetworkNotFetched(SegmentationError):
+    """``auto`` needs a network that is not in the cache: fetching it cures that, and is to be agreed to first."""
+
+    checkpoint: Checkpoint = COCO
 
 
 def resolve_source(
@@ -36,7 +42,7 @@ def resolve_source(
         ``auto`` becomes ``embedded``, ``oracle`` or ``coco``; everything else stays as it is.
 
     Raises:
-        SegmentationError: ``auto`` finds nothing that could segment this sequence; says what is available.
+        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; says what else there is.
     """
     if settings.source != "auto":
         return settings.source
@@ -47,23 +53,22 @@ def resolve_source(
             return "oracle"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    available = [
-        f"coco (the surest; downloads {COCO.megabytes} MB from {COCO.url}, about a second a frame on two cores)",
-        "onnx:PATH (your export, e.g. of YOLO-seg; about 0.1 s a frame)",
-        "recorded:DIR",
-        "weights:PATH",
-        "embedded (0.02 s a frame, knows rendered people only: on recorded ones hardly better than nothing)",
+    options = [
+        "--yes (run, bench) or segmentation.source=coco downloads it once",
+        "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
+        "segmentation.source=recorded:DIR takes masks that were stored before",
     ]
     if masks is not None:
-        available.insert(0, "oracle (the sequence's exact masks)")
-    if optional:
-        available.insert(0, "none (no masks)")
-    else:
-        available.append("or a system that needs no masks, e.g. emfoa-oft-no-masks or orb-slam2")
-    what = f"sequence '{sequence_id}'" if sequence_id else "this sequence"
-    raise SegmentationError(
-        f"segmentation.source=auto finds no network for {what}: the COCO checkpoint is not in the cache",
-        "choose one of: segmentation.source=" + ", ".join(available),
+        options.append("segmentation.source=oracle takes the sequence's exact masks")
+    without = (
+        "segmentation.source=none" if optional else "a system that needs none, e.g. emfoa-oft-no-masks or orb-slam2"
+    )
+    options.append(f"without masks: {without}")
+    what = f"'{sequence_id}'" if sequence_id else "this sequence"
+    raise NetworkNotFetched(
+        f"no masks for {what}: segmentation.source=auto needs "
+        f"the COCO checkpoint ({COCO.megabytes} MB), which is not in the cache",
+        options=options,
     )
 
 

@@ -13,11 +13,11 @@ def seen_in_training(source: str, sequence_id: str) -> bool:
 
     Args:
         source: Where the masks come from, resolved (``embedded``, never ``auto``).
-        sequence_id: For example ``synthetic/walking_xyz@3``.
+        sequence_id: For example ``synthetic/walking_xyz?scene=3``.
     """
     if source != "embedded" or not sequence_id.startswith("synthetic/"):
         return False
     try:
-        return parse_synthetic_id(sequence_id).instance in TUNE_INSTANCES
+        return parse_synthetic_id(sequence_id).scene in TUNE_INSTANCES
     except SequenceError:  # an imported trajectory may name any sequence
         return False

@@ -56,7 +56,7 @@ def open_sequence(
     """Open a sequence.
 
     Args:
-        name: An id (``tum/fr3/walking_xyz``, ``bonn/crowd``, ``synthetic/walking_xyz@0?frames=150``), a published
+        name: An id (``tum/fr3/walking_xyz``, ``bonn/crowd``, ``synthetic/walking_xyz?scene=0&frames=150``), a published
             folder name (``rgbd_dataset_freiburg3_walking_xyz``) or the path of a folder of a layout that is read.
         data_root: Folder of the sequences; default ``DYNSLAM_BENCH_DATA``, else the user's cache folder.
         camera: In place of what the catalogue or the folder says: ``tum-fr1``, ``tum-fr2``, ``tum-fr3``, ``bonn`` or a
@@ -109,7 +109,7 @@ def open_rendered(sequence_id: str, *, data_root: Path) -> Sequence:
     """Open a rendered sequence; its frames are kept below the data root, or in the user's cache if that is read-only.
 
     Args:
-        sequence_id: For example ``synthetic/walking_xyz@0?frames=150``.
+        sequence_id: For example ``synthetic/walking_xyz?scene=0&frames=150``.
         data_root: Folder of the sequences.
 
     Raises:
@@ -213,7 +213,7 @@ def _open_whole(
             "a path names a folder, see docs/sequences.md",
         )
     known = [*sequence_ids(), *by_folder()]
-    raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, known))
+    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, known))
 
 
 def _is_path(name: str) -> bool:

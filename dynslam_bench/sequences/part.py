@@ -16,7 +16,7 @@ class Part:
     """Which frames of which content are seen.
 
     Attributes:
-        id: Id without a length: ``synthetic/walking_xyz@0`` for all its lengths; a noise seed stays in it.
+        id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed stays in it.
         content: Digest of the whole content, however much of it is seen.
         scene: The same without the draw of the sensors' noise.
         camera: Intrinsics of the camera before any preprocessing.

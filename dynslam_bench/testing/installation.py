@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from dynslam_bench.core.folders import find_data_root, is_writable, stage_cache_folder, weights_folder
-from dynslam_bench.core.version import version
+from dynslam_bench.core.version import install_hint, version
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
 from dynslam_bench.sequences.listing import summaries
 
@@ -60,16 +60,16 @@ def _packages() -> list[Finding]:
     try:
         required = metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:
-        return [Finding("package", DISTRIBUTION, "not installed", True, "pip install .")]
+        return [Finding("package", DISTRIBUTION, "not installed", True, "pip install . in the checkout")]
     extras: dict[str, list[str]] = {}
     for requirement in required:
         name = re.split(r"[\s<>=!~;\[(]", requirement, maxsplit=1)[0]
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
         if extra is not None or ";" not in requirement:
             extras.setdefault(extra.group(1) if extra else "", []).append(name)
-    found = [_package("package", name, [name], "pip install --force-reinstall dynslam-bench") for name in extras[""]]
+    found = [_package("package", name, [name], "pip install --force-reinstall .") for name in extras[""]]
     found += [
-        _package("extra", extra, names, f"pip install 'dynslam-bench[{extra}]'")
+        _package("extra", extra, names, install_hint(extra))
         for extra, names in sorted(extras.items())
         if extra and extra not in FOR_DEVELOPERS
     ]

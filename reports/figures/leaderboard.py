@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from dynslam_bench.core.toml import label_text
+
 from ..model.board import Board
 from ..model.statistics import Interval
 from ..tables.leaderboard import CACHED_MARK, timed
@@ -196,7 +198,8 @@ def mask_figure(board: Board) -> Figure | None:
                     "x": rounded([float(row.mask_iou or 0.0) for row in rows]),
                     "y": rounded([1000 * max(float(row.score_m or 0.0), 1e-6) for row in rows]),
                     "text": [
-                        f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(row.segmentation)}" for row in rows
+                        f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}"
+                        for row in rows
                     ],
                     "marker": {"size": 9, "opacity": 0.85, "color": palette[key]},
                     "hovertemplate": "%{text}<br>IoU %{x:.3f}<br>ATE %{y:.3g} mm<extra>%{fullData.name}</extra>",

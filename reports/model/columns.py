@@ -30,7 +30,7 @@ def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
 
 
 def shortened(names: Sequence[str]) -> dict[str, str]:
-    """Names without the folders, and without the ``@...`` and the ``?...`` behind them, that all of them share.
+    """Names without the folders, and without the options (``scene=...``, ``frames=...``), that all of them share.
 
     The part of a sequence, `` [0:60]``, always stays.
     """
@@ -40,21 +40,20 @@ def shortened(names: Sequence[str]) -> dict[str, str]:
     shared = 0
     while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
         shared += 1
-    marks = [_split(name)[1].partition("?") for name in names]
-    instances, queries = {mark for mark, _, _ in marks}, {query for _, _, query in marks}
+    common = set[str].intersection(*(set(_split(name)[1]) for name in names))
     short = {}
-    for name, (mark, sign, query) in zip(names, marks, strict=True):
-        stem, _, part = _split(name)
-        tail = (mark if len(instances) > 1 else "") + (sign + query if len(queries) > 1 else "")
-        short[name] = "/".join(stem.split("/")[shared:]) + tail + part
+    for name in names:
+        stem, options, part = _split(name)
+        kept = "&".join(option for option in options if option not in common)
+        short[name] = "/".join(stem.split("/")[shared:]) + (f"?{kept}" if kept else "") + part
     return short if len(set(short.values())) == len(names) else {name: name for name in names}
 
 
-def _split(name: str) -> tuple[str, str, str]:
-    """Stem, ``@...?...`` and `` [part] (words)`` of a name."""
+def _split(name: str) -> tuple[str, list[str], str]:
+    """Stem, the options behind the ``?``, and `` [part] (words)`` of a name."""
     whole = min((name.partition(mark)[0] for mark in (" [", " (")), key=len)
-    stem = min((whole.partition(mark)[0] for mark in ("@", "?")), key=len)
-    return stem, whole[len(stem) :], name[len(whole) :]
+    stem, _, query = whole.partition("?")
+    return stem, query.split("&") if query else [], name[len(whole) :]
 
 
 def _name(row: RunRow) -> str:

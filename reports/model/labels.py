@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core.toml import label_text, setting_text
 
 from .row import SEEN, RunRow
 
@@ -34,15 +36,24 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     single = {tracker: _single(tracker, by_tracker) for tracker in by_tracker}
     kinds = {tracker: {other.kind for other in others} for tracker, others in by_tracker.items()}
     labels = {}
+    values = [value for row in variants.values() for value in row.variant.values()]
+    texts = _short_texts(values)
     for key, row in variants.items():
         shown = {*differing_of[row.tracker], *ALWAYS, *single[row.tracker]}
-        parts = [f"{name}={setting_text(value)}" for name, value in sorted(row.variant.items()) if name in shown]
+        parts = [f"{name}={texts[setting_text(value)]}" for name, value in sorted(row.variant.items()) if name in shown]
         parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
         if row.imported and len(kinds[row.tracker]) > 1:
             parts.append("imported")
         base = f"{row.label} <{row.tracker}>" if len(by_label[row.label]) > 1 else row.label
         labels[key] = base + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in seen)
     return labels
+
+
+def _short_texts(values: Iterable[Any]) -> dict[str, str]:
+    """Values as texts, each with its short form; whole where two values have the same short form."""
+    short = {text: label_text(text) for text in map(setting_text, values)}
+    counts = Counter(short.values())
+    return {text: each if counts[each] == 1 else text for text, each in short.items()}
 
 
 def _single(tracker: str, by_tracker: Mapping[str, Sequence[RunRow]]) -> list[str]:

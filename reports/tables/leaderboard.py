@@ -9,6 +9,7 @@ from statistics import median
 
 import numpy as np
 
+from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.protocol import Protocol
 
 from ..model.board import Board
@@ -32,7 +33,7 @@ CACHED_MARK = "†"
 CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 SEEN_NOTE = (
     f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
-    "instances 0-99): its best case, no judgement."
+    "scenes 0-99): its best case, no judgement."
 )
 
 
@@ -179,7 +180,7 @@ def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
     ended = [row for row in runs if not row.failed]
     kinds = " + ".join(f"{count} {kind}" for kind, count in Counter(row.kind for row in runs).items())
     provenance = runs[0].provenance
-    masks = " + ".join(sorted({row.segmentation for row in runs if row.segmentation not in ("", "none")}))
+    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
     masks_words = f"{masks} masks" if masks else ""
     return [
         TableCell(f"{100 * coverage:.1f} %", value=coverage),

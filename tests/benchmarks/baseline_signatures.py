@@ -95,13 +95,13 @@ def classify(
 
 
 def recorded(twin: str) -> str:
-    """The recorded sequence that a twin is modelled on: ``synthetic/walking_xyz@3`` -> ``tum/fr3/walking_xyz``."""
-    return "tum/fr3/" + twin.removeprefix("synthetic/").partition("@")[0].partition("?")[0]
+    """The recorded sequence behind a twin: ``synthetic/walking_xyz?scene=3`` -> ``tum/fr3/walking_xyz``."""
+    return "tum/fr3/" + twin.removeprefix("synthetic/").partition("?")[0]
 
 
 def instance_of(sequence: str) -> int | None:
     """The instance of a rendered twin; None for any other sequence."""
-    return parse_synthetic_id(sequence).instance if sequence.startswith("synthetic/") else None
+    return parse_synthetic_id(sequence).scene if sequence.startswith("synthetic/") else None
 
 
 def instance_range(text: str) -> range:
@@ -317,8 +317,8 @@ def is_identity(tracker: str) -> bool:
 
 
 def short(twin: str) -> str:
-    """``synthetic/walking_xyz@0?frames=600`` -> ``walking_xyz``; other instances keep their number."""
-    return twin.removeprefix("synthetic/").partition("?")[0].removesuffix("@0")
+    """``synthetic/walking_xyz?scene=0&frames=600`` -> ``walking_xyz``; other scenes keep their number."""
+    return twin.removeprefix("synthetic/").partition("&")[0].removesuffix("?scene=0")
 
 
 def main() -> int:

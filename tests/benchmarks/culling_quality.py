@@ -1,6 +1,6 @@
 """Culling quality of `emfoa-oft`, its ablations and other systems, per feature, against exact masks.
 
-    python tests/benchmarks/culling_quality.py [--sequences "synthetic/walking_xyz@100?frames=300" ...]
+    python tests/benchmarks/culling_quality.py [--sequences "synthetic/walking_xyz?scene=100&frames=300" ...]
         [--frames 60:160] [--only emfoa-oft yolo-slam] [--masks oracle] [--cache DIR] [--jobs N]
 
 Every feature of every frame lies on one of three things, by the renderer's exact masks:
@@ -45,7 +45,7 @@ from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 from dynslam_bench.trackers.registry import TRACKERS  # noqa: E402
 
 SEQUENCES = [
-    f"synthetic/walking_{motion}@{100 + number}?frames=300"
+    f"synthetic/walking_{motion}?scene={100 + number}&frames=300"
     for number, motion in enumerate(("xyz", "static", "halfsphere", "rpy"))
 ]
 """Held out, those of the suite `dynamic`: on instances 0-99 the embedded network was trained."""

@@ -35,7 +35,7 @@ TRACKERS_WITH_F = (
     "emfoa-oft-paper", "emfoa-oft-paper-sparse", "emfoa-oft-paper-no-masks", "opf-slam", "chen-slam", "blitz-slam",
     "mor-slam", "sgc-slam", "di-slam", "ds-slam", "sof-slam", "seg-slam",
 )  # fmt: skip
-SEQUENCES = ("synthetic/walking_xyz@100", "synthetic/walking_halfsphere@100")
+SEQUENCES = ("synthetic/walking_xyz?scene=100", "synthetic/walking_halfsphere?scene=100")
 
 
 def measure(tracker: str, sequence: str, frames: tuple[int, int | None], masks: str, cache: str | None) -> np.ndarray:

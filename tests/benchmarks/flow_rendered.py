@@ -31,7 +31,7 @@ def rendered(instance: int, start: int, strides: Sequence[int], count: int, moti
         motion: One of `MOTIONS`; by default the instance's turn.
     """
     motion = motion or MOTIONS[instance % len(MOTIONS)]
-    sequence = open_sequence(f"synthetic/{motion}@{instance}?frames={start + max(strides) + 1}")
+    sequence = open_sequence(f"synthetic/{motion}?scene={instance}&frames={start + max(strides) + 1}")
     frame, camera, poses = sequence[start], sequence.camera, sequence.ground_truth.T_world_cam
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     points = np.unique(np.rint(corners(gray, count)), axis=0).astype(np.float32)
@@ -49,6 +49,6 @@ def rendered(instance: int, start: int, strides: Sequence[int], count: int, moti
         moved = se3.transform(kept_up, camera.unproject(points, np.maximum(z, 0.1)))
         guess = np.where((z > 0)[:, None] & (moved[:, 2:] > 0.1), camera.project(moved), np.nan).astype(np.float32)
         target = cv2.cvtColor(sequence[start + stride].rgb, cv2.COLOR_RGB2GRAY)
-        name = f"{motion}@{instance} +{stride}"
+        name = f"{motion}?scene={instance} +{stride}"
         pairs.append(Pair(name, gray, target, points[seen], truth[seen], guess[seen], start))
     return pairs

@@ -1,6 +1,6 @@
 """Loops on rendered sequences: the same frames without and with loop closing.
 
-    python tests/benchmarks/loops_rendered.py [--sequences synthetic/loop_corridor@3] [--stride 2] [--rivals 5]
+    python tests/benchmarks/loops_rendered.py [--sequences 'synthetic/loop_corridor?scene=3'] [--stride 2] [--rivals 5]
 
 Frames are rendered, their ORB features kept, nothing else. Prints for each back end: frames that count as tracked and
 RMSE of their positions after the best rigid alignment, online and final (with `full`: all of the map refined at the
@@ -107,7 +107,7 @@ def scaled_error(found: Trajectory, truth: Trajectory) -> float | None:
 def main() -> None:
     """Each sequence, with each setting."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", nargs="+", default=["synthetic/loop_corridor@3"])
+    parser.add_argument("--sequences", nargs="+", default=["synthetic/loop_corridor?scene=3"])
     parser.add_argument("--stride", type=int, default=2)
     parser.add_argument("--rivals", type=int, default=0, metavar="RUNS")
     parser.add_argument("--settings", nargs="+", choices=sorted(SETTINGS), default=list(SETTINGS))

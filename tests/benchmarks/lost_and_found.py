@@ -43,9 +43,9 @@ from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
 ROOMS = [
-    *(f"synthetic/sitting_{motion}@{instance}" for motion in ("xyz", "halfsphere", "rpy") for instance in (3, 103)),
-    *(f"synthetic/walking_halfsphere@{instance}" for instance in (3, 103)),
-    *(f"synthetic/loop_room@{instance}?frames=1800" for instance in (3, 103)),
+    *(f"synthetic/sitting_{motion}?scene={scene}" for motion in ("xyz", "halfsphere", "rpy") for scene in (3, 103)),
+    *(f"synthetic/walking_halfsphere?scene={instance}" for instance in (3, 103)),
+    *(f"synthetic/loop_room?scene={instance}&frames=1800" for instance in (3, 103)),
 ]
 BEFORE = {"black": 100, "kidnapped": 200, "carried": 200}
 BACK, AFTER, SOON = 150, 30, 10

@@ -66,7 +66,7 @@ def study_of(case: str, options: argparse.Namespace) -> StudySpec:
     share = max(1, options.scenes // len(kinds))
 
     def scenes(first: int) -> tuple[str, ...]:
-        return tuple(f"synthetic/{kind}@{first}-{first + share - 1}?frames={options.frames}" for kind in kinds)
+        return tuple(f"synthetic/{kind}?scene={first}-{first + share - 1}&frames={options.frames}" for kind in kinds)
 
     return StudySpec(
         name=f"planted-{case}", tracker=f"{Path(__file__).resolve()}:{case.upper()}",

@@ -2,8 +2,8 @@
 
     python tests/benchmarks/readme_pictures.py SITE RESULTS [-o docs/pictures]
 
-`SITE` is a published site (`dynslam-bench report publish`); `RESULTS` holds one run of a tracker that culls, made for
-instance with `dynslam-bench run emfoa-oft synthetic/walking_xyz@100 --frames 0:60`. Headless Chromium draws both.
+`SITE` is a published site (`dynslam-bench report publish`); `RESULTS` holds one run of a tracker that culls, e.g. with
+`dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60`. Headless Chromium draws both.
 """
 
 from __future__ import annotations

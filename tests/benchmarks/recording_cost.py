@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=3)
     asked = parser.parse_args()
-    sequence = f"synthetic/walking_xyz@100?frames={asked.frames}"
+    sequence = f"synthetic/walking_xyz?scene=100&frames={asked.frames}"
     measure(asked.tracker, sequence, False)
     pairs = [[measure(asked.tracker, sequence, rrd) for rrd in (False, True)] for _ in range(asked.rounds)]
     for plain, recorded in pairs:

@@ -41,7 +41,7 @@ TRACKERS = (
     "dai-slam", "di-slam", "huai-slam", "ngd-slam",
 )  # fmt: skip
 EXCERPT = ROOT.parent / "shared/data/bonn/rgbd_bonn_crowd"
-SEQUENCES = ("synthetic/walking_xyz@100", "synthetic/sitting_rpy@101", str(EXCERPT))
+SEQUENCES = ("synthetic/walking_xyz?scene=100", "synthetic/sitting_rpy?scene=101", str(EXCERPT))
 MASKS = f"onnx:{ROOT.parent / 'shared/weights/yolov8n-seg_480x640_fp32.onnx'}"
 
 

@@ -34,7 +34,7 @@ FOLDERS = {
     "fr1_rpy": SHARED / "data/tum/rgbd_dataset_freiburg1_rpy",
     "bonn": SHARED / "data/bonn/rgbd_bonn_crowd",
 }
-FAST = tuple(f"synthetic/fast_{kind}@{{instances}}?frames=120" for kind in ("desk", "rpy", "walking"))
+FAST = tuple(f"synthetic/fast_{kind}?scene={{instances}}&frames=120" for kind in ("desk", "rpy", "walking"))
 OFF = {"backend.tracking.rolling_shutter": False}
 
 

@@ -33,7 +33,7 @@ from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
 from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 
 TWINS = ("walking_xyz", "walking_static", "walking_halfsphere", "walking_rpy")
-DEFAULT = [f"synthetic/{name}@{instance}?frames=200" for instance in (100, 101) for name in TWINS]
+DEFAULT = [f"synthetic/{name}?scene={instance}&frames=200" for instance in (100, 101) for name in TWINS]
 """Held out: on instances 0-99 the embedded network was trained."""
 EMBEDDED = {"segmentation.source": "embedded"}
 PAIRS: dict[str, dict[str, dict[str, object]]] = {

@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=3)
     arguments = parser.parse_args()
     cv2.setNumThreads(arguments.threads)
-    sequence = open_sequence("synthetic/walking_xyz@120?frames=60")
+    sequence = open_sequence("synthetic/walking_xyz?scene=120&frames=60")
     frames = [sequence[index] for index in (30, 31)]
     grays = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY) for frame in frames]
     rows: list[tuple[str, Callable[[], object]]] = []

@@ -29,10 +29,10 @@ NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"
 MARGIN = 0.1
 PARTS = {
     "rendered": tuple(
-        f"synthetic/{instances}?frames=60&offsets=0-1"
+        f"synthetic/{instances}&frames=60&offsets=0-1"
         for instances in (
-            "walking_xyz@160-164", "walking_halfsphere@165-169", "walking_rpy@170-174", "walking_static@175-177",
-            "sitting_xyz@178-179",
+            "walking_xyz?scene=160-164", "walking_halfsphere?scene=165-169", "walking_rpy?scene=170-174",
+            "walking_static?scene=175-177", "sitting_xyz?scene=178-179",
         )
     ),
     "bonn": (f"{SHARED}/data/bonn/rgbd_bonn_crowd?offsets=8-30",),

@@ -1,7 +1,7 @@
 """What is worth steering: how far the poses of an episode move between the ends of each online setting's range.
 
     python tests/benchmarks/steering_authority.py [--trackers emfoa-oft emfoa-oft-no-masks] [--frames 14] [--stride 3]
-        [--scene synthetic/walking_xyz@103] [--prefix flow]
+        [--scene 'synthetic/walking_xyz?scene=103'] [--prefix flow]
 
 Each row is one setting of one tracker, alone: the mean over the frames of the distance in mm between the camera centres
 with the setting at the low end, and at the high end, and with the default, and whether all frames were tracked.
@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument("--trackers", nargs="+", default=["emfoa-oft", "emfoa-oft-no-masks"])
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--stride", type=int, default=STRIDE)
-    parser.add_argument("--scene", default="synthetic/walking_xyz@103")
+    parser.add_argument("--scene", default="synthetic/walking_xyz?scene=103")
     parser.add_argument("--prefix", default="")
     options = parser.parse_args()
     scene = SmallScene(options.scene, options.frames, options.stride)

@@ -23,7 +23,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        sequence = open_synthetic(f"{arguments.id}?frames={arguments.frames}", Path(folder), threads=arguments.threads)
+        chosen = f"{arguments.id}{'&' if '?' in arguments.id else '?'}frames={arguments.frames}"
+        sequence = open_synthetic(chosen, Path(folder), threads=arguments.threads)
         wall, cpu = time.perf_counter(), time.process_time()
         sequence[0]
         print(

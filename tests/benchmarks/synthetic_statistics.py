@@ -130,7 +130,8 @@ def row(name: str, sequence: Sequence, every: int) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ids", nargs="*", default=[*TWIN_IDS, "synthetic/walking_xyz@1", "synthetic/walking_xyz@100"])
+    others = [f"synthetic/walking_xyz?scene={scene}" for scene in (1, 100)]
+    parser.add_argument("ids", nargs="*", default=[*TWIN_IDS, *others])
     parser.add_argument("--every", type=int, default=15)
     parser.add_argument("--cache", type=Path, help="folder of rendered frames; default none are kept")
     parser.add_argument("--rendered", action="store_true", help="leave out the excerpts")

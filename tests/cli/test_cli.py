@@ -146,9 +146,10 @@ def test_sequences_verify(cli, walk, tmp_path):
 
 
 def test_sequences_render(cli, tmp_path):
-    code, out, _ = cli("sequences", "render", "synthetic/sitting_static@1?frames=2", "--data-root", tmp_path / "data")
+    name = "synthetic/sitting_static?scene=1&frames=2"
+    code, out, _ = cli("sequences", "render", name, "--data-root", tmp_path / "data")
     assert code == 0 and Path(out.strip()).is_relative_to(tmp_path / "data")
-    assert len(open_sequence("synthetic/sitting_static@1?frames=2", data_root=tmp_path / "data")) == 2
+    assert len(open_sequence(name, data_root=tmp_path / "data")) == 2
 
 
 def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
@@ -285,8 +286,8 @@ def test_degradation(cli, walk):
 STUDY = """
 name = "tiny"
 tracker = "orb-slam2"
-tune = ["synthetic/sitting_xyz@1?frames=8"]
-held_out = ["synthetic/sitting_xyz@101?frames=8"]
+tune = ["synthetic/sitting_xyz?scene=1&frames=8"]
+held_out = ["synthetic/sitting_xyz?scene=101&frames=8"]
 seeds = [0]
 offsets = [0]
 trials = 2
@@ -307,7 +308,8 @@ def test_a_study(cli, tmp_path):
     assert json.loads(cli("tune", "status", "study.toml", "--json")[1])["complete"] == 2
     assert "has its 2 trials" in cli("tune", "worker", "study.toml")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
-    code, out, _ = cli("run", "orb-slam2", "synthetic/sitting_xyz@1?frames=8", "--settings", "preset.toml", "--json")
+    name = "synthetic/sitting_xyz?scene=1&frames=8"
+    code, out, _ = cli("run", "orb-slam2", name, "--settings", "preset.toml", "--json")
     assert code == 0 and json.loads(out)[0]["status"] == "ok"
     assert cli("tune", "report", "study.toml")[1].splitlines()[0] == found["summary"]["conclusion"]
     Path("study.toml").write_text(STUDY.replace("n_features", "n_featurs"))

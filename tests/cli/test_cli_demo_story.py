@@ -11,7 +11,7 @@ from dynslam_bench.cli.demo_story import PROBE_FRAMES, PROBE_S, estimate, measur
 from dynslam_bench.reports.model.row import RunRow
 
 
-def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz@100?frames=100") -> RunRow:
+def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100") -> RunRow:
     return RunRow(
         run_id=f"{tracker}{sequence}", kind="run here", tracker=tracker, label=tracker, sequence=sequence,
         protocol_id="p", protocol_digest="d", held_ate_m=ate_m,
@@ -29,16 +29,16 @@ def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz@100?f
 def test_the_verdict_is_that_of_the_numbers(culled_m: float, verdict: str) -> None:
     first, *_ = tell([row("orb-slam2", 0.02), row("mask-rcnn", culled_m), row("never-move", 0.1)], [])
     assert first == (
-        f"Where people walk (walking_xyz@100): 20.0 mm without culling (orb-slam2), {1e3 * culled_m:.1f} mm with "
+        f"Where people walk (walking_xyz?scene=100): 20.0 mm without culling (orb-slam2), {1e3 * culled_m:.1f} mm with "
         f"masks of people (mask-rcnn). {verdict}"
     )
 
 
 def test_every_sequence_has_its_sentence_and_what_did_not_run_has_none() -> None:
-    sitting = row("orb-slam2", 0.003, "synthetic/sitting_xyz@104?frames=100")
+    sitting = row("orb-slam2", 0.003, "synthetic/sitting_xyz?scene=104&frames=100")
     lines = tell([sitting, row("orb-slam2", 0.02), row("mask-rcnn", 0.004)], [])
     assert [line.split(":")[0] for line in lines[:2]] == [
-        "Where people walk (walking_xyz@100)", "Where people sit (sitting_xyz@104)"
+        "Where people walk (walking_xyz?scene=100)", "Where people sit (sitting_xyz?scene=104)"
     ]  # fmt: skip
     assert lines[1].endswith("3.0 mm without culling (orb-slam2).") and len(lines) == 3, "no costs without records"
     assert "proves nothing" in lines[-1]

@@ -1,9 +1,15 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
+import functools
+import hashlib
+import http.server
 import json
 import re
+import shutil
 import sys
+import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +17,10 @@ from cli_errors import one_line
 
 from dynslam_bench.cli import output, run_rows, running
 from dynslam_bench.cli.output import progress
+from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.segmentation import build_segmenter
+from dynslam_bench.segmentation.networks import checkpoints
 
 
 def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
@@ -27,6 +37,53 @@ def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
     assert "my control" in cli("runs", "show")[1]
     cli(*command, "--label", "another name")
     assert "another name [constant-velocity" in cli("runs", "show")[1]
+
+
+def test_frames_and_measured_time_are_said_before_the_run(cli, walk):
+    command = ("run", "constant-velocity", walk, "--set")
+    err = cli(*command, "frames=3")[2]
+    assert err.splitlines()[0] == "1 run, 4 frames"
+    err = cli(*command, "frames=4", "--offset", "0", "1")[2]
+    first = err.splitlines()[0]
+    told = re.fullmatch(
+        r"2 runs, 7 frames, about (\S+) (s|ms) \(stored runs on this machine took (\S+) (s|ms) a frame\)", first
+    )
+    assert told, first
+    whole, each = (float(told[n]) * {"s": 1.0, "ms": 0.001}[told[n + 1]] for n in (1, 3))
+    (record,) = [row for row in json.loads(cli("runs", "list", "--json")[1]) if row["settings"] == "frames=3"]
+    measured = json.loads((Path(record["folder"]) / "run.json").read_text())
+    assert each == pytest.approx(measured["wall_s"] / 4, rel=0.06) and whole == pytest.approx(7 * each, rel=0.12)
+    assert "frames" not in cli(*command, "frames=4")[2], "it is stored: nothing will be tracked"
+    assert cli(*command, "frames=5", "--json")[2] == ""
+
+
+def test_a_row_names_files_without_their_folders(cli, walk):
+    command = ("run", f"replay:{walk / 'groundtruth.txt'}", walk, "--set", "tolerance_s=0.02")
+    code, out, _ = cli(*command)
+    assert code == 0 and "replay:groundtruth.txt" in out and str(walk) not in out
+    (row,) = json.loads(cli(*command, "--json")[1])
+    assert row["tracker"] == f"replay:{walk / 'groundtruth.txt'}", "scripts get the whole name"
+    assert run_rows.shown_cell("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
+        "a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n"
+    )
+
+
+def test_a_recording_without_ground_truth_says_where_its_trajectory_is(cli, walk, tmp_path):
+    shutil.copytree(walk, tmp_path / "mine")
+    (tmp_path / "mine" / "groundtruth.txt").unlink()
+    code, out, err = cli("run", "never-move", "mine")
+    told = err.splitlines()[-1]
+    assert code == 0 and "ok" in out and told.startswith("folder/mine has no ground truth")
+    assert len(read_tum(Path(told.rpartition(": ")[2]))) == 4
+
+
+def test_a_folder_whose_camera_is_not_known_says_how_to_name_it(cli, walk, tmp_path):
+    shutil.copytree(walk, tmp_path / "mine")
+    (tmp_path / "mine" / "camera.toml").rename("cam.toml")
+    code, _, err = cli("run", "never-move", "mine")
+    first, *options = err.splitlines()
+    assert code == 1 and "the camera of" in first and len(options) == 2 and "tum-fr1" in options[0]
+    assert cli("run", "never-move", "mine", "--camera", "cam.toml")[0] == 0
 
 
 def test_runs_list_refuses_what_is_not_there(cli, walk):
@@ -49,6 +106,57 @@ def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk):
         code, _, err = cli(*arguments)
         assert code == 1 and one_line(err)
         assert "there are no runs" in cli("runs", "list")[2]
+
+
+@pytest.fixture
+def published(tmp_path, monkeypatch):
+    """The COCO checkpoint as a file of a server on this machine, and an empty cache; the network is the embedded one.
+
+    Returns the served file; it is requested only where somebody agrees.
+    """
+    served = tmp_path / "served"
+    served.mkdir()
+    content = checkpoints.embedded_weights().read_bytes()
+    (served / "network.pth").write_bytes(content)
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(served))
+    monkeypatch.setattr(http.server.SimpleHTTPRequestHandler, "log_message", lambda *_: None)
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    prefix = hashlib.sha256(content).hexdigest()[:8]
+    stub = replace(checkpoints.COCO, url=f"http://127.0.0.1:{server.server_port}/network.pth", sha256_prefix=prefix)
+    monkeypatch.setattr(build_segmenter.NetworkNotFetched, "checkpoint", stub)
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
+    yield tmp_path / "weights" / stub.file
+    server.shutdown()
+    server.server_close()
+
+
+def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, published, monkeypatch):
+    command = ("run", "mask-rcnn", walk)
+    code, out, err = cli(*command)
+    first, *options = err.splitlines()
+    assert code == 1 and not out and not published.exists() and "there are no runs" in cli("runs", "list")[2]
+    assert first.startswith("error: no masks for 'folder/walk'") and "170 MB" in first
+    assert len(options) == 4 and all(re.match("  - .{20,130}$", option) for option in options)
+    questions = []
+    monkeypatch.setattr(running, "can_ask", lambda: True)
+    monkeypatch.setattr(running.typer, "confirm", lambda text, **_: questions.append(text))
+    assert cli(*command)[0] == 1 and len(questions) == 1 and not published.exists(), "answered no"
+    monkeypatch.setattr(running, "can_ask", lambda: False)
+    code, out, _ = cli(*command, "--yes", "--json")
+    assert code == 0 and published.is_file()
+    (row,) = json.loads(out)
+    assert (row["status"], row["masks"]) == ("ok", "coco")
+    assert cli("run", "mask-rcnn", walk, "--frames", "0:3")[0] == 0, "nobody is asked again"
+
+
+def test_who_agrees_on_a_terminal_gets_the_download(published, monkeypatch, capsys):
+    monkeypatch.setattr(running, "can_ask", lambda: True)
+    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
+    error = build_segmenter.NetworkNotFetched("no masks")
+    assert running.agreed_to_fetch(error.checkpoint)
+    told = capsys.readouterr().err
+    assert "170 MB" in told and error.checkpoint.url in told and str(published.parent) in told
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -84,10 +192,10 @@ def test_sheet_and_video_of_a_stored_run_are_made(cli, walk, tmp_path):
 def test_a_map_that_cannot_be_had_is_said_and_no_success(cli, walk):
     for options in ((), ("--json",)):
         code, _, err = cli("run", "never-move", walk, "--save-map", *options)
-        assert code == 3 and err.startswith("no map.npz: tracker 'never-move' cannot save its map")
-        assert err.count("\n") == 1
+        assert code == 3 and "no map.npz: tracker 'never-move' cannot save its map" in err
+        assert err.count("\n") == (1 if options else 2), "without --json also how many frames it has"
     code, out, err = cli("run", "orb-slam2", walk, "--save-map")
-    assert code == 0 and err == "" and "map.npz" in out
+    assert code == 0 and "no map.npz" not in err and "map.npz" in out
 
 
 def test_a_run_that_was_lost_is_no_success(cli, walk):

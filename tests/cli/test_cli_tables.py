@@ -11,7 +11,7 @@ from dynslam_bench.reports.tables.table import Column, Table, TableCell
 
 ROWS = [
     ["run", "tracker", "sequence", "ATE (m)", "masks"],
-    ["0123456789abcdef", "emfoa-oft", "synthetic/walking_halfsphere@0?frames=600", "0.01234", "embedded"],
+    ["0123456789abcdef", "emfoa-oft", "synthetic/walking_halfsphere?scene=0&frames=600", "0.01234", "embedded"],
 ]
 
 

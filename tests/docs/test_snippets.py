@@ -20,7 +20,7 @@ SHORTER = {
     "frames=[0, 150]": "frames=[0, 4]",
     "offset=n) for n in range(3)": "offset=n, frames=(0, 4)) for n in range(2)",
     '"bonn/crowd",\n    frames="0:300"': '"synthetic/walking_xyz?frames=4",\n    frames="0:3"',
-    "@3?frames=150": "@3?frames=4",
+    "?scene=3&frames=150": "?scene=3&frames=4",
     "[40]": "[2]",
     "(40)": "(2)",
     '"synthetic/walking_xyz", cache_root': '"synthetic/walking_xyz?frames=2", cache_root',
@@ -44,7 +44,7 @@ BEFORE = {
 """What a reader has done already: a run is stored."""
 ELSEWHERE = {
     "docs/environments.md": (2, "tests/runs/test_runs_tables.py"),
-    "docs/plugins.md": (6, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/plugins.md": (7, "tests/trackers/adapters/test_adapter_docs.py"),
     "docs/reports.md": (1, "tests/reports/test_reports_tables.py"),
     "docs/tuning.md": (2, "tests/tuning/test_python_study.py"),
 }

@@ -293,7 +293,7 @@ def test_asking_for_the_final_trajectory_changes_nothing_of_what_filters_see(mon
     runs = []
     for asks in (True, False):
         shown.clear()
-        env = SlamEnv("synthetic/fast_walking@100?frames=14", "orb-slam2", settings=settings)
+        env = SlamEnv("synthetic/fast_walking?scene=100&frames=14", "orb-slam2", settings=settings)
         env.reset(seed=0)
         for _ in range(13):
             if asks:

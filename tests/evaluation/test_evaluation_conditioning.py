@@ -65,8 +65,8 @@ def path_of(name: str) -> np.ndarray:
     [
         ("tum/rgbd_dataset_freiburg1_xyz", 0.002),
         ("bonn/rgbd_bonn_crowd", 0.003),
-        ("synthetic/walking_xyz@100-3f02d1f6", 0.01),
-        ("synthetic/walking_halfsphere@100-3f02d1f6", 0.02),
+        ("synthetic/walking_xyz?scene=100-3f02d1f6", 0.01),
+        ("synthetic/walking_halfsphere?scene=100-3f02d1f6", 0.02),
     ],
 )
 def test_ordinary_paths_do_not(name: str, sigma_m: float) -> None:

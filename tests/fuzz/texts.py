@@ -345,7 +345,7 @@ TARGETS = [
         "ids of sequences",
         _of_text(_ids),
         lambda: [
-            b"synthetic/walking_xyz@3?frames=60&noise=2",
+            b"synthetic/walking_xyz?scene=3&frames=60&noise=2",
             b"3:60",
             b"3:2",
             b"x:",

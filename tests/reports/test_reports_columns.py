@@ -6,6 +6,7 @@ from reports_rows import PROTOCOL, row, rows_of
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.columns import name_columns, shortened
+from dynslam_bench.reports.model.labels import make_labels
 from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.rows import load_runs
 from dynslam_bench.runs.storage.store import RunStore
@@ -78,13 +79,15 @@ def test_sequences_are_grouped_from_static_to_dynamic():
 
 
 def test_names_lose_what_all_share():
-    names = ["synthetic/walking_xyz@0?frames=60", "synthetic/sitting_xyz@0?frames=60"]
+    names = ["synthetic/walking_xyz?scene=0&frames=60", "synthetic/sitting_xyz?scene=0&frames=60"]
     assert list(shortened(names).values()) == ["walking_xyz", "sitting_xyz"]
-    assert list(shortened([*names, "synthetic/sitting_xyz@1"]).values()) == [
-        "walking_xyz@0?frames=60",
-        "sitting_xyz@0?frames=60",
-        "sitting_xyz@1",
+    assert list(shortened([*names, "synthetic/sitting_xyz?scene=1"]).values()) == [
+        "walking_xyz?scene=0&frames=60",
+        "sitting_xyz?scene=0&frames=60",
+        "sitting_xyz?scene=1",
     ]
+    rendered = [f"synthetic/walking_xyz?scene={scene}&frames=60" for scene in (100, 101)]
+    assert list(shortened(rendered).values()) == ["walking_xyz?scene=100", "walking_xyz?scene=101"]
     assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
     assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
     assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}
@@ -103,3 +106,25 @@ def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tm
     (mine,) = (each for each in rows if (each.tracker, each.sequence) == ("mine", "s/a"))
     assert run_command(mine) == f"dynslam-bench run {given} s/a --set loop=true"
     assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
+
+
+def test_labels_name_files_without_their_folders_unless_two_would_be_alike(tmp_path):
+    def labels(*sources):
+        rows = [row(tracker="mask-rcnn", variant={"segmentation.source": source}) for source in sources]
+        return sorted(make_labels(rows).values())
+
+    assert labels("onnx:/home/me/nets/yolov8n-seg.onnx", "recorded:/data/masks/", "none") == [
+        f"MASK-RCNN · segmentation.source={each}" for each in ("none", "onnx:yolov8n-seg", "recorded:masks")
+    ]
+    assert labels("onnx:/a/best.onnx", "onnx:/b/best.onnx") == [
+        f"MASK-RCNN · segmentation.source=onnx:/{folder}/best.onnx" for folder in "ab"
+    ]
+
+
+def test_the_board_names_masks_without_their_folders(tmp_path):
+    store = RunStore(tmp_path / "r")
+    add_run(store, "mask-rcnn", "s/a", masks="onnx:/home/me/nets/yolov8n-seg.onnx")
+    add_run(store, "orb-slam2", "s/a")
+    paths = build_report(store, tmp_path / "report")
+    assert "onnx:yolov8n-seg masks" in paths.markdown.read_text()
+    assert "/home/me" not in paths.markdown.read_text() + paths.csv["leaderboard"].read_text()

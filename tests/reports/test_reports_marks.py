@@ -14,7 +14,7 @@ from dynslam_bench.runs.storage.store import RunStore
 from dynslam_bench.segmentation.training_set import seen_in_training
 from dynslam_bench.trackers import TRACKERS
 
-OLD, NEW = "synthetic/walking_xyz@3", "synthetic/walking_xyz@103"
+OLD, NEW = "synthetic/walking_xyz?scene=3", "synthetic/walking_xyz?scene=103"
 
 
 @pytest.fixture
@@ -33,8 +33,8 @@ def store(tmp_path):
     ("source", "sequence", "seen"),
     [
         ("embedded", "synthetic/walking_xyz", True),
-        ("embedded", "synthetic/sitting_rpy@99?frames=50&noise=4", True),
-        ("embedded", "synthetic/sitting_rpy@100?frames=50", False),
+        ("embedded", "synthetic/sitting_rpy?scene=99&frames=50&noise=4", True),
+        ("embedded", "synthetic/sitting_rpy?scene=100&frames=50", False),
         ("embedded", "synthetic/somebody_elses", False),
         ("embedded", "tum/fr3/walking_xyz", False),
         ("oracle", "synthetic/walking_xyz", False),
@@ -68,15 +68,15 @@ def test_every_format_carries_the_mark(store, tmp_path, rank_seen):
     paths = build_report(store, tmp_path / "report", rank_seen=rank_seen)
     markdown, latex, page = (path.read_text() for path in (paths.markdown, paths.latex, paths.html))
     rule = "rank, since that was asked for" if rank_seen else "do not rank"
-    assert "trained on this very scene (the embedded one, on rendered instances 0-99)" in markdown and rule in markdown
+    assert "trained on this very scene (the embedded one, on rendered scenes 0-99)" in markdown and rule in markdown
     table = markdown.split("## Absolute trajectory")[1].split("\n## ")[0]
     (line,) = [line for line in table.splitlines() if line.startswith("| mask-rcnn §")]
     held_out, trained, where = [cell.strip() for cell in line.split("|")[2:-1]]
     assert "§" not in held_out and "**" in held_out and "§" in trained and ("**" in trained) is rank_seen
-    assert where == "walking\\_xyz@3"
+    assert where == "walking\\_xyz?scene=3"
     assert page.count("mask-rcnn §") > 3 and "mask-rcnn \\S{}" in latex and "§" not in latex
     errors = pd.read_csv(paths.csv["per_sequence"])
-    assert errors.set_index("tracker")["§ trained on"]["mask-rcnn §"] == "walking_xyz@3"
+    assert errors.set_index("tracker")["§ trained on"]["mask-rcnn §"] == "walking_xyz?scene=3"
     runs = pd.read_csv(paths.csv["runs"])
     marked = runs[runs["seen_in_training"]]
     assert set(zip(marked["tracker"], marked["sequence"], strict=True)) == {("mask-rcnn", OLD), ("dynaslam", OLD)}
@@ -87,7 +87,7 @@ def test_every_format_carries_the_mark(store, tmp_path, rank_seen):
 def test_run_says_it_in_one_line(store):
     records = [store.get(run) for run in store.ids()]
     assert seen_note(records).startswith("2 of 8 runs have masks of a network that was trained on their scene")
-    assert seen_note(records).endswith("e.g. synthetic/walking_xyz@100") and "\n" not in seen_note(records)
+    assert seen_note(records).endswith("e.g. synthetic/walking_xyz?scene=100") and "\n" not in seen_note(records)
     assert seen_note([record for record in records if record.sequence.id == NEW]) == ""
 
 

@@ -73,7 +73,8 @@ def test_a_part_has_one_run_id_however_it_is_written() -> None:
         return resolve(RunSpec(tracker="never-move", sequence=f"synthetic/walking_xyz{sequence}", **change)).run_id
 
     first = ids("", frames="0:60")
-    assert ids("?frames=60") == ids("@0?frames=60") == ids("@000", frames=(0, 60)) == ids("?frames=90", frames=":60")
+    assert ids("?frames=60") == ids("?scene=0&frames=60") == ids("?frames=90", frames=":60")
+    assert ids("@0?frames=60") == ids("?scene=000", frames=(0, 60)) == first
     assert ids("?frames=60") == first != ids("?frames=61")
     assert len({first, ids("?frames=60&noise=1"), ids("?frames=60&noise=2"), ids("?frames=60", offset=1)}) == 4
 

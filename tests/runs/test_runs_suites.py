@@ -23,7 +23,7 @@ def test_every_suite_names_only_what_exists(name: str) -> None:
     suite = load_suite(name)
     assert suite.title and suite.description and suite.name == name
     for sequence in suite.sequences:
-        whole = sequence.partition("@")[0]
+        whole = sequence.partition("?")[0]
         assert whole in sequence_ids() or entry_of(sequence) is not None
         if sequence.startswith("synthetic/"):
             assert parse_synthetic_id(sequence).split == "held-out", "the embedded network was trained on the others"

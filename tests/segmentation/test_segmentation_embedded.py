@@ -14,7 +14,7 @@ AUTO = SegmentationSettings()
 
 def test_auto_means_embedded_on_rendered_sequences():
     assert embedded_weights().stat().st_size < 15e6
-    assert resolve_source(AUTO, "synthetic/walking_xyz@0?frames=60") == "embedded"
+    assert resolve_source(AUTO, "synthetic/walking_xyz?scene=0&frames=60") == "embedded"
     assert len(weights_digest(AUTO, "synthetic/walking_xyz")) == 12
     json = embedded_weights().with_suffix(".json").read_text()
     assert f'"sha256_prefix": "{weights_digest(AUTO, "synthetic/walking_xyz")}"' in json
@@ -22,7 +22,7 @@ def test_auto_means_embedded_on_rendered_sequences():
 
 def test_it_finds_people_of_a_held_out_instance(tmp_path):
     segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz", threads=1)
-    sequence = open_sequence("synthetic/sitting_xyz@120?frames=30", data_root=tmp_path)
+    sequence = open_sequence("synthetic/sitting_xyz?scene=120&frames=30", data_root=tmp_path)
     frame, masks = sequence[5], sequence.masks[5]
     people = np.isin(masks.instances, [k for k, name in masks.class_names.items() if name == "person"])
     found = segmenter.segment(frame)

@@ -97,7 +97,7 @@ def test_suppression_in_rounds_is_the_greedy_one() -> None:
 def test_the_embedded_network_with_fixed_shapes() -> None:
     weights = embedded_weights()
     assert weights is not None
-    frame = open_sequence("synthetic/walking_static@101?frames=40")[20]
+    frame = open_sequence("synthetic/walking_static?scene=101&frames=40")[20]
     segmenter = MaskRCNNSegmenter.from_file(weights, SETTINGS)
     expected = segmenter.segment(frame)
     network = StaticMaskRCNN(segmenter.network, *frame.rgb.shape[:2], score=0.1, iou=SETTINGS.nms_iou)

@@ -21,7 +21,7 @@ ORACLE = SegmentationSettings(source="oracle")
 
 @pytest.fixture(scope="module")
 def sequence():
-    return open_sequence("synthetic/walking_xyz@0?frames=60", frames=(0, 3))
+    return open_sequence("synthetic/walking_xyz?scene=0&frames=60", frames=(0, 3))
 
 
 def test_recorded_masks_are_the_segmenters(sequence, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_numbers_stand_for_classes_in_every_frame(tmp_path: Path) -> None:
 
 def test_the_command_says_how_to_use_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        start(["segmenter", "record", "synthetic/walking_xyz@0?frames=60", str(tmp_path / "m"), "--source", "oracle",
-               "--frames", "0:2"])  # fmt: skip
+        start(["segmenter", "record", "synthetic/walking_xyz?scene=0&frames=60", str(tmp_path / "m"),
+               "--source", "oracle", "--frames", "0:2"])  # fmt: skip
     assert ended.value.code == 0
     assert "2 of 2 frames segmented now; use them with --set segmentation.source=recorded:" in capsys.readouterr().out

@@ -219,11 +219,11 @@ def test_auto(monkeypatch, tmp_path):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     auto = SegmentationSettings()
     monkeypatch.setattr(building, "embedded_weights", lambda: tmp_path / "embedded.pt")
-    assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "embedded"
+    assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "embedded"
     monkeypatch.setattr(building, "embedded_weights", lambda: None)
-    assert resolve_source(auto, "synthetic/walking_xyz@3?frames=60", Masks()) == "oracle"
+    assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "oracle"
     with pytest.raises(
-        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*embedded.*needs no masks"
+        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*without masks: a system"
     ):
         resolve_source(auto, "bonn/crowd")
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")

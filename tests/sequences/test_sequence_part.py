@@ -25,13 +25,13 @@ def test_all_spellings_of_the_same_frames_are_one_part() -> None:
     first = part(f"{WALK}?frames=60")
     spellings = [
         part(WALK, frames="0:60"),
-        part(f"{WALK}@0", frames=(0, 60)),
-        part(f"{WALK}@000?frames=60"),
+        part(f"{WALK}?scene=0", frames=(0, 60)),
+        part(f"{WALK}?scene=000&frames=60"),
         part(f"{WALK}?frames=100", frames=":60"),
         part(f"{WALK}?frames=60", frames="0:90"),
         part(f"{WALK}?frames=60", frames="0:"),
     ]
-    assert all(each == first for each in spellings) and first.id == f"{WALK}@0"
+    assert all(each == first for each in spellings) and first.id == f"{WALK}?scene=0"
     assert part(WALK) == part(f"{WALK}?frames=600")
 
 
@@ -41,7 +41,7 @@ def test_other_frames_instances_strides_and_cameras_are_other_blocks() -> None:
         part(WALK, frames="0:60"),
         part(WALK, frames="1:60"),
         part(WALK, frames="0:60", stride=2),
-        part(f"{WALK}@1", frames="0:60"),
+        part(f"{WALK}?scene=1", frames="0:60"),
         part("synthetic/walking_rpy", frames="0:60"),
     ]
     assert len({each.block for each in others}) == len(others)
@@ -77,10 +77,11 @@ def frame_hash(frame) -> str:
 
 
 def test_a_noise_seed_changes_the_noise_and_nothing_else(tmp_path: Path) -> None:
-    plain, one, two = (open_synthetic(f"{WALK}@3?frames=2{noise}", tmp_path) for noise in ("", "&noise=1", "&noise=2"))
+    ids = [f"{WALK}?scene=3&frames=2{noise}" for noise in ("", "&noise=1", "&noise=2")]
+    plain, one, two = (open_synthetic(name, tmp_path) for name in ids)
     assert frame_hash(plain[1])[:16] == "8ed2db9ef4f896d1", "instances keep their bytes"
     assert len({frame_hash(each[1]) for each in (plain, one, two)}) == 3
-    assert frame_hash(one[1]) == frame_hash(open_synthetic(f"{WALK}@3?frames=2&noise=1", None)[1])
+    assert frame_hash(one[1]) == frame_hash(open_synthetic(f"{WALK}?scene=3&frames=2&noise=1", None)[1])
     assert frame_hash(one[1]) == frame_hash(one[1]), "read back from a folder of its own"
     assert np.array_equal(plain.exact_depth(1), one.exact_depth(1))
     assert np.array_equal(plain.masks[1].instances, one.masks[1].instances)

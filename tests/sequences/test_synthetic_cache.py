@@ -54,9 +54,9 @@ def in_child(code: str, *arguments: object) -> str:
 
 
 def test_pixels_are_the_same_across_processes_and_threads() -> None:
-    here = pixels_hash("synthetic/walking_halfsphere@3", 1)
-    assert in_child(HASHER, "synthetic/walking_halfsphere@3", 3) == here
-    assert pixels_hash("synthetic/walking_halfsphere@4", 1) != here
+    here = pixels_hash("synthetic/walking_halfsphere?scene=3", 1)
+    assert in_child(HASHER, "synthetic/walking_halfsphere?scene=3", 3) == here
+    assert pixels_hash("synthetic/walking_halfsphere?scene=4", 1) != here
 
 
 def test_the_first_read_is_what_later_reads_give(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_frames_do_not_depend_on_the_length(tmp_path: Path) -> None:
 def test_ground_truth_and_digest_need_no_rendering(tmp_path: Path) -> None:
     sequence = open_synthetic("synthetic/sitting_static", tmp_path)
     assert len(sequence.ground_truth) == 600
-    assert sequence.digest() == open_synthetic("synthetic/sitting_static@0", None).digest()
+    assert sequence.digest() == open_synthetic("synthetic/sitting_static?scene=0", None).digest()
     assert not list(tmp_path.iterdir())
     assert "renderer" not in vars(sequence)
 
@@ -217,7 +217,7 @@ def test_tuning_and_held_out_instances_share_nothing() -> None:
 def test_textures_differ_between_instances() -> None:
     def hashes(instance: int) -> dict[str, str]:
         atlas = Scene(
-            parse_synthetic_id(f"synthetic/walking_xyz@{instance}").world(), instance, RenderSettings()
+            parse_synthetic_id(f"synthetic/walking_xyz?scene={instance}").world(), instance, RenderSettings()
         ).atlas()
         ends = [*atlas.level_offset[1:, 0], len(atlas.texels)]
         return {

@@ -33,7 +33,7 @@ def reprojected(sequence, index: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", NEW)
 def test_every_sequence_opens_and_says_what_it_is(name: str) -> None:
-    sequence = open_synthetic(f"{name}@{137 if name.endswith('s') else 41}", None)
+    sequence = open_synthetic(f"{name}?scene={137 if name.endswith('s') else 41}", None)
     assert isinstance(sequence, Sequence)
     parsed = parse_synthetic_id(sequence.id)
     assert parse_synthetic_id(str(parsed)) == parsed and parsed.version >= 1
@@ -194,7 +194,7 @@ def test_splits_share_no_place_of_any_thing() -> None:
     def places(instance: int) -> set[tuple[float, ...]]:
         found = set()
         for variant in ("box_obstructing", "trolley", "kidnapped"):
-            (body,) = parse_synthetic_id(f"synthetic/objects_{variant}@{instance}").world().bodies
+            (body,) = parse_synthetic_id(f"synthetic/objects_{variant}?scene={instance}").world().bodies
             found |= {(variant, key.x, key.y, key.z, key.yaw) for key in body.path.args[0][2:4]}
         return found
 

@@ -17,7 +17,7 @@ V, U = np.mgrid[0:480, 0:640].astype(float)
 
 @pytest.fixture(scope="module")
 def walking():
-    return open_synthetic("synthetic/walking_xyz@1", None, threads=1)
+    return open_synthetic("synthetic/walking_xyz?scene=1", None, threads=1)
 
 
 def reprojected(sequence, index: int, other: int) -> np.ndarray:
@@ -66,7 +66,7 @@ def test_flow_and_back_returns(walking) -> None:
 
 
 def test_colours_follow_the_flow() -> None:
-    sequence = open_synthetic("synthetic/walking_xyz@0", None, settings=CLEAN, threads=1)
+    sequence = open_synthetic("synthetic/walking_xyz?scene=0", None, settings=CLEAN, threads=1)
     index = 72
     flow, now, after = sequence.flow(index), sequence[index].rgb.astype(float), sequence[index + 1].rgb.astype(float)
     x, y = U + flow[..., 0], V + flow[..., 1]
@@ -117,7 +117,7 @@ def test_hits_lie_on_their_surfaces(walking) -> None:
 
 
 def test_depth_without_noise_is_exact_up_to_the_files_units() -> None:
-    sequence = open_synthetic("synthetic/sitting_rpy@2", None, settings=CLEAN, threads=1)
+    sequence = open_synthetic("synthetic/sitting_rpy?scene=2", None, settings=CLEAN, threads=1)
     assert np.abs(sequence[40].depth - sequence.exact_depth(40)).max() <= 0.5 / 5000 + 1e-6
 
 
@@ -158,7 +158,7 @@ def test_every_twin_is_a_sequence_with_plausible_motion(name: str) -> None:
 
 
 def test_people_move_and_chairs_only_when_touched() -> None:
-    sequence = open_synthetic("synthetic/walking_static@4", None)
+    sequence = open_synthetic("synthetic/walking_static?scene=4", None)
     moving = [sequence.scene.moving(i) for i in range(0, 600, 5)]
     assert moving[0] == frozenset()
     share = {k: np.mean([k in ids for ids in moving]) for k in (1, 2, 3, 4)}
@@ -180,7 +180,8 @@ def test_controls(people: str, persons: bool) -> None:
 
 @pytest.mark.parametrize("option", ["lighting_change", "glare", "shadow"])
 def test_lighting_options_change_colours_only(option: str, walking) -> None:
-    sequence = open_synthetic("synthetic/walking_xyz@1", None, settings=RenderSettings(**{option: True}), threads=1)
+    settings = RenderSettings(**{option: True})
+    sequence = open_synthetic("synthetic/walking_xyz?scene=1", None, settings=settings, threads=1)
     changed, plain = sequence[45], walking[45]
     assert np.abs(changed.rgb.astype(int) - plain.rgb).mean() > 3
     assert np.array_equal(sequence.exact_depth(45), walking.exact_depth(45))
@@ -189,7 +190,7 @@ def test_lighting_options_change_colours_only(option: str, walking) -> None:
 
 @pytest.mark.parametrize("instance", [0, 55, 100, 199])
 def test_people_fill_enough_of_walking_and_leave_enough_free(instance: int) -> None:
-    sequence = open_synthetic(f"synthetic/walking_xyz@{instance}", None, threads=1)
+    sequence = open_synthetic(f"synthetic/walking_xyz?scene={instance}", None, threads=1)
     people, moving = [], []
     for index in range(5, 600, 54):
         masks = sequence.masks[index]

@@ -11,25 +11,27 @@ def test_the_eight_twins_exist() -> None:
     assert len(TWIN_IDS) == 8
     for name in TWIN_IDS:
         parsed = parse_synthetic_id(name)
-        assert (parsed.instance, parsed.frames) == (0, 600)
+        assert (parsed.scene, parsed.frames) == (0, 600)
         assert parse_synthetic_id(str(parsed)) == parsed
 
 
-def test_instance_and_length_are_read() -> None:
-    parsed = parse_synthetic_id("synthetic/sitting_rpy@107?frames=33")
+@pytest.mark.parametrize("form", ["?scene=107&frames=33", "?frames=33&scene=107", "@107?frames=33"])
+def test_scene_and_length_are_read(form: str) -> None:
+    parsed = parse_synthetic_id(f"synthetic/sitting_rpy{form}")
     assert parsed == SyntheticId("sitting", "rpy", 107, 33)
     assert parsed.split == "held-out"
-    assert str(parsed) == "synthetic/sitting_rpy@107?frames=33"
+    assert str(parsed) == "synthetic/sitting_rpy?scene=107&frames=33"
 
 
 @pytest.mark.parametrize("query", ["frames=33&noise=5", "noise=5&frames=33", "noise=005&frames=033"])
 def test_a_noise_seed_is_read_in_any_order(query: str) -> None:
-    parsed = parse_synthetic_id(f"synthetic/sitting_rpy@107?{query}")
+    parsed = parse_synthetic_id(f"synthetic/sitting_rpy?scene=107&{query}")
     assert parsed == SyntheticId("sitting", "rpy", 107, 33, noise=5)
-    assert str(parsed) == "synthetic/sitting_rpy@107?frames=33&noise=5" and parse_synthetic_id(str(parsed)) == parsed
-    assert parsed.whole == "synthetic/sitting_rpy@107?noise=5"
+    assert str(parsed) == "synthetic/sitting_rpy?scene=107&frames=33&noise=5"
+    assert parse_synthetic_id(str(parsed)) == parsed
+    assert parsed.whole == "synthetic/sitting_rpy?scene=107&noise=5"
     assert parse_synthetic_id("synthetic/sitting_rpy?noise=5") == SyntheticId("sitting", "rpy", noise=5)
-    assert parse_synthetic_id("synthetic/sitting_rpy").noise is None, "the instance's own noise"
+    assert parse_synthetic_id("synthetic/sitting_rpy").noise is None, "the scene's own noise"
 
 
 @pytest.mark.parametrize(
@@ -42,10 +44,14 @@ def test_a_noise_seed_is_read_in_any_order(query: str) -> None:
         ("synthetic/walking_xyz?", "unknown option ''"),
         ("synthetic/walking_xy", "did you mean 'synthetic/walking_xyz'"),
         ("synthetic/Walking-static", "did you mean 'synthetic/walking_static'"),
+        ("synthetic/walking_xyz?scene=200", "0 to 199"),
+        ("synthetic/walking_xyz?scene=", "scene ''"),
+        ("synthetic/walking_xyz?scene=0-3", "scene '0-3'"),
+        ("synthetic/walking_xyz@40?scene=40", "names scene twice"),
         ("synthetic/walking_xyz@200", "0 to 199"),
         ("synthetic/walking_xyz@-1", "0 to 199"),
-        ("synthetic/walking_xyz@", "instance ''"),
-        ("synthetic/walking_xyz@1.5", "instance '1.5'"),
+        ("synthetic/walking_xyz@", "scene ''"),
+        ("synthetic/walking_xyz@1.5", "scene '1.5'"),
         ("synthetic/walking_xyz?frames=0", "from 1 to"),
         ("synthetic/walking_xyz?frames=many", "frames 'many'"),
         ("synthetic/walking_xyz?frame=3", "?frames=N"),

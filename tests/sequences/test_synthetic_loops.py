@@ -16,8 +16,8 @@ def walk_of(name: str):
 @pytest.mark.parametrize(("shape", "lap_m"), [("room", 20), ("corridor", 60), ("rooms", 120)])
 @pytest.mark.parametrize("instance", [0, 131])
 def test_laps_have_their_length_and_are_walked_more_than_once(shape: str, lap_m: float, instance: int) -> None:
-    sequence = open_synthetic(f"synthetic/loop_{shape}@{instance}", None)
-    walk = walk_of(f"synthetic/loop_{shape}@{instance}")
+    sequence = open_synthetic(f"synthetic/loop_{shape}?scene={instance}", None)
+    walk = walk_of(f"synthetic/loop_{shape}?scene={instance}")
     places = walk.at(np.linspace(0.0, walk.lap_s, 20 * len(walk.control) + 1))
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).sum() == pytest.approx(lap_m, rel=0.12)
     assert 1.1 * walk.lap_s < len(sequence) / 30 < 10_000 / 30 and len(sequence) >= 2000
@@ -33,22 +33,22 @@ def test_laps_have_their_length_and_are_walked_more_than_once(shape: str, lap_m:
 
 
 def test_furniture_is_moved_out_of_sight_and_nowhere_else() -> None:
-    sequence = open_synthetic("synthetic/loop_room_moved@1", None, threads=1)
-    lap_s = walk_of("synthetic/loop_room_moved@1").lap_s
+    sequence = open_synthetic("synthetic/loop_room_moved?scene=1", None, threads=1)
+    lap_s = walk_of("synthetic/loop_room_moved?scene=1").lap_s
     half_laps = {(body.path.args[1] + (k + 0.5) * lap_s) * 30 for body in sequence.scene.world.bodies for k in (0, 1)}
     steps = {i: sequence.scene.moving(i) for i in (int(np.ceil(t)) for t in half_laps if t < len(sequence))}
     assert len(steps) >= 6 and all(steps.values()), "most pieces move at least once"
     for index, ids in steps.items():
         assert not np.isin(sequence.renderer.geometry(index)[1], list(ids)).any(), f"frame {index} sees {ids} jump"
         assert not np.isin(sequence.renderer.geometry(index - 1)[1], list(ids)).any(), f"frame {index} sees {ids} jump"
-    still = open_synthetic("synthetic/loop_room@1", None, threads=1)
+    still = open_synthetic("synthetic/loop_room?scene=1", None, threads=1)
     assert not any(still.scene.moving(i) for i in steps)
     assert np.array_equal(still.renderer.geometry(40)[0], sequence.renderer.geometry(40)[0]), "one lap is the same"
 
 
 def test_repeated_walls_share_their_textures_and_others_do_not() -> None:
     def names(variant: str) -> set[str]:
-        world = parse_synthetic_id(f"synthetic/loop_{variant}@3").world()
+        world = parse_synthetic_id(f"synthetic/loop_{variant}?scene=3").world()
         return {name for row in world.room.texture for name in row if name.startswith("poster")}
 
     assert len(names("corridor")) > 40
@@ -72,7 +72,7 @@ def test_rooms_show_something_wherever_the_camera_turns() -> None:
 
 @pytest.mark.parametrize("variant", WALKS)
 def test_the_camera_meets_nothing(variant: str) -> None:
-    sequence = open_synthetic(f"synthetic/loop_{variant}@100", None, threads=1)
+    sequence = open_synthetic(f"synthetic/loop_{variant}?scene=100", None, threads=1)
     least = [sequence.exact_depth(int(i))[::8, ::8].min() for i in np.linspace(3, len(sequence) - 1, 5)]
     assert min(least) > 0.2
     assert min(sequence.exact_depth(7)[::8, ::8].ravel()) > 0, "the room is closed"

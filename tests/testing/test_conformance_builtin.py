@@ -85,7 +85,7 @@ def test_sequences():
 
 
 def test_rendered_sequences(tmp_path):
-    check_sequence(open_sequence("synthetic/sitting_rpy@2?frames=5", data_root=tmp_path))
+    check_sequence(open_sequence("synthetic/sitting_rpy?scene=2&frames=5", data_root=tmp_path))
 
 
 @pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")

@@ -30,7 +30,7 @@ def test_missing_packages_extras_and_weights_are_named_with_a_way_to_get_them(mo
     found = {(each.part, each.name): each for each in examine()}
     assert found["package", "numpy"].state == "1.2.3" and not found["package", "numpy"].missing
     assert found["package", "pandas"].missing and "pip install" in found["package", "pandas"].hint
-    assert found["extra", "gtsam"].hint == "pip install 'dynslam-bench[gtsam]'"
+    assert found["extra", "gtsam"].hint == "pip install '.[gtsam]' in the checkout of dynslam-bench"
     assert ("extra", "lint") not in found
     coco = found["weights", "coco"]
     assert coco.missing and "https://" in coco.hint and str(tmp_path) in coco.hint

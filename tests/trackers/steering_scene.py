@@ -31,8 +31,10 @@ class SmallScene:
         camera: At half the resolution.
     """
 
-    def __init__(self, name: str = "synthetic/walking_xyz@103", frames: int = FRAMES, stride: int = STRIDE) -> None:
-        whole = open_sequence(f"{name}?frames={frames * stride}")
+    def __init__(
+        self, name: str = "synthetic/walking_xyz?scene=103", frames: int = FRAMES, stride: int = STRIDE
+    ) -> None:
+        whole = open_sequence(f"{name}&frames={frames * stride}")
         self.id = whole.id
         self.camera = whole.camera.resized(whole.camera.width // 2, whole.camera.height // 2)
         self.frames = []

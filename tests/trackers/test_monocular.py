@@ -52,7 +52,7 @@ def test_sequences_without_depth_are_for_monocular_trackers_alone(scene):
     scene.has_depth = False
     try:
         check_sensors(TRACKERS.get("emfoa-oft-mono"), scene)
-        with pytest.raises(TrackerError, match=r"'emfoa-oft' needs depth, and .*walking_xyz@103.* colour images alone"):
+        with pytest.raises(TrackerError, match=r"'emfoa-oft' needs depth, and .*walking_xyz\?scene=103.* colour"):
             check_sensors(TRACKERS.get("emfoa-oft"), scene)
     finally:
         del scene.has_depth

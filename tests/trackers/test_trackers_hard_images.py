@@ -24,7 +24,7 @@ END = 34
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory):
-    return open_synthetic(f"synthetic/sitting_xyz@2?frames={FRAMES}", tmp_path_factory.mktemp("rendered"))
+    return open_synthetic(f"synthetic/sitting_xyz?scene=2&frames={FRAMES}", tmp_path_factory.mktemp("rendered"))
 
 
 def track(sequence, change: Callable[[Frame], Frame], bad: range = BAD):

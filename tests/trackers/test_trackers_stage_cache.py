@@ -18,7 +18,7 @@ FRAMES = 4
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory):
-    return open_synthetic(f"synthetic/walking_xyz@5?frames={FRAMES}", tmp_path_factory.mktemp("rendered"))
+    return open_synthetic(f"synthetic/walking_xyz?scene=5&frames={FRAMES}", tmp_path_factory.mktemp("rendered"))
 
 
 def run(sequence, cache: Path | None, **settings: object):

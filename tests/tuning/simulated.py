@@ -21,8 +21,8 @@ from dynslam_bench.tuning.evaluate import Outcome
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE, HELD_OUT = (
-    "synthetic/walking_xyz@0-11?frames=20&offsets=0-1",
-    "synthetic/walking_xyz@100-107?frames=20&offsets=0-2",
+    "synthetic/walking_xyz?scene=0-11&frames=20&offsets=0-1",
+    "synthetic/walking_xyz?scene=100-107&frames=20&offsets=0-2",
 )
 STARTS_SD = 0.28
 """Standard deviation of the log ratio of two runs in one scene: measured 0.24 to 0.31 for real trackers."""

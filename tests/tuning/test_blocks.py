@@ -10,7 +10,7 @@ import pytest
 import toy_tracker
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.tuning.blocks import Block, parse_blocks
+from dynslam_bench.tuning.blocks import Block, parse_blocks, scenes
 from dynslam_bench.tuning.design import design_of, fresh_starts, with_more_starts
 from dynslam_bench.tuning.splits import check_splits
 from dynslam_bench.tuning.study_file import StudySpec
@@ -18,16 +18,18 @@ from dynslam_bench.tuning.study_file import StudySpec
 WALK = "synthetic/walking_xyz"
 
 
-def test_a_text_names_instances_lengths_and_starts() -> None:
-    blocks = parse_blocks(f"{WALK}@0-1,7?frames=80&offsets=0-4")
+def test_a_text_names_scenes_lengths_and_starts() -> None:
+    blocks = parse_blocks(f"{WALK}?scene=0-1,7&frames=80&offsets=0-4")
     assert len(blocks) == 15
-    assert blocks[0] == Block(f"{WALK}@0?frames=80") and blocks[-1] == Block(f"{WALK}@7?frames=80", offset=4)
-    assert list(dict.fromkeys(block.scene for block in blocks)) == [f"{WALK}@0", f"{WALK}@1", f"{WALK}@7"]
+    assert blocks[0] == Block(f"{WALK}?scene=0&frames=80")
+    assert blocks[-1] == Block(f"{WALK}?scene=7&frames=80", offset=4)
+    assert list(scenes(blocks)) == [f"{WALK}?scene=0", f"{WALK}?scene=1", f"{WALK}?scene=7"]
+    assert parse_blocks(f"{WALK}@0-1,7?frames=80&offsets=0-4") == blocks
 
 
 @pytest.mark.parametrize("text", [
     "bonn/crowd[0:120]", "bonn/crowd[40:]?offsets=2,5&stride=2", "bonn/crowd?frames=120&degrade=blur:0.5,glare:0.2",
-    f"{WALK}@3[10:40]?frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
+    f"{WALK}[10:40]?scene=3&frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
 ])  # fmt: skip
 def test_what_a_block_prints_is_read_as_that_block(text: str) -> None:
     blocks = parse_blocks(text)
@@ -49,11 +51,13 @@ def test_parts_strides_and_degradation_reach_the_run() -> None:
     [
         ("bonn/crowd[0:10", 'names no blocks.*write it as "bonn/crowd'),
         ("bonn/crowd[9:3]", "9:3 is no range of frames"),
-        (f"{WALK}@5-2", "'5-2' of .* is neither a number nor a range"),
-        (f"{WALK}@1,0-2", "names a number twice"),
+        (f"{WALK}?scene=5-2", "'5-2' of .* is neither a number nor a range"),
+        (f"{WALK}?scene=1,0-2", "names a number twice"),
         ("bonn/crowd?offset=3", "unknown option 'offset=3'.*offsets"),
         ("bonn/crowd?stride=2&stride=3", "names stride twice"),
-        ("bonn/crowd?noise=3", "noise is a draw of rendered sequences only"),
+        ("bonn/crowd?noise=3", "rendered sequences alone have a noise"),
+        ("bonn/crowd?scene=3", "rendered sequences alone have a scene"),
+        (f"{WALK}@3?scene=3", "names its scenes twice"),
         ("bonn/crowd[0:9]?frames=3", "names its frames twice"),
         ("bonn/crowd?degrade=blurr:0.3", "unknown degradation 'blurr'.*'blur'"),
         ("bonn/crowd?degrade=blur:3", "'blur' is 3.0, expected a strength"),
@@ -105,14 +109,14 @@ def test_blocks_of_one_recording_are_apart_or_repeats(tmp_path: Path) -> None:
 
 
 def test_the_default_runs_from_three_starts_and_the_choice_is_made_on_unseen_blocks(tmp_path: Path) -> None:
-    few = parse_blocks(f"{WALK}@0-3?frames=20&offsets=0,3")
-    assert sorted(block.offset for block in with_more_starts(few) if block.scene.endswith("@0")) == [0, 1, 3]
+    few = parse_blocks(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
+    assert sorted(block.offset for block in with_more_starts(few) if block.scene.endswith("?scene=0")) == [0, 1, 3]
     fresh = fresh_starts(few)
     assert [block.offset for block in fresh[:2]] == [1, 2] and not {b.offset for b in fresh} & {0, 3}
-    spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}@0-3?frames=20",), recorded=())
+    spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}?scene=0-3&frames=20",), recorded=())
     design = design_of(spec)
     assert {block.scene for block in design.confirm} == {block.scene for block in design.race}
-    many = design_of(spec.model_copy(update={"tune": (f"{WALK}@0-11?frames=20",)}))
+    many = design_of(spec.model_copy(update={"tune": (f"{WALK}?scene=0-11&frames=20",)}))
     confirm, race = ({block.scene for block in blocks} for blocks in (many.confirm, many.race))
     assert len(confirm) == 4 and len(race) == 8 and not confirm & race
     assert len({block.scene for block in many.race[:8]}) == 8, "a growing set takes one of each scene in turn"

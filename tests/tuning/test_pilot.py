@@ -24,7 +24,7 @@ def logs(rng: np.random.Generator, scenes: int, starts: int, within: float, betw
     for scene in range(scenes):
         own = rng.normal(0, between)
         for start in range(starts):
-            found[Block(f"synthetic/walking_xyz@{scene}", offset=start)] = own + rng.normal(0, within)
+            found[Block(f"synthetic/walking_xyz?scene={scene}", offset=start)] = own + rng.normal(0, within)
     return found
 
 
@@ -32,7 +32,7 @@ def test_the_spread_between_starts_and_between_scenes_is_found_again() -> None:
     rng = np.random.default_rng(0)
     found = np.array([np.square(spread(logs(rng, 6, 3, 0.3, 0.2))) for _ in range(400)]).mean(axis=0)
     assert found[0] == pytest.approx(0.09, rel=0.05) and found[1] == pytest.approx(0.04, rel=0.15)
-    within, between = spread({Block("synthetic/walking_xyz@0"): 0.1, Block("synthetic/walking_xyz@1"): 0.3})
+    within, between = spread({Block("synthetic/walking_xyz?scene=0"): 0.1, Block("synthetic/walking_xyz?scene=1"): 0.3})
     assert within == 0 and between == pytest.approx(math.sqrt(0.02))
 
 
@@ -67,7 +67,7 @@ def test_a_pilot_measures_what_was_put_in(tmp_path: Path) -> None:
 
 
 def test_a_hopeless_study_is_refused_with_what_it_would_take(tmp_path: Path) -> None:
-    spec = make_spec(pilot=True, held_out=["synthetic/walking_xyz@100-102?frames=20&offsets=0"])
+    spec = make_spec(pilot=True, held_out=["synthetic/walking_xyz?scene=100-102&frames=20&offsets=0"])
     tuner = SimulatedTuner(spec, tmp_path / "a")
     told: list[StudyEvent] = []
     with pytest.raises(StudyError, match=r"could show nothing: 3 scenes.*20 % would take [0-9]+ scenes") as caught:

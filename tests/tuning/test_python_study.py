@@ -70,9 +70,9 @@ def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
 
 
 def test_blocks_may_be_given_as_blocks(tmp_path: Path) -> None:
-    block = Block("synthetic/walking_xyz@3?frames=20", offset=2)
+    block = Block("synthetic/walking_xyz?scene=3&frames=20", offset=2)
     study = Study(**{**FIELDS, "tune": [block, TUNE]}, results=tmp_path)
-    assert study.spec.tune == ("synthetic/walking_xyz@3?frames=20&offsets=2", TUNE)
+    assert study.spec.tune == ("synthetic/walking_xyz?scene=3&frames=20&offsets=2", TUNE)
     assert study.spec.blocks(study.spec.tune[0]) == [block]
 
 

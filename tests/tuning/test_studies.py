@@ -195,14 +195,14 @@ def test_bad_studies_are_refused_before_any_trial(
     [
         ("trails = 3\n", "unknown key 'trails'.*'trials'"),
         ("[space]\ninclud = []\n", "unknown key 'space.includ'.*space.include"),
-        ('held_out = ["synthetic/walking_xyz@0?frames=50"]\n', "share 1 sequences.*walking_xyz"),
+        ('held_out = ["synthetic/walking_xyz?scene=0&frames=50"]\n', "share 1 sequences.*walking_xyz"),
         ("trials = 1\n", "trials.*greater than or equal to 2"),
         ("trials = = 1\n", "is not valid TOML"),
     ],
 )
 def test_bad_study_files_are_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "study.toml"
-    path.write_text('tune = ["synthetic/walking_xyz@0"]\n' + text)
+    path.write_text('tune = ["synthetic/walking_xyz?scene=0"]\n' + text)
     with pytest.raises(StudyError, match=message):
         read_study(path)
 

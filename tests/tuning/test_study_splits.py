@@ -34,7 +34,7 @@ def faults(tune: list[str], held_out: list[str], *, accept: bool = False) -> lis
     return check_splits(study.name, splits, accept=accept)
 
 
-@pytest.mark.parametrize("other", ["@0", "@000", "@0?frames=50", "?frames=10&noise=3", ""])
+@pytest.mark.parametrize("other", ["?scene=0", "?scene=000", "@0", "?scene=0&frames=50", "?frames=10&noise=3", ""])
 def test_rendered_sequences_overlap_in_every_spelling(other: str, tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
     path.write_text(f'tune = ["{WALK}"]\nheld_out = ["{WALK}{other}"]\n')
@@ -109,11 +109,11 @@ def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> N
 
 
 def test_instances_stay_in_their_split() -> None:
-    with pytest.raises(StudyError, match=r"'synthetic/walking_xyz@5' is used as held-out.*0-99.*into the tune split"):
-        faults([f"{WALK}@1"], [f"{WALK}@5"])
-    with pytest.raises(StudyError, match=r"'synthetic/walking_xyz@105' is used as tune.*100-199.*held-out split"):
-        faults([f"{WALK}@105"], [f"{WALK}@101"])
-    assert faults([f"{WALK}@1", f"{WALK}@1?noise=4"], [f"{WALK}@101"]) == []
+    with pytest.raises(StudyError, match=r"walking_xyz\?scene=5' is used as held-out.*0-99.*into the tune split"):
+        faults([f"{WALK}?scene=1"], [f"{WALK}?scene=5"])
+    with pytest.raises(StudyError, match=r"walking_xyz\?scene=105' is used as tune.*100-199.*held-out split"):
+        faults([f"{WALK}?scene=105"], [f"{WALK}?scene=101"])
+    assert faults([f"{WALK}?scene=1", f"{WALK}?scene=1&noise=4"], [f"{WALK}?scene=101"]) == []
 
 
 def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
 
 
 def test_an_older_study_with_overlapping_splits_can_still_be_looked_at() -> None:
-    assert len(faults([f"{WALK}@1"], [f"{WALK}@5"], accept=True)) == 1
+    assert len(faults([f"{WALK}?scene=1"], [f"{WALK}?scene=5"], accept=True)) == 1
 
 
 def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:

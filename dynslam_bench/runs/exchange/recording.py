@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -236,6 +237,4 @@ def check_rerun() -> None:
         RunError: It is not installed.
     """
     if importlib.util.find_spec("rerun") is None:
-        raise RunError(
-            "recordings are written with rerun-sdk, which is not installed", "pip install 'dynslam-bench[rerun]'"
-        )
+        raise RunError("recordings are written with rerun-sdk, which is not installed", install_hint("rerun"))

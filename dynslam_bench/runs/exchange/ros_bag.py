@@ -13,6 +13,7 @@ import numpy as np
 
 from dynslam_bench.core.errors import RunError, TrajectoryError
 from dynslam_bench.core.files import temporary_folder
+from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.bags import read_bag_poses
@@ -55,9 +56,7 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: st
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise RunError(
-            "MCAP is written with rosbags, which is not installed", "pip install 'dynslam-bench[bags]'"
-        ) from error
+        raise RunError("MCAP is written with rosbags, which is not installed", install_hint("bags")) from error
     store = get_typestore(Stores.LATEST)
     with temporary_folder(folder / BAG) as work:
         bag = work / BAG

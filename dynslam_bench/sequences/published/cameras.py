@@ -229,5 +229,8 @@ def find_camera(
         return CAMERAS[otherwise], None
     raise SequenceError(
         f"the camera of {folder} is not known: there is no {CAMERA_FILE} inside, and '{name}' is no published name",
-        f"name it with --camera {'|'.join(CAMERAS)}|FILE.toml",
+        options=(
+            f"a published camera: --camera {'|'.join(CAMERAS)}",
+            f"another one: --camera FILE.toml, or that file as {CAMERA_FILE} in the folder",
+        ),
     )

@@ -40,13 +40,13 @@ def open_synthetic(
     """Open a rendered sequence; frames are rendered when first read and cached under ``cache_root/synthetic``.
 
     Args:
-        id: For example ``synthetic/walking_xyz@101?frames=150``.
+        id: For example ``synthetic/walking_xyz?scene=101&frames=150``.
         cache_root: Where rendered frames are kept; None keeps nothing and renders at every read.
         settings: What differs from the default rendering (noise, controls, lighting).
         threads: Threads a frame; None for the cores there are. The frames do not depend on it.
 
     Raises:
-        SequenceError: Unknown id, or an instance or length out of range.
+        SequenceError: Unknown id, or a scene or length out of range.
     """
     from .sequence import SyntheticSequence
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,26 +13,26 @@ from .families.registry import FAMILIES, SYNTHETIC_IDS
 from .scenes.world import World
 from .settings import DEFAULT_FRAMES, HELD_OUT_INSTANCES, MAX_FRAMES
 
-_OPTIONS = {"frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
+_OPTIONS = {"scene": (0, HELD_OUT_INSTANCES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
 """What may stand behind the question mark, with the least and the largest value."""
-_ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<instance>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
+_ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class SyntheticId:
-    """A parsed id ``synthetic/<family>_<variant>[@instance][?frames=N][&noise=SEED]``.
+    """A parsed id ``synthetic/<family>_<variant>[?scene=N][&frames=N][&noise=SEED]``.
 
     Attributes:
         family: For example ``walking`` or ``loop``.
         variant: For the twins the camera's motion; may be empty.
-        instance: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held out.
+        scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held out.
         frames: Length of the sequence; frames are the same whatever the length.
-        noise: Seed of the sensors' noise: another draw of the same scene. None is the instance's own draw.
+        noise: Seed of the sensors' noise: another draw of the same scene. None is the scene's own draw.
     """
 
     family: str
     variant: str
-    instance: int = 0
+    scene: int = 0
     frames: int = DEFAULT_FRAMES
     noise: int | None = None
 
@@ -52,29 +53,29 @@ class SyntheticId:
 
     def world(self) -> World:
         """What is filmed."""
-        return FAMILIES[self.family].build(self.variant, self.instance)
+        return FAMILIES[self.family].build(self.variant, self.scene)
 
     @property
     def split(self) -> Literal["tune", "held-out"]:
-        """Which split the instance belongs to."""
-        return "held-out" if self.instance in HELD_OUT_INSTANCES else "tune"
+        """Which split the scene belongs to."""
+        return "held-out" if self.scene in HELD_OUT_INSTANCES else "tune"
 
     @property
     def whole(self) -> str:
         """The id without its length: what is seen, however much of it."""
-        noise = "" if self.noise is None else f"?noise={self.noise}"
-        return f"synthetic/{self.name}@{self.instance}{noise}"
+        noise = "" if self.noise is None else f"&noise={self.noise}"
+        return f"synthetic/{self.name}?scene={self.scene}{noise}"
 
     def __str__(self) -> str:
         noise = "" if self.noise is None else f"&noise={self.noise}"
-        return f"synthetic/{self.name}@{self.instance}?frames={self.frames}{noise}"
+        return f"synthetic/{self.name}?scene={self.scene}&frames={self.frames}{noise}"
 
 
 def parse_synthetic_id(text: str) -> SyntheticId:
-    """Parse an id such as ``synthetic/walking_xyz@101?frames=150`` or ``synthetic/walking_xyz?frames=150&noise=3``.
+    """Parse an id such as ``synthetic/walking_xyz?scene=101&frames=150``; ``walking_xyz@101`` is read as scene 101.
 
     Raises:
-        SequenceError: Unknown name (with a did-you-mean), or an instance, length or noise seed out of range.
+        SequenceError: Unknown name (with a did-you-mean), or a scene, length or noise seed out of range.
     """
     match = _ID.fullmatch(text)
     if match is None:
@@ -82,21 +83,20 @@ def parse_synthetic_id(text: str) -> SyntheticId:
     name = f"synthetic/{match['name']}"
     if name not in SYNTHETIC_IDS:
         raise SequenceError(f"unknown rendered sequence '{name}'", did_you_mean(name, SYNTHETIC_IDS))
-    instance = 0
-    if match["instance"] is not None:
-        instance = _integer(match["instance"], "instance", text, 0, HELD_OUT_INSTANCES.stop - 1)
     family, _, variant = match["name"].partition("_")
-    options = {"frames": FAMILIES[family].length(variant)} | _options(match["query"], text)
-    return SyntheticId(family, variant, instance, options["frames"], options.get("noise"))
+    written = [] if match["scene"] is None else [f"scene={match['scene']}"]
+    written += [] if match["query"] is None else match["query"].split("&")
+    options = {"scene": 0, "frames": FAMILIES[family].length(variant)} | _options(written, text)
+    return SyntheticId(family, variant, options["scene"], options["frames"], options.get("noise"))
 
 
-def _options(query: str | None, text: str) -> dict[str, int]:
-    """The options behind the question mark, each at most once."""
+def _options(written: Sequence[str], text: str) -> dict[str, int]:
+    """The values of options such as ``scene=3``, each at most once."""
     found: dict[str, int] = {}
-    for option in [] if query is None else query.split("&"):
+    for option in written:
         key, separator, value = option.partition("=")
         if key not in _OPTIONS or not separator:
-            forms = "write ?frames=N, ?noise=SEED or both, as ?frames=N&noise=SEED"
+            forms = "write ?scene=N, ?frames=N, ?noise=SEED, or several, as ?scene=100&frames=60"
             raise SequenceError(f"'{text}' has an unknown option '{option}'", forms)
         if key in found:
             raise SequenceError(f"'{text}' names {key} twice", "leave one out")

@@ -72,7 +72,7 @@ class Renderer:
 
     def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
         self.settings = settings
-        self.scene = Scene(sequence.world(), sequence.instance, settings)
+        self.scene = Scene(sequence.world(), sequence.scene, settings)
         self._view = lru_cache(maxsize=8)(partial(view_of, self.scene))
         """How a frame sees the scene; neighbouring frames ask for the same views."""
         self.depth_sensor = _adapted(settings.depth, self.scene.world.optics.depth)
@@ -80,7 +80,7 @@ class Renderer:
         self.threads = threads or default_threads()
         self._pool: ThreadPoolExecutor | None = None
         self._pool_process = 0
-        text = f"{_NOISE_VERSION}/{sequence.name}@{sequence.instance}"
+        text = f"{_NOISE_VERSION}/{sequence.name}@{sequence.scene}"
         text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)

@@ -50,7 +50,8 @@ class SyntheticSequence:
         self.store: FrameStore | None = None
         if cache_root is not None:
             noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
-            label = f"{sequence.name}@{sequence.instance}{noise}-{self._key()}"
+            # No "?" in a folder's name: Windows has none.
+            label = f"{sequence.name}@{sequence.scene}{noise}-{self._key()}"
             self.store = FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
 
     def __getstate__(self) -> dict[str, object]:
@@ -67,7 +68,7 @@ class SyntheticSequence:
 
     @property
     def id(self) -> str:
-        """For example ``synthetic/walking_xyz@0?frames=600``."""
+        """For example ``synthetic/walking_xyz?scene=0&frames=600``."""
         return str(self._id)
 
     @property
@@ -108,7 +109,7 @@ class SyntheticSequence:
     @cached_property
     def scene(self) -> Scene:
         """The geometry behind the frames."""
-        return Scene(self._id.world(), self._id.instance, self.settings)
+        return Scene(self._id.world(), self._id.scene, self.settings)
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -117,17 +118,17 @@ class SyntheticSequence:
 
     @property
     def split(self) -> str:
-        """``tune`` (instances 0-99) or ``held-out`` (100-199)."""
+        """``tune`` (scenes 0-99) or ``held-out`` (100-199)."""
         return self._id.split
 
     @property
     def noise(self) -> int | None:
-        """Seed of the sensors' noise; None for the instance's own."""
+        """Seed of the sensors' noise; None for the scene's own."""
         return self._id.noise
 
     @property
     def whole_id(self) -> str:
-        """The id without its length, for example ``synthetic/walking_xyz@0``: all lengths cut the same script."""
+        """The id without its length, for example ``synthetic/walking_xyz?scene=0``: all lengths cut the same script."""
         return self._id.whole
 
     def digest(self) -> str:
@@ -136,7 +137,7 @@ class SyntheticSequence:
 
     def scene_digest(self) -> str:
         """Digest of what is filmed: neither the length nor the sensors' noise."""
-        return digest({"scene": f"{self._id.name}@{self._id.instance}", "key": self._key()})
+        return digest({"scene": f"{self._id.name}@{self._id.scene}", "key": self._key()})
 
     def _key(self) -> str:
         family = {"family": self._id.version} if self._id.version else {}

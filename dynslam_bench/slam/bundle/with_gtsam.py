@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.version import install_hint
 
 from ..localisation.pose import CHI2_DEPTH, CHI2_MONO
 from .schur import BundleProblem, BundleResult, reprojection_chi2
@@ -79,7 +80,7 @@ def load_gtsam(wanted_by: str) -> Any:
         import gtsam
     except ImportError as error:
         message = f"{wanted_by} needs a package that cannot be imported: {error}"
-        raise TrackerError(message, "pip install 'dynslam-bench[gtsam]', or leave the setting") from error
+        raise TrackerError(message, f"{install_hint('gtsam')}, or leave the setting") from error
     return gtsam
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.core.version import install_hint
 
 from .settings import (
     ConstantVelocitySettings,
@@ -81,7 +82,7 @@ ORBSLAM3 = TrackerSpec(
         "Open-Source Library for Visual, Visual-Inertial, and Multimap SLAM, IEEE T-RO 37(6), 2021"
     ),
     files=f"{_HERE}.vocabulary:files",
-    requires={"pyorbslam3": "pip install 'dynslam-bench[orbslam3]' (Linux x86-64)"},
+    requires={"pyorbslam3": f"{install_hint('orbslam3')} (Linux x86-64)"},
     remarks=(
         "Assumes a static world and marks nothing as lost on dynamic scenes: it follows the people, coverage 100 %. "
         "After a real loss it starts a new map with an origin of its own; its poses are taken as they come. Runs three "
@@ -126,7 +127,7 @@ OPEN3D_ODOMETRY = TrackerSpec(
     provenance="external",
     license="MIT",
     citation="Q.-Y. Zhou, J. Park, V. Koltun, Open3D: A modern library for 3D data processing, arXiv:1801.09847",
-    requires={"open3d": "pip install 'dynslam-bench[open3d]'"},
+    requires={"open3d": install_hint("open3d")},
     remarks="No map and no loop closing: it drifts. Assumes a static world.",
 )
 

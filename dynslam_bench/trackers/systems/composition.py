@@ -145,6 +145,11 @@ def _mask_stage(
             also=movable_classes(filters),
         )
     needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
+    if needing and not isinstance(settings, SemanticSystemSettings):
+        raise SegmentationError(
+            f"filter '{needing[0]}' needs masks, but {type(settings).__name__} has no group segmentation",
+            "derive the system's settings from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)",
+        )
     if masks is None and needing:
         raise SegmentationError(
             f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'", f"sources: {SOURCES}"

@@ -80,7 +80,7 @@ function nameBelow(panel) {
   const room = panel.width / panel.sx.categories.length - 8, names = new Map();
   for (const name of panel.sx.categories) {
     const lines = [""];
-    for (const piece of plain(name).split(/(?=[@?\[ _])/)) {
+    for (const piece of plain(name).split(/(?=[?&\[ _])/)) {
       if (lines.at(-1) && widthOf(lines.at(-1) + piece) > room) lines.push(piece.trim()); else lines[lines.length - 1] += piece;
     }
     names.set(name, lines);

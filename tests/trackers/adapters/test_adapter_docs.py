@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.errors import SegmentationError, SequenceError, SettingsError
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, load_object
 from dynslam_bench.flow.build_flow import build_flow
 from dynslam_bench.flow.registry import FLOWS
@@ -16,7 +16,8 @@ from dynslam_bench.segmentation.registry import SEGMENTERS
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.published.datasets import DATASETS
 from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
-from dynslam_bench.trackers import TRACKERS, build_tracker
+from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
+from dynslam_bench.trackers.systems.composition import SystemSettings, compose
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "plugins.md"
 
@@ -26,7 +27,7 @@ def example(tmp_path):
     """Writes a named example of the page and gives its path."""
     blocks = re.findall(r"```python\n(# (\w+\.py)\n.*?)```", PAGE.read_text(), re.DOTALL)
     texts = {name: text for text, name in blocks}
-    assert len(texts) == len(blocks) >= 6
+    assert len(texts) == len(blocks) >= 7
 
     def write(name):
         path = tmp_path / name
@@ -105,6 +106,33 @@ def test_filter_and_system(example):
     check_filter(load_object(f"{path}:FarFilter"))
     assert TRACKERS.get(f"{path}:SPEC").id == "far-slam"
     check_tracker(f"{path}:SPEC", frames=3)
+
+
+def test_filter_beside_masks(example):
+    path = example("people_slam.py")
+    carried, settings = load_object(f"{path}:CarriedFilter"), load_object(f"{path}:CarriedSettings")
+    check_filter(lambda: carried(settings()))
+    check_tracker(f"{path}:SPEC", frames=3)
+    with pytest.raises(SettingsError, match="needs masks"):
+        TRACKERS.get(f"{path}:SPEC").settings(segmentation={"source": "none"}).verify()
+    sequence = open_sequence("synthetic/walking_xyz", frames=(0, 2))
+    context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
+    dropped = []
+    for behind_m in (0.0, 0.5):
+        chosen = {"segmentation.source": "oracle", "carried.behind_m": behind_m}
+        tracker = build_tracker(f"{path}:SPEC", chosen, context)
+        tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+        stats = tracker.track(sequence[0]).stats
+        dropped.append(stats["carried_dropped"])
+        assert stats["semantic_objects"] >= 1
+    assert 0 <= dropped[0] < dropped[1], "its setting reaches it"
+
+
+def test_a_filter_that_needs_masks_without_the_group_is_told_how_to_get_it(example):
+    path = example("people_slam.py")
+    carried = load_object(f"{path}:CarriedFilter")(load_object(f"{path}:CarriedSettings")())
+    with pytest.raises(SegmentationError, match=r"'carried' needs masks.*SemanticSystemSettings"):
+        compose(SystemSettings(), TrackerContext(), [carried])
 
 
 def test_the_shell_lines_name_verbs_that_exist():

@@ -70,7 +70,7 @@ def test_without_the_api_it_is_listed_and_says_what_to_install(monkeypatch):
 def test_open3d_is_listed_without_open3d(monkeypatch):
     known = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "open3d" else known(name, *a))
-    assert TRACKERS.get("open3d-odometry").missing() == ["pip install 'dynslam-bench[open3d]'"]
+    assert TRACKERS.get("open3d-odometry").missing() == ["pip install '.[open3d]' in the checkout of dynslam-bench"]
     with pytest.raises(TrackerError, match="dynslam-bench"):
         build_tracker("open3d-odometry")
 

@@ -20,7 +20,7 @@ def test_a_tracker_in_one_cpp_file_follows_the_camera(tmp_path: Path) -> None:
     assert COMPILER is not None
     command = [COMPILER, "-O2", "-Wall", "-Wextra", "-Werror", "-o", str(program), str(SOURCE)]
     subprocess.run(command, check=True, capture_output=True)
-    env = SlamEnv("synthetic/sitting_xyz@100", f"subprocess:{program}", frames=(0, 12))
+    env = SlamEnv("synthetic/sitting_xyz?scene=100", f"subprocess:{program}", frames=(0, 12))
     env.reset(seed=0)
     info: dict = {}
     for _ in range(11):

@@ -9,7 +9,7 @@ FRAMES = (0, 24)  # people cover 85 % of the features; with all of them counted 
 
 
 def test_a_crowd_in_front_of_the_camera_leaves_enough_features() -> None:
-    sequence = open_sequence("synthetic/walking_halfsphere@102", frames=FRAMES)
+    sequence = open_sequence("synthetic/walking_halfsphere?scene=102", frames=FRAMES)
     kept, states = {}, {}
     for share in (0.0, 0.3):
         settings = {"segmentation.source": "oracle", "segmentation.outside_share": share}

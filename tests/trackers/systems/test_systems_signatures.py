@@ -63,7 +63,7 @@ def test_what_is_as_good_as_exact_masks_has_not_failed() -> None:
     ],
 )
 def test_published_classes(tracker: str, sequence: str, expected: str | None) -> None:
-    assert signatures.published_class(tracker, signatures.recorded(f"synthetic/{sequence}@3")) == expected
+    assert signatures.published_class(tracker, signatures.recorded(f"synthetic/{sequence}?scene=3")) == expected
 
 
 def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
@@ -115,18 +115,19 @@ def test_a_store_without_the_yardstick_is_a_clear_error(tmp_path: Path) -> None:
 
 def test_instances_are_rows_of_their_own_and_repeats_are_one_cell(tmp_path: Path) -> None:
     store = RunStore(tmp_path)
-    for twin in ("synthetic/walking_rpy", "synthetic/walking_rpy@100", "synthetic/walking_rpy@101?frames=600"):
+    for scene in ("", "?scene=100", "?scene=101&frames=600"):
+        twin = f"synthetic/walking_rpy{scene}"
         fake.add_run(store, "mask-rcnn", twin, 0, error=0.004, overrides={"segmentation.source": "oracle"})
         for repeat, error in enumerate((0.4, 0.5, 0.6)):
             fake.add_run(store, "orb-slam2", twin, repeat, error=error, provenance="faithful-code")
     text = signatures.report(tmp_path, signatures.instance_range("100:200"))
     rows = [line.split("|") for line in text.splitlines() if line.startswith("| `orb-slam2` | faithful")]
-    assert [row[3].strip() for row in rows] == ["walking_rpy@100", "walking_rpy@101"]
+    assert sorted(row[3].strip() for row in rows) == ["walking_rpy?scene=100", "walking_rpy?scene=101"]
     for row in rows:
         median, low, high = (float(each) for each in re.findall(r"\d\.\d+", row[4]))
         assert low < median < high
     assert "| walking_rpy |" in signatures.report(tmp_path)
-    assert "walking_rpy@101" not in signatures.report(tmp_path, signatures.instance_range("100"))
+    assert "walking_rpy?scene=101" not in signatures.report(tmp_path, signatures.instance_range("100"))
     with pytest.raises(DynslamError, match=r"no runs on instances 150 to 159.*--instances"):
         signatures.report(tmp_path, signatures.instance_range("150:160"))
     with pytest.raises(argparse.ArgumentTypeError, match="'held-out' is no range of instances"):

@@ -15,6 +15,7 @@ import torch
 
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing
+from dynslam_bench.core.version import install_hint
 
 from ...settings import SegmentationSettings
 from ..checkpoints import COCO, embedded_weights, fetch_checkpoint
@@ -171,6 +172,6 @@ def _library() -> Any:
     except ImportError as error:
         raise SegmentationError(
             f"networks are exported with onnx and onnxscript: {error.name} is not installed",
-            "pip install 'dynslam-bench[onnx]'",
+            install_hint("onnx"),
         ) from error
     return onnx
