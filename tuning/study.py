@@ -364,7 +364,8 @@ class Tuner:
         for block in spec.blocks(*spec.tune, *spec.confirm, *spec.held_out):
             first.setdefault(block.sequence, block)
         how: dict[str, Any] = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(spec.space.fixed)}
-        data, program = {}, {}
+        data: dict[str, str] = {}
+        program: dict[str, str] = {}
         for sequence, block in first.items():
             identity = resolve(block.run_spec(spec.tracker, **how)).identity
             data[sequence] = digest([identity["content"], identity["camera"]])

@@ -145,7 +145,7 @@ def open_folder(
     except OSError:  # a file vanished meanwhile; opening it names what is wrong
         state = ""
     if state and _OPENED.get(repr(wanted), ("", None))[0] == state:
-        return cast("Sequence", _OPENED[repr(wanted)][1])
+        return _OPENED[repr(wanted)][1]
     sequence = _open_folder(folder, entry, camera, chosen, settings)
     while len(_OPENED) >= _MOST_OPENED:
         _OPENED.pop(next(iter(_OPENED)))
