@@ -83,8 +83,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         log=log_of(store, record.run_id),
         command=command_line(record.command),
         machine=machine_words(record),
-        notes=_notes(record, evaluation, scored),
-        hints=scored.hints,
+        **_remarks(record, evaluation, scored.hints),
     )
 
 
@@ -118,11 +117,11 @@ def _trial_of(record: RunRecord) -> str:
     return record.study if record.asked else ""
 
 
-def _notes(record: RunRecord, evaluation: Evaluation | None, scored: MetricRecord) -> list[str]:
-    """What a reader should know of a run: whose trial it is, its own remarks, those of its evaluation."""
-    hints = [f"hint: {line}" for line in scored.hints]
+def _remarks(record: RunRecord, evaluation: Evaluation | None, hints: list[str]) -> dict[str, list[str]]:
+    """What a reader should know of a run: hints, whose trial it is, its own remarks, those of its evaluation."""
     trial = [f"trial of the study '{_trial_of(record)}'"] if _trial_of(record) else []
-    return [*hints, *trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
+    lines = [*trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
+    return {"notes": [*(f"hint: {hint}" for hint in hints), *lines], "hints": hints}
 
 
 def log_of(store: RunStore, run_id: str) -> str:
