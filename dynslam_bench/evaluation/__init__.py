@@ -3,7 +3,8 @@
 from .compare_protocols import ComparisonRow, compare_protocols
 from .evaluate import Evaluation, evaluate, evaluate_files, pose_errors
 from .frames import common_frames, coverage, hold
-from .hints import Hint, hints
+from .hint_tracks import Hint
+from .hints import hints
 from .masks import MaskCounts, compare_masks
 from .never_move import never_move
 from .online import OnlineError, OnlineSample

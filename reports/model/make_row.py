@@ -85,8 +85,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         log=log_of(store, record.run_id),
         command=command_line(record.command),
         machine=machine_words(record),
-        notes=_notes(record, evaluation, scored),
-        hints=scored.hints,
+        **_remarks(record, evaluation, scored.hints),
     )
 
 
@@ -115,11 +114,11 @@ def _counts(record: RunRecord, final: Evaluation | None) -> dict[str, Any]:
     return counts
 
 
-def _notes(record: RunRecord, evaluation: Evaluation | None, scored: MetricRecord) -> list[str]:
-    """What a reader should know of a run: whose trial it is, its own remarks, those of its evaluation."""
-    hints = [f"hint: {line}" for line in scored.hints]
+def _remarks(record: RunRecord, evaluation: Evaluation | None, hints: list[str]) -> dict[str, list[str]]:
+    """What a reader should know of a run: hints, whose trial it is, its own remarks, those of its evaluation."""
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
-    return [*hints, *trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
+    lines = [*trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
+    return {"notes": [*(f"hint: {hint}" for hint in hints), *lines], "hints": hints}
 
 
 def log_of(store: RunStore, run_id: str) -> str:

@@ -29,9 +29,7 @@ def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
     code = digest([identity.get(name) for name in _CODE], 8)
     libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
     weights = {f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()}
-    machine = identity.get("machine") or {}  # of real-time runs
-    computer = {"machine": f"{machine.get('cpu', '')}, {machine.get('cores', '')} cores"} if machine else {}
-    return {"code": code} | libraries | weights | computer
+    return {"code": code} | libraries | weights
 
 
 class TrackerInfo(Record):
