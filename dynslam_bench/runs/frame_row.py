@@ -177,14 +177,14 @@ def column_names(rows: Iterable[FrameRow]) -> list[str]:
     return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT))]
 
 
-def write_csv(path: Path, rows: Sequence[FrameRow], exact: Mapping[float, int]) -> None:
+def write_csv(path: Path, rows: Sequence[FrameRow], exact: Mapping[float, int] | None = None) -> None:
     """Write ``frames.csv``; `exact` gives the nanoseconds of stamps by their seconds."""
     columns = column_names(rows)
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = csv.writer(file)
         table.writerow(columns)
         for row in rows:
-            cells = row.cells() | {"timestamp": format_ns(exact.get(row.timestamp) or ns_of(row.timestamp))}
+            cells = row.cells() | {"timestamp": format_ns((exact or {}).get(row.timestamp) or ns_of(row.timestamp))}
             table.writerow([cells.get(name) for name in columns])
 
 

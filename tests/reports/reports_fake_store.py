@@ -7,6 +7,7 @@ import numpy as np
 from dynslam_bench.core.machine import Machine
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.stamps import from_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.tum_file import format_tum
 from dynslam_bench.runs.storage.record import IDENTITY_SCHEME, RunRecord, SequenceInfo, StageTime, TrackerInfo
@@ -88,7 +89,7 @@ def add_run(
     n = len(stamps)
     part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:16]
     store.prepare()
-    store.add_sequence(part, stamps, truth if ground_truth else None)
+    store.add_sequence(part, from_seconds(stamps.tolist()), truth if ground_truth else None)
     made_of = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
                 "extra": (offset, noise, content, camera, frames, online, masks)}  # fmt: skip
     run_id = run_id or hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]

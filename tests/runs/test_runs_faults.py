@@ -25,7 +25,7 @@ def make(root: Path, record: RunRecord) -> None:
     store = RunStore(root)
     store.prepare()
     with store.claim(record.run_id), store.work_folder(record.run_id) as work:
-        store.add_sequence(record.sequence.part, TRUTH.timestamps, TRUTH)
+        store.add_sequence(record.sequence.part, TRUTH.timestamps_ns, TRUTH)
         store.publish(work, record)
     store.add_metrics(METRICS)
 

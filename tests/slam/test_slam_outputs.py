@@ -34,7 +34,7 @@ def test_keyframes_csv(tmp_path):
     with (tmp_path / "keyframes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["frame"]) for row in rows] == [0, 3, 6, 9]
-    assert rows[1]["timestamp"] == "100.333333"
+    assert rows[1]["timestamp"] == "100.333333333"
     for row, record in zip(rows, map_outputs.keyframes, strict=True):
         translation = np.array([float(row[k]) for k in ("tx", "ty", "tz")])
         quaternion = np.array([float(row[k]) for k in ("qx", "qy", "qz", "qw")])

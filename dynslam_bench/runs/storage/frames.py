@@ -92,4 +92,4 @@ class FrameLog:
             exact: The nanoseconds of the frames' stamps by their seconds, where a float does not hold them.
         """
         write_tum(folder / ONLINE_FILE, self.trajectory().with_exact(exact or {}), comment=comment)
-        write_csv(folder / CSV_FILE, self.rows, exact or {})
+        write_csv(folder / CSV_FILE, self.rows, exact)
