@@ -155,7 +155,8 @@ def test_sequences_render(cli, tmp_path):
 def test_run_show_report_compare_and_remove(cli, walk, tmp_path):
     """One store through its life."""
     code, out, err = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
-    assert code == 0 and all(line.endswith(" s so far") for line in err.splitlines())  # quiet in pipes
+    said, *others = err.splitlines()
+    assert code == 0 and said == "2 runs, 6 frames" and all(line.endswith(" s so far") for line in others)
     shown = [re.split(r"\s{2,}", line)[3:6] for line in out.splitlines()]
     assert shown == [["frames", "repeat", "status"], ["0:3", "seed 0", "ok"], ["0:3", "seed 1", "ok"]]
     runs = json.loads(cli("runs", "list", "--json")[1])

@@ -156,7 +156,7 @@ def test_a_folder_without_a_camera_needs_one_named(cli, walk, tmp_path):
     copy = shutil.copytree(walk, tmp_path / "walk")
     (copy / "camera.toml").rename(tmp_path / "mine.toml")
     code, _, err = cli("sequences", "verify", copy)
-    assert code == 1 and "--camera" in one_line(err)
+    assert code == 1 and "is not known" in err and err.count("--camera") == 2
     assert cli("sequences", "verify", copy, "--camera", tmp_path / "mine.toml")[0] == 0
     code, _, err = cli("sequences", "verify", copy, "--camera", "tum-fr9")
     assert code == 1 and "tum-fr9" in one_line(err)
