@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from statistics import mean
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dynslam_bench.reports.model.row import RunRow
@@ -38,13 +38,14 @@ def measure(jobs: int) -> tuple[float, bool]:
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.sequences.synthetic.kernels.raycast import shade_pixels
 
+    kernel: Any = shade_pixels  # what numba adds to it no annotation says
     sequence = open_synthetic(f"synthetic/walking_xyz?frames={PROBE_FRAMES + 1}", None, threads=1)
     sequence[0]
     with ThreadPoolExecutor(jobs) as pool:
         begun = time.perf_counter()
         list(pool.map(sequence.__getitem__, range(1, PROBE_FRAMES + 1)))
         took = time.perf_counter() - begun
-    return took * jobs / (PROBE_FRAMES * PROBE_S), bool(shade_pixels.stats.cache_misses)
+    return took * jobs / (PROBE_FRAMES * PROBE_S), bool(kernel.stats.cache_misses)
 
 
 def estimate(frames: int, study_frames: int, trials: int, jobs: int, *, slowness: float, compiles: bool) -> str:

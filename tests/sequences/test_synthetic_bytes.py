@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import dynslam_bench.sequences.synthetic as package
-from dynslam_bench.sequences.synthetic import open_synthetic, parse_synthetic_id
-from dynslam_bench.sequences.synthetic.kernels import arithmetic
+from dynslam_bench.sequences.synthetic import arithmetic, open_synthetic, parse_synthetic_id
 from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION
 
 KEPT = [
@@ -61,7 +60,7 @@ def test_an_older_processor_renders_the_same_bytes() -> None:
 
 
 def test_nothing_is_rendered_with_what_depends_on_the_processor() -> None:
-    """Products and functions come from `kernels/arithmetic.py`."""
+    """Products and functions come from `arithmetic.py`."""
     found = []
     for path in Path(package.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -21,5 +21,12 @@ def test_trials_that_were_judged_are_not_called_out_of_the_choice(bounds, said):
     study = optuna.create_study()
     for bound in bounds:
         study.add_trial(optuna.trial.create_trial(value=1.0, user_attrs={CONSTRAINTS: {"ate": bound}}))
-    notes = [note for note in warnings_of(SimpleNamespace(study=study)) if "constraint" in note]
+    tuner = SimpleNamespace(study=study, spec=SimpleNamespace(objectives=("accuracy",)))
+    notes = [note for note in warnings_of(tuner) if "constraint" in note]
     assert len(notes) == (said is not None) and all(said in note for note in notes)
+
+
+@pytest.mark.parametrize("objective", ["speed", "accuracy"])
+def test_times_of_the_race_are_called_unpaired(objective):
+    tuner = SimpleNamespace(study=optuna.create_study(), spec=SimpleNamespace(objectives=(objective,)))
+    assert any("processor time" in note for note in warnings_of(tuner)) == (objective == "speed")

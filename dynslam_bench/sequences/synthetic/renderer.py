@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
 
+from .arithmetic import cos, exp, norm, power, product, sin
 from .bounds import bounds_of
 from .ids import SyntheticId
 from .kernels import motion as motion_kernels
 from .kernels import raycast as kernels
 from .kernels import sensors
-from .kernels.arithmetic import cos, exp, norm, power, product, sin
 from .scenes.parts import QUAD, ROUND_CONE
 from .scenes.scene import Scene, Snapshot
 from .scenes.textures import Atlas

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels.arithmetic import product
+from .arithmetic import product
 from .scenes.scene import Scene, Snapshot
 from .settings import CAMERA, FPS
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import atan2, cos, norm, sin
+from ..arithmetic import atan2, cos, norm, sin
 from ..scenes.interiors import Point, add_floor, add_wall, cartons, corridor_bay, notices, office_bay, office_chair
 from ..scenes.parts import BOX, Parts, turn
 from ..scenes.plan import pick, plan_room

@@ -14,7 +14,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import cos
+from ..arithmetic import cos
 from ..people.bodies import draw_person
 from ..people.script import Key, posture
 from ..scenes.camera_paths import camera_poses

@@ -10,7 +10,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import product, sin
+from ..arithmetic import product, sin
 from ..people.bodies import Posture, draw_person
 from ..scenes.camera_paths import EYE_HEIGHT_M, TILT_RAD, camera_axes, hand, rotations
 from ..scenes.plan import pick, plan_room

@@ -10,7 +10,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import atan2
+from ..arithmetic import atan2
 from ..people.bodies import Posture, draw_person
 from ..scenes.plan import pick
 from ..scenes.walks import Walk, walking_camera

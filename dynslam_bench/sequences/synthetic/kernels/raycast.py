@@ -15,12 +15,13 @@ import numpy as np
 
 from dynslam_bench.core.compiled import dividing_kernel
 
+from ..arithmetic import atan2 as _atan2
 from ..scenes.parts import BOX, ROUND_CONE
-from .arithmetic import atan2
 from .arrays import Intrinsics, Ints, Reals
 from .hits import NEAR_M, hit_box, hit_round_cone
 
 TILE = 8
+atan2 = dividing_kernel(_atan2)
 _PER_TURN = 1.0 / (2.0 * math.pi)
 
 

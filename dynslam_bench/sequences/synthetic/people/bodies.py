@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import cos, power, product, sin
+from ..arithmetic import cos, power, product, sin
 from ..scenes.parts import ROUND_CONE, Parts, along, turn
 from ..scenes.plan import pick, pick_one
 

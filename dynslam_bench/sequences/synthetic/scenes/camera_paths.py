@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import arctan2, cos, norm, product, sin
+from ..arithmetic import arctan2, cos, norm, product, sin
 
 Array = NDArray[np.float64]
 

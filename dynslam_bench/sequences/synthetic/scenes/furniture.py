@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.arithmetic import norm, product
+from ..arithmetic import norm, product
 from .parts import BOX, ROUND_CONE, Parts, turn
 from .plan import Plan
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import atan2
+from ..arithmetic import atan2
 from .furniture import add_cabinet, add_chair, add_desk, add_posters, add_shelf
 from .parts import BOX, QUAD, Parts, turn, wall
 from .plan import Plan, plan_room

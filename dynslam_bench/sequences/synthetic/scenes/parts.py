@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.arithmetic import cos, product, sin
+from ..arithmetic import cos, product, sin
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import norm, product
+from ..arithmetic import norm, product
 from ..people.bodies import add_person
 from ..settings import FPS, RenderSettings
 from . import textures

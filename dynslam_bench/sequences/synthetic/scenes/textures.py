@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.arithmetic import exp, sin
+from ..arithmetic import exp, sin
 
 Image = NDArray[np.float64]
 """Float ``[S, S, 3]`` in 0-255, S a power of two; it wraps around."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 
-from ..kernels.arithmetic import arctan2, norm, product, sin
+from ..arithmetic import arctan2, norm, product, sin
 from .camera_paths import EYE_HEIGHT_M, TILT_RAD, camera_axes, hand, rotations
 
 Array = NDArray[np.float64]
