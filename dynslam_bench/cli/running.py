@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import typer
@@ -13,6 +12,7 @@ import typer
 from dynslam_bench.core.toml import label_text
 
 from . import completion
+from .expected_time import plan_words
 from .options import (
     AsJson,
     Assignments,
@@ -112,12 +112,11 @@ def run(
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
     from dynslam_bench.runs import Limits, RunSpec
-    from dynslam_bench.sequences.catalogue import parse_frames
 
     given = gather_settings(assignments, settings, {} if preset is None else preset_of(tracker, preset))
     given |= map_settings(tracker, start_map, localisation_only, given)
     asked: dict[str, Any] = {"tracker": tracker, "settings": given}
-    asked |= {"frames": None if frames is None else parse_frames(frames), "stride": stride, "camera": camera}
+    asked |= {"frames": frames, "stride": stride, "camera": camera}
     asked |= {"data_root": None if data_root is None else str(data_root), "device": device, "threads": threads}
     asked |= {"realtime": realtime, "drop_share": drop, "degrade": parse_strengths(degrade or ()), "cache": cache}
     asked |= {"video": video, "sheet": sheet, "rrd": rrd, "save_map": save_map, "label": label}
@@ -378,54 +377,6 @@ def make_runs(
             specs, results=store, jobs=jobs, retry=tuple(retry), on_plan=planned, on_event=told, protocol=protocol,
             **with_executor,
         )  # fmt: skip
-
-
-MOST_LOOKED_AT, MOST_ALIKE = 100, 5
-"""Stored runs, the newest first, that are looked through for those of a tracker, and how many of these count."""
-
-
-def plan_words(runs: Collection[ResolvedRun], store: RunStore, jobs: int) -> str:
-    """How many frames are to be tracked, and how long that takes by what stored runs of the same trackers took."""
-    from dynslam_bench.runs.one import PROGRESS_EVERY
-
-    frames = sum(len(run.sequence) for run in runs)
-    words = f"{len(runs)} run{'s' * (len(runs) != 1)}, {frames} frames"
-    times = frame_times(runs, store)
-    known = [run for run in runs if _kind(run) in times]
-    if not known:
-        later = f"; how long it takes is known after the first {PROGRESS_EVERY}" if frames > PROGRESS_EVERY else ""
-        return words + later
-    expected_s = sum(len(run.sequence) * times[_kind(run)] for run in known) / min(jobs, len(runs))
-    low, high = _seconds(min(times.values())), _seconds(max(times.values()))
-    rate = low if low == high else f"{low} to {high}"
-    some = f" for {len(known)} of them" if len(known) < len(runs) else ""
-    return f"{words}, about {_seconds(expected_s)}{some} (stored runs on this machine took {rate} a frame)"
-
-
-def frame_times(runs: Collection[ResolvedRun], store: RunStore) -> dict[tuple[str, str], float]:
-    """Seconds of wall-clock time a frame of stored runs on a machine like this: the median by tracker and masks."""
-    from dynslam_bench.core.machine import this_machine
-
-    wanted, times = {_kind(run) for run in runs}, dict[tuple[str, str], list[float]]()
-    newest = sorted(store.ids(), key=lambda run_id: -store.folder(run_id).stat().st_mtime)
-    machine = this_machine()
-    for record in filter(None, map(store.get, newest[:MOST_LOOKED_AT])):
-        kind = (record.tracker.id, record.segmentation)
-        here = record.machine is not None and (record.machine.cpu, record.machine.cores) == (machine.cpu, machine.cores)
-        if kind in wanted and here and record.status in ("ok", "lost") and record.n_processed and record.wall_s:
-            times.setdefault(kind, []).append(record.wall_s / record.n_processed)
-    return {kind: median(found[:MOST_ALIKE]) for kind, found in times.items()}
-
-
-def _kind(run: ResolvedRun) -> tuple[str, str]:
-    return run.tracker.id, run.segmentation
-
-
-def _seconds(value: float) -> str:
-    for unit, seconds in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
-        if value >= 1.5 * seconds:
-            return f"{value / seconds:.2g} {unit}" if value < 10 * seconds else f"{value / seconds:.0f} {unit}"
-    return f"{1000 * value:.0f} ms"
 
 
 def dask_executor(address: str) -> Any:

@@ -72,21 +72,18 @@ def run_many(
 
     Everything is looked up before the first run begins. A stored run is made again if a video, a sheet or its map is
     asked for that it lacks; one that is given another label gets that, and one that a study made is an ordinary run
-    once it is asked for without the study. Each run is a child process; a failure is a record like any other and stops
-    nothing. A run that cannot be made because its sequence cannot be read, or a file that it needs, stops no other
-    either, and nothing of it is stored. Interrupting leaves the finished runs stored, so calling again goes on from
-    there. Several processes may do so at a time on one results folder: each run is made by one of them (not with
-    `executor`).
+    once it is asked for without the study. A failure is a record and stops nothing; after an interrupt the call goes
+    on. A run whose sequence or files cannot be read stops no other, and nothing of it is stored. Several processes may
+    share a results folder (without `executor`): each run is made by one of them.
 
     Args:
         specs: What to run; runs that are the same are made once.
         results: The results folder, or a store.
         jobs: Runs at a time on this machine.
-        executor: Where to make them instead: anything with the interface of `concurrent.futures.Executor`, for example
-            Dask's ``client.get_executor()``. Workers return records as bytes; they need the sequences, not the results
-            folder. Partial metrics stay on the worker, so `on_progress` is not called.
+        executor: Where to make them instead, e.g. Dask's ``client.get_executor()``. Its workers return records as bytes
+            and need the sequences, not the results folder; partial metrics stay there: `on_progress` is not called.
         retry: Statuses to run again although they are stored; ``failed`` stands for all of `FAILED`.
-        on_plan: Told once which runs will be made, before the first of them; not called where all are stored.
+        on_plan: Told once, before the first run, which runs will be made, if any.
         on_event: Told of everything that happens, from several threads but never two at a time.
         on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
         protocol: Protocol to score under.
@@ -112,8 +109,7 @@ def run_many(
     bench = _Bench(store, protocol, len(resolved), on_event, on_progress, jobs, cancelled, on_fault)
     for spec, error in faults:
         bench.fault(spec, error)
-    todo: dict[str, ResolvedRun] = {}
-    done: dict[str, RunRecord] = {}
+    todo, done = dict[str, ResolvedRun](), dict[str, RunRecord]()
     for run in resolved:
         if run.run_id in todo or run.run_id in done:
             continue
