@@ -81,9 +81,9 @@ def hints(
         found.append(hint)
         shift, left = _time_shift(stamps, poses, truth)
     if shift:
-        hint = _shift_hint(stamps, poses, truth, shift, left)
-        found += [hint] if hint else []
-        shift = shift if hint else 0.0
+        late = _shift_hint(stamps, poses, truth, shift, left)
+        found += [late] if late else []
+        shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
     stamps, poses = stamps[covered] + shift, poses[covered]
     if not sim3 and left < MOSTLY:

@@ -73,7 +73,7 @@ def tracker_report(
     run = _Runner(construct, scene, frames, seed)
     if not report.run("results", lambda: _results(run)):
         return report
-    report.run("camera to world", lambda: _conventions(subject if spec is None else spec, settings, seed))
+    report.run("camera to world", lambda: _conventions(construct if spec is None else spec, settings, seed))
     report.run("same stats on every frame", lambda: _same_keys(run))
     report.run("frames are left alone", lambda: _frames_left_alone(run))
     report.run("results are kept", lambda: _results_are_kept(run))
