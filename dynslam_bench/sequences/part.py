@@ -59,7 +59,11 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
         id=str(getattr(base, "whole_id", base.id)),
         content=scene if noise is None else digest([scene, noise]),
         scene=scene,
-        camera={name: value for name, value in asdict(base.camera).items() if name not in ("readout_s", "depth_delay_s") or value},
+        camera={
+            name: value
+            for name, value in asdict(base.camera).items()
+            if name not in ("readout_s", "depth_delay_s") or value
+        },
         start=frames.start - offset,
         stop=frames.stop,
         stride=frames.step,
