@@ -43,7 +43,8 @@ STENCIL = 5
 JITTER = 0.25
 """Share of the frame interval by which stamps may be off that were given after the exposure (as TUM's are)."""
 CAUCHY = 2.5
-LARGEST_DELAY_S = 0.1
+SMALLEST_DELAY_S, LARGEST_DELAY_S = 0.005, 0.1
+"""A smaller delay changes hardly any pair of images; a larger one is not looked for."""
 ROUNDS = 12
 RESOLVED_S, RESOLVED_SHARE = 0.004, 0.4
 """Half the interval must be at most this, or this share of the value, or the quantity counts as not observable."""
@@ -53,7 +54,7 @@ SYSTEMATIC_S = 0.001
 
 Windows of 10 to 25 frames give 23.4 to 27.3 ms on the excerpt of fr1_xyz."""
 SYSTEMATIC_FACTOR = 0.012
-"""Alike for lengths: 1.5 % are missing where depth is noisy (`fast_desk`)."""
+"""Alike for lengths, relative: 1.5 % are missing where depth is noisy (`fast_desk`)."""
 _DIFFERENCE_S = 0.004
 
 
@@ -716,8 +717,8 @@ def _delay(found: Estimate, camera: Camera) -> Quantity:
     if abs(found.value) > LARGEST_DELAY_S:
         return replace(about, reason=f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?")
     about = replace(about, observable=True)
-    if low <= 0 <= high:
-        return replace(about, reason="colour and depth are exposed as their stamps say")
+    if low <= 0 <= high or abs(found.value) < SMALLEST_DELAY_S:
+        return replace(about, reason="colour and depth are exposed as their stamps say, to a sixth of a frame")
     late = "later" if found.value > 0 else "earlier"
     written = round(camera.depth_delay_s + found.value, 4)
     return replace(about, written=written, reason=f"depth is exposed {late} than its stamps say")
@@ -749,7 +750,7 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
             information.append(length / max(error, 1e-12))
     if len(scales) < LEAST_WINDOWS:
         return replace(about, reason=f"the ground truth covers {len(scales)} of {len(windows)} windows")
-    found = _over_windows(used, np.array(scales), np.array(information), SYSTEMATIC_FACTOR)
+    found = _over_windows(used, np.array(scales), np.array(information), SYSTEMATIC_FACTOR * float(np.median(scales)))
     if found.half > RESOLVED_FACTOR * found.value:
         share = found.half / max(found.value, 1e-9)
         return replace(

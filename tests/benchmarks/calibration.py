@@ -1,7 +1,7 @@
 """How near `sequences calibrate` comes to the truth: rolling shutters of known readout, global ones, real excerpts.
 
-    python tests/benchmarks/calibration.py [--scenes 0 1] [--frames 100] [--readouts 0 10 20 26 33] [--part fast global real]
-        [--data-root FOLDER]
+    python tests/benchmarks/calibration.py [--scenes 0 1] [--frames 100] [--readouts 0 10 20 26 33]
+        [--part fast global real] [--data-root FOLDER]
 
 One line a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies within, the delay
 of depth, the depth factor, processor time. Then how often the truth lies within the interval, and how often a global
