@@ -1,4 +1,4 @@
-"""``sequences list|info|fetch|verify|unpack|render``."""
+"""``sequences list|info|fetch|verify|unpack|render|calibrate``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from . import completion
-from .options import AsJson, Camera, DataRoot
+from .options import AsJson, Camera, DataRoot, Frames
 from .output import VERIFICATION_FAILED, complain, note, progress, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
@@ -191,3 +191,45 @@ def render(
             folder = render_synthetic(name, find_data_root(data_root), threads=threads, progress=advance)
         note(f"{name} is in")
         write(str(folder))
+
+
+@app.command()
+def calibrate(
+    name: Annotated[str, typer.Argument(help="Path or id of a recording.", autocompletion=completion.sequences)],
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    frames: Frames = None,
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Write the camera, with what was measured, to this camera.toml."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the readout time of a rolling shutter, the delay of depth, and the depth factor."""
+    from dynslam_bench.sequences.calibration import calibrate as measure
+    from dynslam_bench.sequences.catalogue import open_sequence
+    from dynslam_bench.sequences.published.cameras import write_camera
+
+    sequence = open_sequence(name, data_root=data_root, camera=camera, frames=frames)
+    with progress(name) as advance:
+        found = measure(sequence, progress=advance)
+    written = output is not None and found.measured
+    if output is not None and written:
+        write_camera(output, found.camera, fps=sequence.fps)
+    if as_json:
+        write_json({**asdict(found), "file": str(output) if written else None})
+        return
+    units = {"readout_s": (1e3, "ms"), "depth_delay_s": (1e3, "ms"), "depth_factor": (1.0, "a metre")}
+    rows = []
+    for each in found.quantities:
+        scale, unit = units[each.name]
+        estimate = "" if each.value is None else f"{scale * each.value:.4g} {unit}"
+        interval = "" if each.low is None or each.high is None else f"{scale * each.low:.4g} to {scale * each.high:.4g}"
+        verdict = "not observable" if not each.observable else "kept" if each.written is None else f"{each.written:g}"
+        rows.append((each.name, estimate, interval, verdict, each.reason))
+    write_table(("quantity", "estimate", "95 % interval", "camera.toml", "why"), rows)
+    write(f"{found.windows} windows of {found.frames} frames, keypoints to {found.pixel_noise:.2f} px")
+    if written:
+        write(f"{output}")
+    elif output is not None:
+        note(f"nothing to write: {output} is left alone")

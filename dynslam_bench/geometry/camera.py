@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,8 @@ class Camera:
         baseline_m: Baseline of the (virtual) stereo pair that turns depth into a right coordinate, in metres.
         readout_s: Seconds from the first row's exposure to the last one's, the frame's stamp being the middle row's
             time (rolling shutter); 0 is a global shutter, or one of which nothing is known.
+        depth_delay_s: Seconds by which depth images are exposed later than their stamps say, beside the colour images;
+            readers add it to the depth images' stamps before they pair them.
     """
 
     width: int
@@ -37,6 +39,7 @@ class Camera:
     depth_factor: float = 5000.0
     baseline_m: float = 0.075
     readout_s: float = 0.0
+    depth_delay_s: float = field(default=0.0, repr=False)  # the paired images that follow from it tell it in digests
 
     @cached_property
     def matrix(self) -> NDArray[np.float64]:

@@ -41,6 +41,12 @@ class SequenceView:
         return timestamps_ns(self.base)[self.range.start : self.range.stop : self.range.step]
 
     @property
+    def depth_timestamps(self) -> NDArray[np.float64]:
+        """Stamps of the selected frames' depth images; the frames' own where the sequence does not tell."""
+        stamps = getattr(self.base, "depth_timestamps", self.base.timestamps)
+        return np.asarray(stamps[self.range.start : self.range.stop : self.range.step])
+
+    @property
     def masks(self) -> MaskSource | None:
         """Masks of the selected frames, under their new indices."""
         source = self.base.masks

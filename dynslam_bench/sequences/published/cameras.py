@@ -115,6 +115,9 @@ class CameraFile(Settings):
     readout_s: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.0, description="seconds between the first row's exposure and the last one's; 0 = global shutter"
     )
+    depth_delay_s: Annotated[float, Field(ge=-1, le=1)] = Field(
+        default=0.0, description="seconds by which depth images are exposed later than their stamps say"
+    )
     fps: Positive | None = Field(default=None, description="nominal frame rate in Hz")
 
     def camera(self) -> Camera:
@@ -165,6 +168,8 @@ def write_camera(path: Path, camera: Camera, *, fps: float | None = None) -> Non
     lines = [f"width = {int(camera.width)}", f"height = {int(camera.height)}"]
     for key in ("fx", "fy", "cx", "cy", "depth_factor", "baseline_m", "readout_s"):
         lines.append(f"{key} = {float(getattr(camera, key))!r}")
+    if camera.depth_delay_s:
+        lines.append(f"depth_delay_s = {float(camera.depth_delay_s)!r}")
     lines.append(f"distortion = [{', '.join(repr(float(value)) for value in camera.distortion)}]")
     if fps is not None:
         lines.append(f"fps = {float(fps)!r}")

@@ -93,10 +93,11 @@ class RecordedSequence:
         self._description = description
         self._any_depth_size = any_depth_size
         self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
-        colour, depth = contents.colour, contents.depth
+        delay_s = description.camera.depth_delay_s
+        colour, depth = contents.colour, replace(contents.depth, stamps=contents.depth.stamps + delay_s)
         for file in (*colour.files, *depth.files):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
-        if contents.paired:
+        if contents.paired and not delay_s:
             index = np.arange(len(colour)), np.arange(len(colour))
             _check_files(folder, colour.files, "colour")
             _check_files(folder, depth.files, "depth")
@@ -118,6 +119,7 @@ class RecordedSequence:
         self._timestamps = colour.stamps[index[0]]
         _check_unit(folder, self._timestamps)
         self._timestamps.flags.writeable = False
+        self._depth_timestamps = depth.stamps[index[1]]
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
         self._ground_truth = _turned(contents.truth, description.R_body_cam)
@@ -147,6 +149,11 @@ class RecordedSequence:
     def timestamps(self) -> NDArray[np.float64]:
         """Stamps of the colour images in seconds ``[N]``, strictly increasing."""
         return self._timestamps
+
+    @property
+    def depth_timestamps(self) -> NDArray[np.float64]:
+        """Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added."""
+        return self._depth_timestamps
 
     @property
     def colour_files(self) -> dict[float, str]:

@@ -1,0 +1,101 @@
+"""How near `sequences calibrate` comes to the truth: rolling shutters of known readout, global ones, real excerpts.
+
+    python tests/benchmarks/calibration.py [--scenes 0 1] [--frames 100] [--readouts 0 10 20 26 33]
+        [--part fast global real] [--data-root FOLDER]
+
+One line a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies within, the delay
+of depth, the depth factor, processor time. Then how often the truth lies within the interval, and how often a global
+shutter was taken for a rolling one. `--readouts` renders the `fast_*` families with other readout times than their
+26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.calibration import Quantity, calibrate
+from dynslam_bench.sequences.synthetic import open_synthetic
+from dynslam_bench.sequences.synthetic.families import fast
+
+SHARED = Path(__file__).resolve().parents[3] / "shared/data"
+REAL = ("tum/rgbd_dataset_freiburg1_xyz", "tum/rgbd_dataset_freiburg1_rpy", "bonn/rgbd_bonn_crowd")
+FAST = ("desk", "rpy", "spin", "walking")
+GLOBAL = ("walking_xyz", "walking_rpy", "walking_halfsphere", "walking_static", "sitting_rpy", "crowd_xyz", "loop_room")
+
+
+def recordings(options: argparse.Namespace) -> Iterator[tuple[str, float | None, Sequence]]:
+    """Name, true readout in ms where it is known, and the recording."""
+    root = find_data_root(options.data_root)
+    optics = fast.OPTICS
+    for ms in options.readouts if "fast" in options.part else ():
+        for kind in FAST:
+            for scene in options.scenes:
+                fast.OPTICS = replace(optics, readout_s=1e-3 * ms)
+                name = f"synthetic/fast_{kind}@{scene}?frames={options.frames}"
+                sequence = open_synthetic(name, root / f"readout_{ms:g}ms")
+                assert sequence.camera.readout_s == 1e-3 * ms  # the scene is built while the optics are these
+                yield name, ms, sequence
+    fast.OPTICS = optics
+    for kind in GLOBAL if "global" in options.part else ():
+        for scene in options.scenes:
+            name = f"synthetic/{kind}@{scene}?frames={options.frames}"
+            yield name, 0.0, open_synthetic(name, root)
+    for folder in REAL if "real" in options.part else ():
+        if (SHARED / folder).is_dir():
+            yield folder, None, open_sequence(SHARED / folder)
+        else:
+            sys.stdout.write(f"{folder}: not judged, nothing under {SHARED}\n")
+
+
+def text(quantity: Quantity, scale: float) -> str:
+    """Estimate and interval, and whether it counts as observable."""
+    if quantity.value is None or quantity.low is None or quantity.high is None:
+        return "-"
+    interval = f"{scale * quantity.value:.1f} [{scale * quantity.low:.1f}, {scale * quantity.high:.1f}]"
+    return interval if quantity.observable else f"({interval})"
+
+
+def main() -> None:
+    """One line a recording, then the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--readouts", nargs="+", type=float, default=[0.0, 26.0])
+    parser.add_argument("--part", nargs="+", default=["fast", "global", "real"], choices=["fast", "global", "real"])
+    parser.add_argument("--data-root", type=Path)
+    options = parser.parse_args()
+    rolling, still, observable = [], [], 0
+    sys.stdout.write("recording | true ms | readout ms | truth within | delay ms | depth factor | processor s\n")
+    for name, truth, sequence in recordings(options):
+        began = time.process_time()
+        try:
+            found = calibrate(sequence)
+        except SequenceError as error:
+            sys.stdout.write(f"{name} | {error}\n")
+            continue
+        readout, delay, factor = found.quantities
+        within = None
+        if truth is not None and readout.low is not None and readout.high is not None:
+            within = 1e3 * readout.low <= truth <= 1e3 * readout.high
+            (rolling if truth else still).append(within)
+            observable += readout.observable
+        row = (name, truth, text(readout, 1e3), within, text(delay, 1e3), text(factor, 1))
+        sys.stdout.write(" | ".join(map(str, row)) + f" | {time.process_time() - began:.1f}\n")
+        sys.stdout.flush()
+    sys.stdout.write(
+        f"truth within the interval: {sum(rolling)} of {len(rolling)} rolling shutters, "
+        f"0 within: {sum(still)} of {len(still)} global ones; {observable} observable\n"
+    )
+
+
+if __name__ == "__main__":
+    main()
