@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,7 +39,7 @@ class Camera:
     depth_factor: float = 5000.0
     baseline_m: float = 0.075
     readout_s: float = 0.0
-    depth_delay_s: float = field(default=0.0, repr=False)  # the paired images that follow from it tell it in digests
+    depth_delay_s: float = 0.0
 
     @cached_property
     def matrix(self) -> NDArray[np.float64]:

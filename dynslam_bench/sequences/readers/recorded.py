@@ -94,7 +94,8 @@ class RecordedSequence:
         self._any_depth_size = any_depth_size
         self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
         delay_s = description.camera.depth_delay_s
-        colour, depth = contents.colour, replace(contents.depth, stamps=contents.depth.stamps + delay_s)
+        delayed = contents.depth.stamps_ns + round(1e9 * delay_s)
+        colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
         for file in (*colour.files, *depth.files):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
         if contents.paired and not delay_s:
