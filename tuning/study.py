@@ -43,7 +43,7 @@ from .study_file import StudySpec
 from .trials import best_trials, errors_in, errors_of
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-MADE_OF = ("parameters", "data", "program")
+MADE_OF = ("parameters", "data", "program", "version", "source")
 """What of a study's identity tells the data and the program that made it: must be the same to go on, not to read."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
 

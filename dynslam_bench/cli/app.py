@@ -10,7 +10,6 @@ import typer
 
 from dynslam_bench.core.download_progress import show_downloads
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.harmless import printable
 
 from . import (
     caches,
@@ -27,7 +26,7 @@ from . import (
     trackers,
 )
 from .ending import interrupted, leave_interrupted
-from .output import drawn_download, for_scripts
+from .output import complain_of, drawn_download, for_scripts
 from .panels import CARE, MEASURE, REPORT, START
 
 INTERRUPT_CODE = 130
@@ -90,7 +89,7 @@ def start(arguments: list[str] | None = None) -> None:
             leave_interrupted()
         if not isinstance(error, DynslamError):
             raise
-        _say(f"error: {error.headline}", *error.options)
+        complain_of(error)
         sys.exit(1)
     except SystemExit as ended:  # typer turns an interrupt within a command into this
         if ended.code == INTERRUPT_CODE:
@@ -117,10 +116,3 @@ def expand_lists(arguments: list[str]) -> list[str]:
             expanded.append(following)
         expanded.append(argument)
     return expanded
-
-
-def _say(text: str, *options: str) -> None:
-    line = printable(" ".join(text.split()))
-    sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")
-    for option in options:
-        sys.stderr.write(f"  - {printable(' '.join(option.split()))}\n")

@@ -16,6 +16,7 @@ from dynslam_bench.core.download_progress import Report
 from dynslam_bench.core.harmless import printable
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.errors import DynslamError
     from dynslam_bench.reports.tables.table import Table
 
 SOME_RUNS_FAILED = 3
@@ -58,6 +59,14 @@ def announce(text: str) -> None:
 def complain(text: str) -> None:
     """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
     sys.stderr.write(printable(text) + "\n")
+
+
+def complain_of(error: DynslamError) -> None:
+    """Write an error to standard error: its headline in one line, each cure below it."""
+    line = printable(" ".join(f"error: {error.headline}".split()))
+    sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")
+    for option in error.options:
+        sys.stderr.write(f"  - {printable(' '.join(option.split()))}\n")
 
 
 def can_ask() -> bool:

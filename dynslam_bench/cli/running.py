@@ -48,7 +48,7 @@ from .options import (
     Yes,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, announce, can_ask, complain, note, progress
+from .output import SOME_RUNS_FAILED, announce, can_ask, complain, complain_of, note, progress
 from .panels import MEASURE
 from .run_rows import drift_note, seen_note, show_pictures, show_runs
 
@@ -365,7 +365,7 @@ def make_runs(
         def fault(_: RunSpec, error: DynslamError) -> None:
             if faults is not None and str(error) not in faults:
                 faults.append(str(error))
-                complain(f"error: {error}")
+                complain_of(error)
 
         def planned(runs: Collection[ResolvedRun]) -> None:
             announce(plan_words(runs, store, jobs))

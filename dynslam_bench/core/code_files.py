@@ -26,6 +26,32 @@ def is_code(file: Path) -> bool:
     return (file.suffix in CODE or ".so." in file.name) and file.is_file()
 
 
+def foreign_modules(file: Path) -> set[str]:
+    """Top-level names of the modules outside its folder that a module imports, itself or through others of the folder.
+
+    Args:
+        file: A ``.py`` file, whose folder is taken to be on the path when it is imported.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    known, foreign = set[str](), set[str]()
+    waiting = [file]
+    while waiting:
+        names = imported_modules(waiting) - known
+        known |= names
+        waiting = []
+        for name in names:
+            module, package = file.parent / f"{name}.py", file.parent / name
+            if module.is_file():
+                waiting.append(module)
+            elif package.is_dir():
+                waiting += files_below(package)
+            else:
+                foreign.add(name)
+    return foreign
+
+
 def program_files(folder: Path) -> list[Path]:
     """The files below a folder that decide what its code does.
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import dynslam_bench
 
-from .code_files import files_below, imported_modules, is_code, program_files
+from .code_files import files_below, foreign_modules, imported_modules, is_code, program_files
 from .digests import code_files_digest, path_digest
 from .errors import PluginError
 from .records import digest
@@ -123,31 +123,33 @@ def plugin_digest(entry_point: str) -> str:
         return ""
     try:
         if module.endswith(".py"):
-            folder = Path(module).expanduser().resolve().parent
-            files = program_files(folder)
-            return digest([code_files_digest(files, folder), _dependencies(files)])
-        files = [file for place in _folders_of(top) for file in _files_of(place)]
-        return digest([[_whole(place) for place in _folders_of(top)], _dependencies(files)])
+            file = Path(module).expanduser().resolve()
+            files = program_files(file.parent)
+            return digest([code_files_digest(files, file.parent), _dependencies(foreign_modules(file))])
+        places = _folders_of(top)
+        names = imported_modules(file for place in places for file in _files_of(place)) - {top}
+        return digest([[_whole(place) for place in places], _dependencies(names)])
     except OSError as error:
         raise PluginError(f"cannot read the code of plug-in '{entry_point}': {error}") from error
 
 
-def _dependencies(files: Sequence[Path]) -> dict[str, str]:
-    """What code imports beside itself, this package and the standard library: versions, or digests of development code.
+def _dependencies(modules: set[str]) -> dict[str, str]:
+    """What modules beside this package and the standard library are: versions, or digests of development code.
+
+    Those that cannot be found are left out: an import that may fail.
 
     Raises:
         OSError: A file cannot be read.
     """
     found: dict[str, str] = {}
-    waiting = imported_modules(files)
+    waiting = set(modules)
     while waiting:
         top = waiting.pop()
         if top in found or top == _OWN or top in sys.stdlib_module_names:
             continue
         try:
             places = _folders_of(top)
-        except (PluginError, ImportError, ValueError):  # it lies in the plug-in's folder, or is not installed
-            found[top] = ""
+        except (PluginError, ImportError, ValueError):
             continue
         if any(part in ("site-packages", "dist-packages") for part in places[0].parts):
             found[top] = distribution_of_module(top)[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -120,6 +121,11 @@ class SegmentationSettings(Settings):
     @field_validator("classes", mode="before")
     @classmethod
     def _known_classes(cls, value: Any) -> Any:
+        if isinstance(value, str) and value.lstrip().startswith("["):  # a list as JSON, e.g. of --set
+            try:
+                value = json.loads(value)
+            except (ValueError, RecursionError):
+                raise ValueError("a list of class names is no valid JSON") from None
         if isinstance(value, (list, tuple, set, frozenset)):
             if not all(isinstance(part, str) for part in value):
                 raise ValueError("a list of class names holds text only")

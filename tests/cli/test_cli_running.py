@@ -146,7 +146,7 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, publis
     code, out, _ = cli(*command, "--yes", "--json")
     assert code == 0 and published.is_file()
     (row,) = json.loads(out)
-    assert (row["status"], row["masks"]) == ("ok", "coco")
+    assert (row["status"], row["segmentation"]) == ("ok", "coco")
     assert cli("run", "mask-rcnn", walk, "--frames", "0:3")[0] == 0, "nobody is asked again"
 
 

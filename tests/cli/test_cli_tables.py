@@ -55,6 +55,7 @@ def test_a_reports_table_has_no_markup(capsys):
 def test_an_error_of_the_tracked_frames_alone_is_said_to_be_one(capsys):
     def shown(coverage):
         row = dict.fromkeys((*run_rows.TITLES, *run_rows.WHERE_SAID), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
+        row |= {"static_camera_ate_rmse_m": 0.2}
         run_rows.show_rows([row], None, "p", as_json=False)
         return capsys.readouterr().out
 

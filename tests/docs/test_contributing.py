@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from pathlib import Path
 
@@ -63,38 +62,6 @@ def test_every_door_is_in_its_room() -> None:
     for rooms, door in doors():
         places = [base / room / door for room in rooms for base in (ROOT, ROOT / "dynslam_bench")]
         assert any(place.exists() for place in places), f"there is no {door} in {rooms}"
-
-
-def _functions() -> list[tuple[str, int]]:
-    found = []
-    for room in ("dynslam_bench", "envs", "tuning", "reports"):
-        for file in (ROOT / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(file.read_text())):
-                if isinstance(node, ast.FunctionDef):
-                    found.append((f"{file.relative_to(ROOT)}:{node.name}", (node.end_lineno or 0) - node.lineno + 1))
-    return found
-
-
-KERNEL = "a compiled loop over registers: divided, the values between its parts would go through memory"
-LONG_FUNCTIONS = {
-    "dynslam_bench/flow/daisy/refinement.py:similarity_lucas_kanade": KERNEL,
-    "dynslam_bench/flow/searches/moth_flame_kernel.py:moth_flame_phase": KERNEL,
-    "dynslam_bench/sequences/synthetic/kernels/raycast.py:shade_pixels": KERNEL,
-    "dynslam_bench/slam/bundle/schur.py:_step": KERNEL,
-    "dynslam_bench/slam/mapping/triangulation.py:_triangulate": KERNEL,
-}
-"""Functions above 60 lines, each with the reason why it is not divided."""
-
-
-def test_files_and_functions_stay_readable() -> None:
-    long_files = {
-        str(file.relative_to(ROOT))
-        for room in ("dynslam_bench", "envs", "tuning", "reports", "tests")
-        for file in (ROOT / room).rglob("*.py")
-        if len(file.read_text().splitlines()) > 400
-    }
-    assert not long_files
-    assert {name for name, lines in _functions() if lines > 60} == set(LONG_FUNCTIONS)
 
 
 def test_kernels_are_compiled_in_one_way() -> None:

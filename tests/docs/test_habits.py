@@ -22,6 +22,7 @@ PRIVATE = {
     "core/faults.py": ({"_exit"}, "os._exit: a fork that does not go on with the tests"),
     "core/test_core_hostile_text.py": ({"_exit"}, "os._exit: a process that dies at once"),
     "envs/envs_toys.py": ({"_exit"}, "os._exit: a process that dies at once"),
+    "envs/test_envs_wrappers.py": ({"_tracker"}, "a tracker's first random number"),
     "flow/test_flow_maps.py": ({"_binomial"}, "exact weights, before they are folded into a kernel"),
     "flow/test_flow_sparse.py": ({"_runner"}, "counts the threads' work, which no result shows"),
     "runs/hostile.py": ({"_exit"}, "os._exit: a process that dies at once"),
@@ -50,7 +51,10 @@ PRIVATE = {
     ),
 }
 """Private names that a test may use, each file with its reason."""
-CLOCK = {"core/files.py": "ages of files, which are stamped by that clock"}
+CLOCK = {
+    "core/digests.py": "ages of files, which are stamped by that clock",
+    "core/files.py": "ages of files, which are stamped by that clock",
+}
 """Where the clock of the wall decides anything: it may jump, the monotonic one may not."""
 
 

@@ -80,7 +80,7 @@ COVERS = {
     "7-scenes": (seven_scenes.read, seven_scenes.read_pose),
     "tartanair-shibuya": (tartanair_shibuya.read, arrays.read_metres),
     "openloris": (openloris.read, openloris.T_base_cam, yaml_numbers.read_yaml, yaml_numbers.numbers),
-    "vslam-lab": (vslam_lab, nanoseconds.read_rows, nanoseconds.column, nanoseconds.seconds),
+    "vslam-lab": (vslam_lab, nanoseconds.read_rows, nanoseconds.column, nanoseconds.nanoseconds),
     "euroc": (euroc, bodies.camera_on_body, bodies.camera_truth, nanoseconds.floats),
 }
 DAMAGED = {

@@ -202,7 +202,7 @@ def test_no_ground_truth(store: RunStore, tmp_path: Path) -> None:
         ({"tracker": "mask-rccn"}, "unknown tracker 'mask-rccn'.*mask-rcnn"),
         ({"settings": {"noise.levl_m": 1}}, "unknown setting 'noise.levl_m'.*noise.level_m"),
         ({"sequence": "bonn/crowdd"}, "unknown sequence 'bonn/crowdd'.*bonn/crowd"),
-        ({"frames": (3, 4)}, "1 frames here, a run needs 2 or more"),
+        ({"frames": (3, 4)}, "1 frames here, an episode needs 2 or more"),
         ({"device": "cuda:77"}, "cuda:77"),
         ({"degrade": {"fog": 1.0}}, "unknown degradation 'fog'.*blur"),
         ({"degrade": {"blurr": 1.0}}, "unknown degradation 'blurr'.*did you mean 'blur'"),

@@ -84,7 +84,7 @@ def test_an_edited_plug_in_is_another_run(toy_folder: str, tmp_path: Path) -> No
     shutil.copy(TARGET.rpartition(":")[0], plugin)
     spec = RunSpec(tracker=f"{plugin}:SPEC", sequence=toy_folder)
     before = resolve(spec).run_id
-    plugin.write_text(plugin.read_text() + "\n# edited\n")
+    plugin.write_text(plugin.read_text() + "\nEDITED = True\n")
     assert resolve(spec).run_id != before
 
 
@@ -107,7 +107,7 @@ def test_an_edited_plug_in_that_a_setting_names_is_another_run(
         before = resolve(spec).run_id
         (tmp_path / name / "readme.txt").write_text("not code")
         assert resolve(spec).run_id == before
-        plugin.write_text(plugin.read_text() + "# edited\n")
+        plugin.write_text(plugin.read_text() + "EDITED = True\n")
         assert resolve(spec).run_id != before, name
 
 

@@ -53,7 +53,7 @@ def test_tensorboard_reads_the_trials(tmp_path: Path, named: bool) -> None:
 
 def test_without_tensorboard_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(StudyError, match=r"needs the package tensorboard \(pip install 'dynslam-bench\[tensorboard\]'"):
+    with pytest.raises(StudyError, match=r"needs the package tensorboard \(pip install '\.\[tensorboard\]'"):
         TensorBoard(tmp_path)
 
 
