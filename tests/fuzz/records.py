@@ -115,7 +115,7 @@ def _read_metrics(data: bytes | None, folder: Path) -> None:
     store = _store(folder, _stored(f"runs/{RUN}/run.json"))
     protocol = get_protocol("tum-rgbd/v1")
     at(store.root / "metrics" / protocol.digest(), f"{RUN}.json", data)
-    found = store.metrics(RUN, protocol)
+    found = store.stored_metrics(RUN, protocol)
     assert found is None or found.run_id == RUN
 
 
