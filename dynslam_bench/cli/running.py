@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
@@ -46,7 +47,7 @@ from .options import (
 )
 from .output import SOME_RUNS_FAILED, note, progress
 from .panels import MEASURE
-from .run_rows import drift_note, seen_note, show_pictures, show_runs
+from .run_rows import drift_note, recording_note, seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.core.records import Record
@@ -270,6 +271,8 @@ def finish(
     for caution in (seen_note(records), drift_note(made, store)):
         if caution:
             note(caution)
+    if not as_json and sys.stderr.isatty():
+        note(recording_note(specs, records, store, protocol))
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)
