@@ -12,7 +12,7 @@ from dynslam_bench.core.toml import label_text
 from .output import complain, write, write_columns, write_json
 
 if TYPE_CHECKING:
-    from dynslam_bench.runs import RunRecord, RunStore
+    from dynslam_bench.runs import RunRecord, RunSpec, RunStore
     from dynslam_bench.runs.storage.run_index import Row
 
 TITLES = {
@@ -138,3 +138,37 @@ def drift_note(records: Sequence[RunRecord], store: RunStore) -> str:
         f"{long[0][0]}, without loop closing: what drifts on such a way stays, with every frame ok; loops are closed "
         "with --set backend.loop_closing.enabled=true"
     )
+
+
+FRAMES_OF_A_HINT = 60
+"""Frames that are compared when a run fails: a few seconds."""
+
+
+def recording_note(specs: Sequence[RunSpec], records: Sequence[RunRecord], store: RunStore, protocol: str) -> str:
+    """One line on a fault of the first recording on which a run failed, was lost or was no better than not moving.
+
+    Empty if no run of a recording did, or where a short check of the recording finds no fault.
+    """
+    from dynslam_bench.runs.spec import place_of
+    from dynslam_bench.sequences.doctor import diagnose
+
+    asked = {place_of(spec.sequence) or spec.sequence: spec for spec in specs}
+    for record in records:
+        spec = asked.get(record.place or record.sequence.id)
+        failed = record.failed or record.status == "lost" or _no_better(record, store, protocol)
+        if spec is None or spec.sequence.startswith("synthetic/") or not failed:
+            continue
+        found = diagnose(spec.sequence, data_root=spec.data_root, camera=spec.camera, most_frames=FRAMES_OF_A_HINT)
+        if found.ok:
+            return ""
+        how = f"dynslam-bench sequences doctor {spec.sequence}{f' --camera {spec.camera}' if spec.camera else ''}"
+        return f"{record.sequence.id} has a fault: {found.findings[0].text}; more by: {how}"
+    return ""
+
+
+def _no_better(record: RunRecord, store: RunStore, protocol: str) -> bool:
+    """Whether the error of a run is that of a camera that never moves, or more."""
+    scored = None if record.status == "stopped" or record.tracker.id == "never-move" else store.score(record, protocol)
+    errors = {} if scored is None else scored.metrics
+    error, bound = errors.get("ate_rmse_m"), errors.get("static_camera_ate_rmse_m")
+    return error is not None and bound is not None and error >= bound

@@ -50,7 +50,7 @@ from .options import (
 )
 from .output import SOME_RUNS_FAILED, announce, can_ask, complain, complain_of, note, progress
 from .panels import MEASURE
-from .run_rows import drift_note, seen_note, show_pictures, show_runs
+from .run_rows import drift_note, recording_note, seen_note, show_pictures, show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.core.errors import DynslamError
@@ -294,6 +294,8 @@ def finish(
         if caution:
             note(caution)
     announce_unscored(records, store)
+    if not as_json and (fault := recording_note(specs, records, store, protocol)):
+        announce(fault)
     note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
     if faults or MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
         raise typer.Exit(SOME_RUNS_FAILED)

@@ -1,4 +1,4 @@
-"""``sequences list|info|fetch|verify|unpack|render|calibrate``."""
+"""``sequences list|info|fetch|verify|doctor|calibrate|unpack|render``."""
 
 from __future__ import annotations
 
@@ -151,6 +151,33 @@ def verify(
             for fault in report.faults:
                 write(f"  {fault}")
     if not all(report.ok for report in reports):
+        raise typer.Exit(VERIFICATION_FAILED)
+
+
+@app.command()
+def doctor(
+    name: Annotated[
+        str, typer.Argument(help="Id, published folder name or path.", autocompletion=completion.sequences)
+    ],
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare a recording's images with its camera and its truth; exits with 4 where a fault was found."""
+    from dynslam_bench.sequences.doctor import diagnose
+
+    with progress(name) as advance:
+        diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
+    if as_json:
+        write_json({**asdict(diagnosis), "ok": diagnosis.ok})
+    else:
+        faults = sum(finding.severity == "fault" for finding in diagnosis.findings)
+        verdict = "no fault found" if diagnosis.ok else f"{faults} fault{'s' * (faults != 1)}"
+        write(f"{diagnosis.id}: {verdict}, {diagnosis.frames} frames compared")
+        for finding in diagnosis.findings:
+            write(f"  {finding.severity} {finding.id}: {finding.text}")
+            write(f"    cure: {finding.cure}")
+    if not diagnosis.ok:
         raise typer.Exit(VERIFICATION_FAILED)
 
 

@@ -49,7 +49,10 @@ class Opened:
 
 def test_without_the_library_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(RunError, match=r"rerun-sdk, which is not installed \(pip install '\.\[rerun\]' in the checkout of dynslam-bench\)"):
+    with pytest.raises(
+        RunError,
+        match=r"rerun-sdk, which is not installed \(pip install '\.\[rerun\]' in the checkout of dynslam-bench\)",
+    ):
         check_rerun()
 
 

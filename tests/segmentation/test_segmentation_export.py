@@ -141,5 +141,7 @@ def test_what_cannot_be_exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         parse_size("640")
     assert parse_size("640x480") == (480, 640) and weights_of("embedded") == (embedded_weights(), 0)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(SegmentationError, match=r"onnx is not installed \(pip install '\.\[onnx\]' in the checkout of dynslam-bench\)"):
+    with pytest.raises(
+        SegmentationError, match=r"onnx is not installed \(pip install '\.\[onnx\]' in the checkout of dynslam-bench\)"
+    ):
         write_onnx(tiny(), tmp_path / "x.onnx")

@@ -1,0 +1,311 @@
+"""Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
+
+Contours of depth are contours in the colour image, too, at the same place and time. Their correlation over shifts,
+mirrorings and delays says whether the depth is registered, which way up the images are, and whether the two streams
+are synchronous.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Frame
+
+from .finding import Finding
+
+Map = NDArray[np.float32]
+
+MAP_WIDTH = 160
+"""Width of the maps of contours, in cells; of an image 640 pixels wide a cell is 4 pixels."""
+MOST_DELAY = 10
+"""Largest delay between colour and depth that is looked for, in frames."""
+FLIPS = {"": (1, 1), "upside down": (-1, 1), "mirrored": (1, -1), "turned by 180 degrees": (-1, -1)}
+
+
+@dataclass(eq=False)
+class Streams:
+    """What is kept of the frames that were read, stretch by stretch.
+
+    Attributes:
+        depth_factor: Raw units a metre.
+        seconds_a_frame: Median interval of the stamps.
+        frames: How many frames were added.
+        dark: How many have a colour image without contrast.
+        empty: How many have no depth.
+        medians: Median depth of each frame that has any, metres.
+        colour_run: Most equal colour images in a row.
+        depth_run: Most equal depth images in a row.
+        rough: Median step between neighbouring raw depths relative to the depth, and the same with swapped bytes.
+        by_flip: Sum of the correlations of the contours over circular shifts ``[H, W]``, for each of `FLIPS`.
+        by_shift: The same as they are, for each delay of the depth ``[2 * MOST_DELAY + 1, H, W]``.
+        by_delay: Correlation of the contours of each colour image with those of depth images up to `MOST_DELAY` frames
+            before and after ``[N, 2 * MOST_DELAY + 1]``; NaN beyond the stretch.
+        cell_px: Pixels a cell of the maps.
+    """
+
+    depth_factor: float
+    seconds_a_frame: float
+    frames: int = 0
+    dark: int = 0
+    empty: int = 0
+    medians: list[float] = field(default_factory=list)
+    colour_run: int = 1
+    depth_run: int = 1
+    rough: list[tuple[float, float]] = field(default_factory=list)
+    by_flip: dict[str, Map] = field(default_factory=dict)
+    by_shift: Map = field(default_factory=lambda: np.zeros(0, np.float32))
+    shifted: NDArray[np.intp] = field(default_factory=lambda: np.zeros(2 * MOST_DELAY + 1, np.intp))
+    by_delay: list[NDArray[np.float64]] = field(default_factory=list)
+    cell_px: int = 1
+
+    def add(self, stretch: list[Frame]) -> None:
+        """Add consecutive frames of one size."""
+        colour_maps, depth_maps = [], []
+        colour_run = depth_run = 1
+        for number, frame in enumerate(stretch):
+            if number:
+                before = stretch[number - 1]
+                colour_run = colour_run + 1 if np.array_equal(frame.rgb, before.rgb) else 1
+                depth_run = depth_run + 1 if np.array_equal(frame.depth, before.depth) else 1
+                self.colour_run, self.depth_run = max(self.colour_run, colour_run), max(self.depth_run, depth_run)
+            gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+            valid = frame.depth[::4, ::4]
+            valid = valid[valid > 0]
+            self.frames += 1
+            self.dark += bool(gray.std() < 1.0)
+            self.empty += bool(len(valid) < 100)
+            if len(valid) >= 100:
+                self.medians.append(float(np.median(valid)))
+                if number % 5 == 0:
+                    self.rough.append(_roughness(frame.depth, self.depth_factor))
+            self.cell_px = max(1, round(gray.shape[1] / MAP_WIDTH))
+            colour_maps.append(_standardised(_colour_contours(gray, self.cell_px)))
+            depth_maps.append(_standardised(_depth_contours(frame.depth, self.cell_px)))
+        self._correlate(colour_maps, depth_maps)
+
+    def _correlate(self, colour_maps: list[Map], depth_maps: list[Map]) -> None:
+        shape = colour_maps[0].shape
+        colours = [np.fft.rfft2(each) for each in colour_maps]
+        depths = [np.conj(np.fft.rfft2(each)) for each in depth_maps]
+        sums = np.zeros((2 * MOST_DELAY + 1, *colours[0].shape), np.complex128)
+        for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
+            for index in range(0, len(colours), 2):
+                if 0 <= index + delay < len(depths):
+                    sums[column] += colours[index] * depths[index + delay]
+                    self.shifted[column] += 1
+        surfaces = np.fft.irfft2(sums, s=shape).astype(np.float32)
+        self.by_shift = surfaces if not len(self.by_shift) else self.by_shift + surfaces
+        for name, (rows, columns) in FLIPS.items():
+            flipped = sum(
+                colour * np.conj(np.fft.rfft2(depth[::rows, ::columns]))
+                for colour, depth in zip(colours[::4], depth_maps[::4], strict=True)
+            )
+            surface = np.fft.irfft2(flipped, s=shape).astype(np.float32)
+            self.by_flip[name] = self.by_flip.get(name, np.zeros_like(surface)) + surface
+        smooth = [np.stack([cv2.GaussianBlur(each, (0, 0), 1.0).ravel() for each in maps])
+                  for maps in (colour_maps, depth_maps)]  # fmt: skip
+        products = smooth[0] @ smooth[1].T
+        rows = np.full((len(products), 2 * MOST_DELAY + 1), np.nan)
+        for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
+            diagonal = np.diagonal(products, delay)
+            first = max(0, -delay)
+            rows[first : first + len(diagonal), column] = diagonal
+        self.by_delay.extend(rows)
+
+
+def _roughness(depth: Map, factor: float) -> tuple[float, float]:
+    raw = np.clip(np.round(depth[::2].astype(np.float64) * factor), 0, 65535).astype(np.uint16)
+    both = (raw[:, 1:] > 0) & (raw[:, :-1] > 0)
+    if both.sum() < 100:
+        return np.nan, np.nan
+    steps = []
+    for values in (raw, raw.byteswap()):
+        wide = values.astype(np.float64)
+        steps.append(
+            float(np.mean(np.minimum(np.abs(np.diff(wide, axis=1))[both] / np.maximum(wide[:, 1:], 1)[both], 1)))
+        )
+    return steps[0], steps[1]
+
+
+def _colour_contours(gray: NDArray[np.uint8], cell: int) -> Map:
+    small = cv2.resize(gray, (gray.shape[1] // cell, gray.shape[0] // cell), interpolation=cv2.INTER_AREA)
+    wide = small.astype(np.float32)
+    return np.asarray(np.sqrt(np.hypot(cv2.Sobel(wide, -1, 1, 0), cv2.Sobel(wide, -1, 0, 1))), np.float32)
+
+
+def _depth_contours(depth: Map, cell: int) -> Map:
+    """The step in depth around each cell, as a logarithm; missing depth is no contour."""
+    rows, columns = depth.shape[0] // cell, depth.shape[1] // cell
+    blocks = depth[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
+    far = cv2.dilate(blocks.max(axis=(1, 3)), np.ones((3, 3), np.uint8))
+    near = cv2.erode(
+        np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3)).astype(np.float32), np.ones((3, 3), np.uint8)
+    )
+    known = (far > 0) & np.isfinite(near)
+    return np.where(known, np.minimum(np.log(np.where(known, far / np.where(known, near, 1), 1)), 0.3), 0).astype(
+        np.float32
+    )
+
+
+def _standardised(values: Map) -> Map:
+    """Without slow changes across the image, with zero mean and unit length."""
+    sharp = values - cv2.blur(values, (25, 25))
+    sharp -= sharp.mean()
+    return np.asarray(sharp / max(float(np.linalg.norm(sharp)), 1e-9), np.float32)
+
+
+FROZEN_FRAMES = 4
+LEAST_SHIFT_PX = 14.0
+"""A shift of the depth below this occurs in published data: 7-Scenes' depth is not registered to its colour."""
+LEAST_DELAY = 2
+"""In frames; the first Kinect's depth lags by nearly one."""
+CLEAR_PEAK = 7.0
+"""Of a correlation, in standard deviations over all shifts: what has nothing in common stays below 6."""
+DEPTH_RANGE_M = (0.1, 60.0)
+
+
+def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
+    """What is wrong with the images alone, the most basic fault first; what follows from a fault is not repeated.
+
+    Args:
+        streams: Statistics of the frames that were read.
+        with_depth: Whether the sequence announces depth images.
+    """
+    if not with_depth:
+        text = "the sequence has no depth images: only the colour images were checked"
+        blank = _no_contrast(streams)
+        return [blank] if blank else [Finding("no-depth", "note", None, "", text, "add depth images to check more")]
+    for check in (_no_contrast, _no_depth, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted):
+        finding = check(streams)
+        if finding is not None:
+            return [finding]
+    return []
+
+
+def _no_contrast(streams: Streams) -> Finding | None:
+    if streams.dark < 0.5 * streams.frames:
+        return None
+    text = f"{streams.dark} of {streams.frames} colour images hold one brightness only"
+    return Finding(
+        "colour-blank", "fault", streams.dark / streams.frames, "", text, "record or export the colour again"
+    )
+
+
+def _no_depth(streams: Streams) -> Finding | None:
+    if streams.empty < 0.5 * streams.frames:
+        return None
+    text = f"{streams.empty} of {streams.frames} depth images hold no depth"
+    cure = "record or export the depth again, or use trackers that need none"
+    return Finding("depth-empty", "fault", streams.empty / streams.frames, "", text, cure)
+
+
+def _frozen(streams: Streams) -> Finding | None:
+    colour, depth = streams.colour_run >= FROZEN_FRAMES, streams.depth_run >= FROZEN_FRAMES
+    if colour == depth:  # a rendered camera at rest repeats both; the truth says whether it rests
+        return None
+    run, name = (streams.colour_run, "colour") if colour else (streams.depth_run, "depth")
+    other = "depth" if colour else "colour"
+    text = f"one {name} image is repeated {run} times in a row while the {other} changes"
+    return Finding(f"{name}-frozen", "fault", float(run), "frames", text, f"export the {name} images again")
+
+
+def _swapped(streams: Streams) -> Finding | None:
+    stated, swapped = np.nanmedian(np.array(streams.rough or [(np.nan, np.nan)]), axis=0)
+    if not swapped < stated / 3:
+        return None
+    text = (
+        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the two bytes of "
+        "each value swapped"
+    )
+    cure = "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)"
+    return Finding("depth-byte-order", "fault", float(stated), "", text, cure)
+
+
+def _units(streams: Streams) -> Finding | None:
+    median = float(np.median(streams.medians))
+    if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
+        return None
+    text = f"the median depth is {median:.3g} m with {streams.depth_factor:g} raw units a metre"
+    likely = next(
+        (f for f in (1.0, 100.0, 1000.0, 5000.0) if 0.4 < median * streams.depth_factor / f < 8), streams.depth_factor
+    )
+    cure = f"set depth_factor in camera.toml (here perhaps {likely:g}), or store arrays in metres"
+    return Finding("depth-units", "fault", median, "m", text, cure)
+
+
+def _flipped(streams: Streams) -> Finding | None:
+    peaks = {name: _peak(surface, 8)[0] for name, surface in streams.by_flip.items()}
+    best = max(peaks, key=lambda name: peaks[name])
+    if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
+        return None
+    text = (
+        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard deviations so, "
+        f"by {peaks['']:.0f} as stored"
+    )
+    return Finding(
+        "colour-flipped", "fault", peaks[best], "sigma", text, "turn the colour images as the depth images are"
+    )
+
+
+def _asynchronous(streams: Streams) -> Finding | None:
+    rows = np.array(streams.by_delay)
+    pairs = np.isfinite(rows).sum(axis=0)
+    usable = pairs >= max(10, 0.3 * len(rows))
+    peaks = np.array(
+        [_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(streams.by_shift, usable, strict=True)]
+    )
+    mean = np.where(usable, np.nansum(rows, axis=0) / np.maximum(pairs, 1), -np.inf)
+    column = int(np.argmax(mean))
+    delay = column - MOST_DELAY
+    if abs(delay) < LEAST_DELAY or peaks[column] < CLEAR_PEAK:
+        return None
+    near = slice(MOST_DELAY - 1, MOST_DELAY + 2)
+    reference = MOST_DELAY - 1 + int(np.argmax(mean[near]))
+    better = rows[:, column] - rows[:, reference]
+    better = better[np.isfinite(better)]
+    sure = float(better.mean() / max(better.std() / np.sqrt(len(better) / 5), 1e-9))
+    if sure < 4 or mean[column] < 1.25 * max(mean[reference], 0) or peaks[column] < 1.1 * peaks[near].max():
+        return None
+    seconds = delay * streams.seconds_a_frame
+    later = "later" if delay > 0 else "earlier"
+    text = (
+        f"the depth images fit the colour images of {abs(delay)} frames {'before' if delay > 0 else 'after'} "
+        f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
+    )
+    cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt; it comes {later}"
+    return Finding("depth-delay", "fault", seconds, "s", text, cure)
+
+
+def _shifted(streams: Streams) -> Finding | None:
+    middle = (
+        streams.by_shift[MOST_DELAY - 1 : MOST_DELAY + 2]
+        / np.maximum(streams.shifted[MOST_DELAY - 1 : MOST_DELAY + 2], 1)[:, None, None]
+    )
+    found = [(*_peak(surface, 30), float(surface[y, x])) for surface in middle
+             for y, x in [_peak(surface, 30)[1]]]  # fmt: skip
+    clear, (row, column), height = max(found, key=lambda each: each[2])
+    shape = middle.shape[1:]
+    down, right = (row + shape[0] // 2) % shape[0] - shape[0] // 2, (column + shape[1] // 2) % shape[1] - shape[1] // 2
+    size = float(np.hypot(down, right)) * streams.cell_px
+    rolled = np.roll(middle, (2, 2), (1, 2))[:, :5, :5]
+    if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or height < 1.4 * rolled.max():
+        return None
+    text = (
+        f"the depth lies {size:.0f} pixels beside the colour ({-right * streams.cell_px:+d} right, "
+        f"{-down * streams.cell_px:+d} down)"
+    )
+    return Finding("depth-not-registered", "fault", size, "px", text, "register the depth to the colour camera")
+
+
+def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
+    """Height in standard deviations and place of the peak within `reach` cells of no shift."""
+    height, width = surface.shape
+    reach_y, reach_x = min(reach, height // 2 - 1), min(reach, width // 2 - 1)
+    near = np.roll(surface, (reach_y, reach_x), (0, 1))[: 2 * reach_y + 1, : 2 * reach_x + 1]
+    y, x = np.unravel_index(int(near.argmax()), near.shape)
+    deviation = (float(near[y, x]) - float(surface.mean())) / max(float(surface.std()), 1e-12)
+    return deviation, ((int(y) - reach_y) % height, (int(x) - reach_x) % width)

@@ -1,0 +1,612 @@
+"""Does the ground truth of a recording tell the motion that its images show?
+
+The motion between frames (`rgbd_motion`) is compared with that of the truth: as it stands, shifted in time, inverted,
+with its quaternions read in the other order, in other axes. Where the two agree, camera and depth are measured by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.association import nearest_gap
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+
+from .finding import Finding
+from .rgbd_motion import RgbdPair
+
+Array = NDArray[np.float64]
+
+LARGEST_SHIFT_S = 2.0
+READINGS = ("as it stands", "inverted", "w first", "w first, inverted", "rotations inverted")
+ROTATION_NOISE = np.radians(0.25)
+TRANSLATION_NOISE = 0.006
+"""Of a measured motion: as a part of the median depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Measured motions between pairs of frames.
+
+    Attributes:
+        start: Stamps of the first frames ``[N]``.
+        end: Stamps of the second frames ``[N]``.
+        rotation: Rotation vectors ``[N, 3]`` in rad.
+        translation: Translations ``[N, 3]`` in metres of the depth images.
+        depth_m: Median depth of the corners.
+    """
+
+    start: Array
+    end: Array
+    rotation: Array
+    translation: Array
+    depth_m: float
+
+    def select(self, index: NDArray[np.bool_]) -> Motions:
+        """Some of them."""
+        return Motions(self.start[index], self.end[index], self.rotation[index], self.translation[index], self.depth_m)
+
+
+def motions_of(pairs: PySequence[RgbdPair], stamps: Array) -> Motions:
+    """The motions of pairs that have one."""
+    twists = se3.log(np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4))
+    poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
+    first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
+    depths = [float(np.median(pair.depth_first[pair.inliers])) for pair in pairs]
+    median = float(np.median(depths)) if depths else 1.0
+    return Motions(stamps[first], stamps[second], twists[:, 3:], poses[:, :3, 3], median)
+
+
+class TruthMotion:
+    """A truth that is asked for motions at any stamps: poses between its own are interpolated.
+
+    Args:
+        truth: Poses at their stamps.
+        reading: How to read them, one of `READINGS`.
+    """
+
+    def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
+        self.stamps = truth.timestamps
+        self.poses = read_as(truth.T_world_cam, reading)
+        steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
+        self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
+        gaps = np.diff(self.stamps)
+        self._widest = max(0.12, 2.5 * float(np.median(gaps))) if len(gaps) else 0.0
+
+    def at(self, stamps: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses ``[N, 4, 4]`` and whether the truth has them: not beyond its ends nor in its holes."""
+        if len(self.stamps) < 2:
+            return np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
+        index = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2)
+        low, high = self.stamps[index], self.stamps[index + 1]
+        share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
+        poses = self.poses[index].copy()
+        turn = np.zeros((len(stamps), 6))
+        turn[:, 3:] = share * self._turns[index]
+        poses[:, :3, :3] = poses[:, :3, :3] @ se3.exp(turn)[:, :3, :3]
+        poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
+        slack = 0.005
+        inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
+        return poses, inside & (high - low <= self._widest)
+
+    def between(self, start: Array, end: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Poses at `start`, relative poses from there to `end`, their rotation vectors, and which of them there are."""
+        first, valid = self.at(start)
+        second, valid_too = self.at(end)
+        relative = se3.inverse(first) @ second
+        return first, relative, se3.log(relative)[:, 3:], valid & valid_too
+
+
+def read_as(poses: Array, reading: str) -> Array:
+    """Poses ``[N, 4, 4]`` of a file that was written in the convention `reading` and read as if in TUM's."""
+    if reading == READINGS[0]:
+        return poses
+    if reading == "inverted":
+        return se3.inverse(poses)
+    if reading == "rotations inverted":
+        turned = poses.copy()
+        turned[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+        return turned
+    position, quaternion = se3.to_quaternion(poses)
+    turned = se3.from_quaternion(position, quaternion[:, [1, 2, 3, 0]])
+    return se3.inverse(turned) if reading == "w first, inverted" else turned
+
+
+def agreement(measured: Array, true: Array, gain: float) -> float:
+    """How well vectors ``[N, 3]`` agree up to a gain: 1 - the weighted median of their relative differences.
+
+    1 is perfect; independent directions give some 0.3; less is the opposite.
+    """
+    true = gain * true
+    size = np.linalg.norm(measured, axis=1) + np.linalg.norm(true, axis=1)
+    off = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
+    order = np.argsort(off)
+    total = np.cumsum(size[order])
+    if not len(total) or total[-1] <= 0:
+        return 0.0
+    return 1.0 - float(off[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def best_gain(measured: Array, true: Array, low: float, high: float) -> float:
+    """The ratio of the lengths of vectors, by their weighted sums, within bounds."""
+    a, b = np.linalg.norm(measured, axis=1).sum(), np.linalg.norm(true, axis=1).sum()
+    return float(np.clip(a / max(b, 1e-12), low, high))
+
+
+def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Array:
+    """The orthogonal matrix ``[3, 3]`` that turns `measured` ``[N, 3]`` into `true` best, by three robust rounds."""
+    weight = np.ones(len(measured))
+    X = np.eye(3)
+    gain = 1.0 / best_gain(measured, true, 1e-6, 1e6)
+    for _ in range(4):
+        left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
+        sign = np.linalg.det(left @ right) if proper else 1.0
+        X = left @ np.diag([1.0, 1.0, sign]) @ right
+        off = np.linalg.norm(true - gain * measured @ X.T, axis=1)
+        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-12)) ** 2)
+    return np.asarray(X)
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well a truth, read in one way and shifted in time, tells the measured motions.
+
+    Attributes:
+        reading: One of `READINGS`.
+        shift_s: What is added to the images' stamps to find their poses.
+        rotation: `agreement` of the rotations.
+        translation: `agreement` of the translations.
+        weights: What either counts: near 1 where the motion is far above the noise.
+        gain: Ratio of the lengths of the measured translations to the true ones.
+        share: Part of the motions for which the truth has poses.
+    """
+
+    reading: str
+    shift_s: float
+    rotation: float
+    translation: float
+    weights: tuple[float, float]
+    gain: float
+    share: float
+
+    @property
+    def total(self) -> float:
+        """Weighted mean of both agreements."""
+        w = self.weights
+        return (w[0] * self.rotation + w[1] * self.translation) / max(w[0] + w[1], 1e-9)
+
+
+def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) -> Match:
+    """Compare the motions with those of a truth under a shift in time."""
+    _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
+    share = float(valid.mean()) if len(valid) else 0.0
+    if valid.sum() < 5:
+        return Match(reading, shift_s, 0.0, 0.0, (0.0, 0.0), 1.0, share)
+    v, tau = motions.rotation[valid], motions.translation[valid]
+    rho, turns = relative[valid, :3, 3], turns[valid]
+    snr = float(np.median(np.linalg.norm(v, axis=1))) / ROTATION_NOISE
+    snr_t = float(np.median(np.linalg.norm(tau, axis=1))) / (TRANSLATION_NOISE * motions.depth_m)
+    gain = best_gain(tau, rho, 1e-6, 1e6)
+    return Match(
+        reading,
+        shift_s,
+        agreement(v, turns, best_gain(v, turns, 0.4, 2.5)),
+        agreement(tau, rho, gain),
+        (snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)),
+        gain,
+        share,
+    )
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Camera and mounting that make the truth's motion carry the corners from image to image.
+
+    Attributes:
+        value: ``focal`` and ``scale`` (of the depth) as natural logarithms of the factor, ``cx`` and ``cy`` as pixels
+            to be added, ``turn`` the rotation vector ``[3]`` in rad and ``lever`` the position ``[3]`` in metres of the
+            camera in the frame of the body that the truth tracks.
+        sigma: Their standard deviations, each pair of frames being one observation.
+        residual_px: Median reprojection error.
+        cost: Mean robust cost of a corner.
+    """
+
+    value: dict[str, Array]
+    sigma: dict[str, Array]
+    residual_px: float
+    cost: float
+
+    def size(self, name: str) -> float:
+        """Length of a value."""
+        return float(np.linalg.norm(self.value[name]))
+
+    def certainty(self, name: str) -> float:
+        """Length of a value in standard deviations of it."""
+        return self.size(name) / max(float(np.linalg.norm(self.sigma[name])), 1e-12)
+
+
+_PARAMETERS = {"focal": slice(0, 1), "cx": slice(1, 2), "cy": slice(2, 3), "scale": slice(3, 4),
+               "turn": slice(4, 7), "lever": slice(7, 10)}  # fmt: skip
+_PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+_CORNERS_A_PAIR = 25
+_OUTLIER_PX = 2.0
+
+
+def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
+    """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
+
+    Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.
+    A weak prior keeps what the motion does not tell near what is stated.
+
+    Args:
+        pairs: Pairs of frames with a motion.
+        relative: Motions of the truth between them ``[N, 4, 4]``, in the depth's units.
+        camera: The stated camera.
+        free: Names of what is fitted, of `Fit.value`; the rest stays as stated.
+    """
+    from scipy.optimize import least_squares
+
+    chosen = [np.flatnonzero(pair.inliers) for pair in pairs]
+    chosen = [index[:: max(1, len(index) // _CORNERS_A_PAIR)][:_CORNERS_A_PAIR] for index in chosen]
+    number = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen])
+    first, depth, second = (
+        np.concatenate([getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)])
+        for name in ("pixels_first", "depth_first", "pixels_second")
+    )
+    back = se3.inverse(relative)
+
+    def errors(x: Array) -> Array:
+        focal = np.exp(x[0]) * np.array([camera.fx, camera.fy])
+        centre = np.array([camera.cx, camera.cy]) + x[1:3]
+        rays = np.concatenate([(first - centre) / focal, np.ones((len(first), 1))], axis=1)
+        mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
+        mount[:3, 3] = x[7:10]
+        moves = se3.inverse(mount) @ back @ mount
+        points = np.exp(x[3]) * depth[:, None] * rays
+        moved = np.einsum("nij,nj->ni", moves[number, :3, :3], points) + moves[number, :3, 3]
+        seen = moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre
+        return (seen - second).ravel()
+
+    index = np.array([i for name in free for i in range(10)[_PARAMETERS[name]]], int)
+
+    def filled(part: Array) -> Array:
+        x = np.zeros(10)
+        x[index] = part
+        return x
+
+    def robust(part: Array) -> Array:
+        x = filled(part)
+        raw = errors(x).reshape(-1, 2) / _OUTLIER_PX
+        square = (raw**2).sum(axis=1, keepdims=True)
+        shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
+        return np.concatenate([shrunk.ravel(), x / _PRIOR])
+
+    scales = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
+    x = filled(least_squares(robust, np.zeros(len(index)), x_scale=scales[index]).x) if len(index) else np.zeros(10)
+    left = errors(x).reshape(-1, 2)
+    weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
+    steps = np.diag(np.array([1e-4, 0.05, 0.05, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]))
+    slopes = np.stack([(errors(x + s) - errors(x - s)) / (2 * s.sum()) for s in steps], axis=1).reshape(-1, 2, len(x))
+    curvature = np.einsum("npi,n,npj->ij", slopes, weight, slopes) + np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
+    pulls = np.zeros((len(pairs), len(x)))
+    np.add.at(pulls, number, np.einsum("npi,n,np->ni", slopes, weight, left))
+    chosen_ones = np.ix_(index, index)
+    inverse = np.linalg.inv(curvature[chosen_ones])
+    outer = pulls.T @ pulls + np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
+    spread = inverse @ outer[chosen_ones] @ inverse
+    deviation = filled(np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(len(pairs) / max(len(pairs) - len(index), 1)))
+    names = _PARAMETERS.items()
+    return Fit(
+        {name: x[where] for name, where in names},
+        {name: deviation[where] for name, where in names},
+        float(np.median(np.linalg.norm(left, axis=1))),
+        float((robust(x[index]) ** 2).sum() / len(first)),
+    )
+
+
+SAME_FRAME_S = 0.02
+LEAST_COVERAGE = 0.15
+LEAST_PAIRS = 6
+REST_PX = 2.0
+GOOD = 0.75
+"""`Match.total` of a truth that tells the motion: healthy recordings have 0.78 to 0.98, other readings up to 0.5."""
+UNLIKE = 0.6
+LEAST_TIME_S = 0.05
+_STEP_S = 0.025
+_RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
+_CURES = {
+    "inverted": ("truth-inverted", "the poses are world-to-camera", "invert them: p -> -R^T p, R -> R^T"),
+    "w first": ("truth-quaternion-order", "the quaternions are in the order qw qx qy qz", _RESAVE),
+    "w first, inverted": (
+        "truth-quaternion-order",
+        "the quaternions are in the order qw qx qy qz, and the poses are world-to-camera",
+        _RESAVE,
+    ),
+    "rotations inverted": (
+        "truth-inverted",
+        "the rotations are world-to-camera while the positions are the camera's",
+        "invert the rotations: conjugate the quaternions",
+    ),
+}
+
+
+def truth_findings(
+    stamps: Array, truth: Trajectory | None, camera: Camera, pairs: PySequence[RgbdPair]
+) -> list[Finding]:
+    """What the truth of a recording does not share with its images, then what camera and depth do not.
+
+    Args:
+        stamps: Stamps of the frames.
+        truth: Poses at their stamps; None if there are none.
+        camera: The stated camera.
+        pairs: Pairs of frames and their motions.
+    """
+    if truth is None:
+        text = "there is no ground truth: units of the depth, intrinsics and time were not compared with any"
+        return [Finding("no-truth", "note", None, "", text, "add groundtruth.txt to check more")]
+    uncovered = _coverage(stamps, truth)
+    if uncovered is not None:
+        return [uncovered]
+    usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
+    if len(usable) < LEAST_PAIRS:
+        text = (
+            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: truth "
+            "and camera were not compared"
+        )
+        return [
+            Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
+        ]
+    displacement = float(np.median([pair.displacement_px for pair in usable]))
+    if displacement < REST_PX:
+        return [_at_rest(stamps, truth, camera, usable, displacement)]
+    return _compared(stamps, truth, camera, [p for p in usable if p.displacement_px >= REST_PX], len(pairs))
+
+
+def _coverage(stamps: Array, truth: Trajectory) -> Finding | None:
+    """A truth of another time, or of a few frames."""
+    begin, end = truth.timestamps[[0, -1]]
+    apart = max(begin - stamps[-1], stamps[0] - end)
+    if apart > 0:
+        text = (
+            f"truth and images share no time: {begin:.3f} to {end:.3f} s and {stamps[0]:.3f} to {stamps[-1]:.3f} s, "
+            f"{apart:.3f} s apart"
+        )
+        cure = "take the groundtruth.txt of this recording, or put its stamps on the images' clock"
+        return Finding("truth-other-sequence", "fault", float(apart), "s", text, cure)
+    covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
+    if covered >= max(LEAST_COVERAGE * len(stamps), 3):
+        return None
+    text = f"{covered} of {len(stamps)} frames have a true pose within {SAME_FRAME_S} s"
+    return Finding("truth-sparse", "fault", float(covered), "frames", text, "export the truth of all frames again")
+
+
+def _at_rest(
+    stamps: Array, truth: Trajectory, camera: Camera, pairs: PySequence[RgbdPair], displacement: float
+) -> Finding:
+    """Images that do not move beside a truth that does, or does not either."""
+    motions = motions_of(pairs, stamps)
+    _, relative, turns, valid = TruthMotion(truth).between(motions.start, motions.end)
+    moves = np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
+    expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
+    if expected > 10 * REST_PX:
+        text = f"the truth moves the image by {expected:.0f} pixels between frames that move by {displacement:.1f}"
+        return Finding("truth-other-sequence", "fault", expected, "px", text, "take the truth of this recording")
+    text = f"the camera rests (the image moves by {displacement:.1f} pixels): truth and intrinsics cannot be compared"
+    return Finding("no-motion", "note", displacement, "px", text, "check a part in which the camera moves")
+
+
+def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
+    motions = motions_of(pairs, stamps)
+    readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
+    shifts = np.arange(-LARGEST_SHIFT_S, LARGEST_SHIFT_S + _STEP_S / 2, _STEP_S)
+    matches = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
+    matches = [each for each in matches if each.share >= 0.5]
+    near = [each for each in matches if each.reading == READINGS[0] and abs(each.shift_s) < LEAST_TIME_S]
+    if not near or sum(near[0].weights) < 0.4:
+        text = f"only {len(pairs)} pairs of frames with a small motion share time with the truth: it cannot be compared"
+        return [Finding("motion-unmeasured", "note", float(len(pairs)), "pairs", text, "check a longer part")]
+    stated, best = max(near, key=_total), max(matches, key=_total)
+    unshifted = min(near, key=lambda each: abs(each.shift_s))
+    if unshifted.total > stated.total - 0.02:
+        stated = unshifted
+    differs = best.reading != READINGS[0] or abs(best.shift_s) >= LEAST_TIME_S
+    if (
+        differs
+        and best.total >= GOOD
+        and 1 - best.total < 0.65 * (1 - stated.total)
+        and stated.total < best.total - 0.05
+    ):
+        turned = None if best.reading == READINGS[0] else _turned(motions, readings[READINGS[0]], stated, best)
+        return _misread(motions, readings, stated, best) if turned is None else [turned]
+    if stated.rotation >= UNLIKE and stated.weights[0] >= 0.3:
+        return _measured(motions, readings[READINGS[0]], stated, camera, pairs)
+    return _otherwise(motions, readings, stated, best, tried)
+
+
+def _total(each: Match) -> float:
+    return each.total
+
+
+def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match) -> list[Finding]:
+    findings = []
+    fine = [match(motions, readings[best.reading], best.reading, best.shift_s + d) for d in np.arange(-5, 6) * 0.005]
+    shift = max(fine, key=_total).shift_s
+    so = f"so they tell {100 * best.total:.0f} % of the images' motion, as stored {100 * stated.total:.0f} %"
+    if best.reading != READINGS[0]:
+        name, text, cure = _CURES[best.reading]
+        findings.append(Finding(name, "fault", best.total, "", f"{text}: {so}", cure))
+    if abs(shift) >= LEAST_TIME_S:
+        text = (
+            f"the truth is {abs(shift):.3f} s {'late' if shift > 0 else 'early'}: {so.replace('they tell', 'it tells')}"
+        )
+        cure = f"{'subtract' if shift > 0 else 'add'} {abs(shift):.3f} s {'from' if shift > 0 else 'to'} the stamps of the truth"
+        findings.append(Finding("truth-time-shift", "fault", shift, "s", text, cure))
+    return findings
+
+
+def _otherwise(
+    motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match, tried: int
+) -> list[Finding]:
+    """A truth that tells the motion in no reading: in other axes, or not at all."""
+    closest = best.total
+    for reading in READINGS[:3]:
+        for shift in np.arange(-4, 5) * 0.025 if reading == READINGS[0] else (0.0,):
+            _, _, turns, valid = readings[reading].between(motions.start + shift, motions.end + shift)
+            if valid.mean() < 0.5:
+                continue
+            v, true = motions.rotation[valid], turns[valid]
+            X = rotation_between(v, true)
+            alike = agreement(v @ X.T, true, best_gain(v, true, 0.4, 2.5))
+            closest = max(closest, alike)
+            if alike >= GOOD and reading == READINGS[0]:
+                return [_axes(X, alike, stated)]
+    enough = stated.weights[0] >= 0.5 and len(motions.start) >= 8 and len(motions.start) >= 0.5 * tried
+    if enough and closest < UNLIKE:
+        text = (
+            f"the truth tells at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames show, "
+            f"under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
+        )
+        return [Finding("truth-other-sequence", "fault", closest, "", text, "take the truth of this recording")]
+    text = f"the truth tells {100 * stated.total:.0f} % of the motion between the frames, too little to compare more"
+    return [Finding("truth-unclear", "note", stated.total, "", text, "check a part with a clearer motion")]
+
+
+def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
+    """Other axes, where these explain rotations and translations better than another reading of the file."""
+    _, relative, turns, valid = truth.between(motions.start, motions.end)
+    v, tau, rho, turns = motions.rotation[valid], motions.translation[valid], relative[valid, :3, 3], turns[valid]
+    X = rotation_between(v, turns)
+    rotation = agreement(v @ X.T, turns, best_gain(v, turns, 0.4, 2.5))
+    translation = agreement(tau @ X.T, rho, best_gain(tau, rho, 1e-6, 1e6))
+    w = stated.weights
+    total = (w[0] * rotation + w[1] * translation) / max(sum(w), 1e-9)
+    return _axes(X, rotation, stated) if total > best.total + 0.03 else None
+
+
+def _axes(X: Array, alike: float, stated: Match) -> Finding:
+    angle = float(np.degrees(np.linalg.norm(se3.log(_pose(X))[3:])))
+    rows = np.abs(X).argmax(axis=1)
+    names = ", ".join(
+        f"its {body} is the camera's {'-' if X[i, rows[i]] < 0 else ''}{'xyz'[rows[i]]}" for i, body in enumerate("xyz")
+    )
+    text = (
+        f"the truth's axes are turned by {angle:.0f} degrees against the camera's ({names}, nearly): so they tell "
+        f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
+    )
+    cure = "multiply each rotation of groundtruth.txt from the right by the rotation from the camera's axes to these"
+    return Finding("truth-axes", "fault", angle, "degrees", text, cure)
+
+
+def _pose(rotation: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    return pose
+
+
+def _measured(
+    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: PySequence[RgbdPair]
+) -> list[Finding]:
+    """Of a truth whose rotations are the camera's: units, positions' axes, then camera, depth and lever arm."""
+    first, relative, turns, valid = truth.between(motions.start + stated.shift_s, motions.end + stated.shift_s)
+    size = np.linalg.norm(motions.rotation, axis=1) + np.linalg.norm(turns, axis=1) + 2 * ROTATION_NOISE
+    agreeing = valid & (np.linalg.norm(motions.rotation - turns, axis=1) < 0.5 * size)
+    if agreeing.sum() < LEAST_PAIRS:
+        return []
+    kept, first, relative = motions.select(agreeing), first[agreeing], relative[agreeing]
+    clear = stated.weights[1] >= 0.4
+    if stated.gain < 0.05 or (clear and stated.translation >= 0.7 and abs(np.log(stated.gain)) > np.log(1.5)):
+        return [_scale(1 / stated.gain, camera, motions)]
+    if clear and stated.translation < UNLIKE:
+        turned = _positions(kept, first, relative, stated)
+        if turned is not None:
+            return [turned]
+    chosen = [pair for pair, use in zip(pairs, agreeing, strict=True) if use]
+    return _fitted(chosen, relative, camera, kept)
+
+
+def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
+    """The true translations are `factor` times the measured ones."""
+    unit = next((name for name, size in (("millimetres", 1e3), ("centimetres", 1e2)) if 0.6 < factor / size < 1.6), "")
+    text = f"the truth's translations are {factor:.4g} times those that the depth gives (median depth {motions.depth_m:.2f} m)"
+    if unit and 0.15 < motions.depth_m < 20:
+        cure = f"divide the positions of groundtruth.txt by {round(np.log10(factor)) and 10 ** round(np.log10(factor))}"
+        return Finding("truth-scale", "fault", factor, "", f"{text}: they are in {unit}", cure)
+    cure = f"set depth_factor = {camera.depth_factor / factor:.4g} in camera.toml (it is {camera.depth_factor:g})"
+    return Finding("depth-factor", "fault", factor, "", text, f"{cure}, unless the truth is not in metres")
+
+
+def _positions(motions: Motions, first: Array, relative: Array, stated: Match) -> Finding | None:
+    """Positions in other axes than the orientations, or mirrored."""
+    steps = np.einsum("nij,nj->ni", first[:, :3, :3], relative[:, :3, 3])
+    own = np.einsum("nij,nj->ni", first[:, :3, :3], motions.translation)
+    for measured, true, where in ((own, steps, "world"), (motions.translation, relative[:, :3, 3], "camera")):
+        W = rotation_between(measured, true, proper=False)
+        alike = agreement(measured @ W.T, true, best_gain(measured, true, 1e-6, 1e6))
+        angle = float(np.degrees(np.arccos(np.clip((np.trace(W) - 1) / 2, -1, 1))))
+        if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
+            how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
+            text = (
+                f"the truth's positions are {how} in the {where}'s axes against its orientations: so they tell "
+                f"{100 * alike:.0f} % of the images' translation, as stored {100 * stated.translation:.0f} %"
+            )
+            return Finding("truth-axes", "fault", angle, "degrees", text, "use one right-handed frame for both")
+    return None
+
+
+def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, motions: Motions) -> list[Finding]:
+    """The one of focal length, principal point, depth scale, axes and lever arm that explains the errors best."""
+    before = fit_camera(pairs, relative, camera, ())
+    fits = {name: fit_camera(pairs, relative, camera, names) for name, names in _GROUPS.items()}
+    name = min(fits, key=lambda each: fits[each].cost)
+    fit = fits[name]
+    size = fit.size(name) if name != "centre" else float(np.hypot(fit.value["cx"][0], fit.value["cy"][0]))
+    sigma = (
+        float(np.linalg.norm(fit.sigma[name]))
+        if name != "centre"
+        else float(np.hypot(fit.sigma["cx"][0], fit.sigma["cy"][0]))
+    )
+    left = fit.cost / before.cost
+    if size < _LIMITS[name] or not any(size >= sigmas * sigma and left <= share for sigmas, share in _EXPLAINED):
+        return []
+    errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
+    return [_described(name, fit, sigma, errors, camera)]
+
+
+_GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
+_LIMITS = {"focal": 0.08, "centre": 25.0, "scale": 0.1, "turn": np.radians(6), "lever": 0.04}
+"""Published recordings differ from their cameras and truths by less: Bonn's lever arm is 0.019 m."""
+_EXPLAINED = ((5, 0.75), (8, 0.88))
+"""Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain in
+healthy recordings, and no value above its limit is sure to 4."""
+
+
+def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -> Finding:
+    if name == "focal":
+        factor = float(np.exp(fit.value["focal"][0]))
+        text = f"the focal length is {factor:.3f} times the stated one (+- {sigma:.3f}): {errors}"
+        cure = f"fx = {camera.fx * factor:.1f}, fy = {camera.fy * factor:.1f} in camera.toml, or name the right camera"
+        return Finding("camera-focal-length", "fault", factor, "", text, cure)
+    if name == "centre":
+        dx, dy = float(fit.value["cx"][0]), float(fit.value["cy"][0])
+        text = f"the principal point is {dx:+.0f}, {dy:+.0f} px from the stated one (+- {sigma:.0f}): {errors}"
+        cure = f"cx = {camera.cx + dx:.1f}, cy = {camera.cy + dy:.1f} in camera.toml, or name the right camera"
+        return Finding("camera-principal-point", "fault", float(np.hypot(dx, dy)), "px", text, cure)
+    if name == "scale":
+        factor = float(np.exp(fit.value["scale"][0]))
+        text = f"the depth is to be multiplied by {factor:.3f} (+- {sigma:.3f}) to agree with the truth: {errors}"
+        cure = f"depth_factor = {camera.depth_factor / factor:.5g} in camera.toml (it is {camera.depth_factor:g})"
+        return Finding("depth-factor", "fault", factor, "", text, cure)
+    if name == "turn":
+        angle = float(np.degrees(fit.size("turn")))
+        text = f"the truth's axes are turned by {angle:.1f} degrees against the camera's: {errors}"
+        return Finding("truth-axes", "fault", angle, "degrees", text, "give the truth the camera's axes")
+    lever = fit.value["lever"]
+    where = ", ".join(f"{value:+.3f}" for value in lever)
+    text = f"the camera is {fit.size('lever'):.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}"
+    cure = f"move each position by R ({where}), R being the pose's rotation"
+    return Finding("truth-lever-arm", "fault", fit.size("lever"), "m", text, cure)
