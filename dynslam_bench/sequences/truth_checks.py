@@ -355,8 +355,8 @@ def truth_findings(
     usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
     if len(usable) < LEAST_PAIRS:
         text = (
-            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: truth "
-            "and camera were not compared"
+            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: "
+            "truth and camera were not compared"
         )
         return [
             Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
@@ -444,7 +444,8 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
         text = (
             f"the truth is {abs(shift):.3f} s {'late' if shift > 0 else 'early'}: {so.replace('they tell', 'it tells')}"
         )
-        cure = f"{'subtract' if shift > 0 else 'add'} {abs(shift):.3f} s {'from' if shift > 0 else 'to'} the stamps of the truth"
+        verb, word = ("subtract", "from") if shift > 0 else ("add", "to")
+        cure = f"{verb} {abs(shift):.3f} s {word} the stamps of the truth"
         findings.append(Finding("truth-time-shift", "fault", shift, "s", text, cure))
     return findings
 
@@ -468,8 +469,8 @@ def _otherwise(
     enough = stated.weights[0] >= 0.5 and len(motions.start) >= 8 and len(motions.start) >= 0.5 * tried
     if enough and closest < UNLIKE:
         text = (
-            f"the truth tells at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames show, "
-            f"under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
+            f"the truth tells at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
+            f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
         )
         return [Finding("truth-other-sequence", "fault", closest, "", text, "take the truth of this recording")]
     text = f"the truth tells {100 * stated.total:.0f} % of the motion between the frames, too little to compare more"
@@ -532,7 +533,8 @@ def _measured(
 def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     """The true translations are `factor` times the measured ones."""
     unit = next((name for name, size in (("millimetres", 1e3), ("centimetres", 1e2)) if 0.6 < factor / size < 1.6), "")
-    text = f"the truth's translations are {factor:.4g} times those that the depth gives (median depth {motions.depth_m:.2f} m)"
+    median = f"median depth {motions.depth_m:.2f} m"
+    text = f"the truth's translations are {factor:.4g} times those that the depth gives ({median})"
     if unit and 0.15 < motions.depth_m < 20:
         cure = f"divide the positions of groundtruth.txt by {round(np.log10(factor)) and 10 ** round(np.log10(factor))}"
         return Finding("truth-scale", "fault", factor, "", f"{text}: they are in {unit}", cure)
@@ -581,8 +583,8 @@ _GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "tu
 _LIMITS = {"focal": 0.08, "centre": 25.0, "scale": 0.1, "turn": np.radians(6), "lever": 0.04}
 """Published recordings differ from their cameras and truths by less: Bonn's lever arm is 0.019 m."""
 _EXPLAINED = ((5, 0.75), (8, 0.88))
-"""Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain in
-healthy recordings, and no value above its limit is sure to 4."""
+"""Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain
+in healthy recordings, and no value above its limit is sure to 4."""
 
 
 def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -> Finding:

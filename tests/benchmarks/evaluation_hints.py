@@ -215,7 +215,9 @@ def usable(case: Case) -> bool:
         metrics = evaluate(case.estimate, case.truth).metrics
     except DynslamError:
         return False
-    return metrics["ate_rmse_m"] < 0.2 * metrics["static_camera_ate_rmse_m"] and metrics["static_camera_ate_rmse_m"] > 0.01
+    return (
+        metrics["ate_rmse_m"] < 0.2 * metrics["static_camera_ate_rmse_m"] and metrics["static_camera_ate_rmse_m"] > 0.01
+    )
 
 
 def harmful(made: Case, case: Case) -> bool:

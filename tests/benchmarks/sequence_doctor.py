@@ -26,7 +26,7 @@ from dynslam_bench.sequences.doctor import diagnose, examine
 from dynslam_bench.sequences.synthetic.ids import SYNTHETIC_IDS
 
 Poses = np.ndarray
-FAULTS: dict[str, tuple[str, Callable[["Copy"], None]]] = {}
+FAULTS: dict[str, tuple[str, Callable[[Copy], None]]] = {}
 
 
 class Copy:

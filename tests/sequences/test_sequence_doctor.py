@@ -1,7 +1,5 @@
 """`sequences doctor`: faults put into a recording are named, a sound one has none, nothing makes it raise."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
