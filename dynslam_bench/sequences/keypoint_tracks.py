@@ -69,7 +69,7 @@ def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, 
             xs = slice(c * width // columns, (c + 1) * width // columns)
             found_here = cv2.goodFeaturesToTrack(image[ys, xs], each, 0.02, 12, mask=free[ys, xs])
             if found_here is not None:
-                found.append(np.asarray(found_here.reshape(-1, 2) + (xs.start, ys.start), np.float32))
+                found.append(np.asarray(found_here.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
     return np.concatenate(found)
 
 
