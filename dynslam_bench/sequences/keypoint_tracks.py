@@ -77,10 +77,9 @@ def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
     """Mean inverse depth ``[N]`` of the 5x5 pixels around `pixels` ``[N, 2]``; NaN at edges, holes and outside."""
     height, width = depth.shape
     place: Array = np.asarray(np.round(pixels))
-    inside: NDArray[np.bool_] = (
-        np.isfinite(place).all(axis=1) & (place >= 2).all(axis=1) & (place < (width - 2, height - 2)).all(axis=1)
-    )
-    u, v = np.where(np.asarray(inside)[:, None], place, 2).astype(np.intp).T
+    ahead, before = (place >= 2).all(axis=1), (place < (width - 2, height - 2)).all(axis=1)
+    inside = np.asarray(np.isfinite(place).all(axis=1) & ahead & before)
+    u, v = np.where(inside[:, None], place, 2).astype(np.intp).T
     around = np.arange(-2, 3)
     patch = depth[v[:, None, None] + around[:, None], u[:, None, None] + around].reshape(len(u), 25).astype(np.float64)
     measured = patch > 0
