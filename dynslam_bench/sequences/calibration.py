@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -148,7 +149,7 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] | None
         _delay(delay, sequence.camera),
         _factor(windows, sequence),
     )
-    values = {each.name: each.written for each in quantities if each.written is not None}
+    values: dict[str, Any] = {each.name: each.written for each in quantities if each.written is not None}
     noise = float(np.median([window.noise[0] for window in windows]))
     return Calibration(replace(sequence.camera, **values), quantities, len(windows), length, noise)
 
@@ -166,7 +167,8 @@ def window_of(sequence: Sequence, first: int, length: int) -> Window:
     if not any(frame.depth.any() for frame in frames):
         raise Unusable("the depth images are empty")
     deep = [cv2.erode((frame.depth > 0).astype(np.uint8), np.ones((9, 9))) for frame in frames]
-    pixels = track([cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY) for frame in frames], deep)
+    grey = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY) for frame in frames]
+    pixels = track([np.asarray(each, np.uint8) for each in grey], [np.asarray(each, np.uint8) for each in deep])
     if len(pixels) < LEAST_POINTS:
         raise Unusable("too few points can be followed")
     return Window(sequence.camera, stamps, pixels, np.stack([frame.depth for frame in frames]), offsets)
@@ -213,9 +215,8 @@ def _change(sequence: Sequence, first: int, last: int) -> float:
         found_at = corners(np.asarray(now, np.uint8), np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
         if len(found_at) < LEAST_POINTS:
             return 0.0
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            now, later, found_at.reshape(-1, 1, 2), None, winSize=(21, 21), maxLevel=3
-        )
+        start = found_at.reshape(-1, 1, 2)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(now, later, start, start.copy(), winSize=(21, 21), maxLevel=3)
         good = found[:, 0] > 0
         if good.sum() < LEAST_POINTS:
             return 0.0
@@ -329,7 +330,8 @@ def _readout(found: Estimate, windows: list[Window], camera: Camera) -> Quantity
 def _delay(found: Estimate, camera: Camera) -> Quantity:
     """The stamps that the reader gives have the camera's own delay added already."""
     low, high = found.value - found.half, found.value + found.half
-    about = Quantity("depth_delay_s", *(camera.depth_delay_s + each for each in (found.value, low, high)))
+    own = camera.depth_delay_s
+    about = Quantity("depth_delay_s", own + found.value, own + low, own + high)
     if not found.resolved:
         return replace(
             about,

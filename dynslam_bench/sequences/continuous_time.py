@@ -130,7 +130,7 @@ class Window:
 
     def _seen(self, moment: _Moment) -> Array:
         """The points ``[L, n, 3]`` in the camera at a moment."""
-        return (moment.R @ (self.points[:, None] - moment.centre)[..., None])[..., 0]
+        return np.asarray((moment.R @ (self.points[:, None] - moment.centre)[..., None])[..., 0])
 
     def _residuals(self, points: Array) -> Array:
         """Pixels and inverse depth ``[L, n, 3]``: predicted less observed."""
@@ -185,7 +185,7 @@ class Window:
 
     def normal_equations(self, readout_s: float) -> _Reduced:
         """Gauss-Newton's normal equations about the state, the points eliminated."""
-        L, n = self.xy.shape[:2]
+        L, n = len(self.xy), len(self.stamps)
         moment = self._at(self.late * readout_s)
         points = self._seen(moment)
         residuals = self._residuals(points)
@@ -288,7 +288,7 @@ class _Reduced:
         carried = (inverse @ mixed).reshape(-1, m)
         H = flat.T @ flat - mixed.reshape(-1, m).T @ carried
         b = flat.T @ r.ravel() - carried.T @ slope.ravel()
-        return cls(H, b, inverse, mixed, slope)
+        return cls(H, b, np.asarray(inverse, np.float64), mixed, slope)
 
     def shared(self) -> tuple[Array, Array, Array]:
         """Information ``[2, 2]`` and slope ``[2]`` of readout and delay, the poses eliminated; the poses' response."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,12 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
     """
     n, (height, width) = len(images), images[0].shape
     tracks = np.full((0, n, 2), np.nan)
-    window = {"winSize": (21, 21), "maxLevel": 4, "criteria": (3, 30, 0.01), "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    window: dict[str, Any] = {
+        "winSize": (21, 21),
+        "maxLevel": 4,
+        "criteria": (3, 30, 0.01),
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }
     for i in range(n - 1):
         alive = np.isfinite(tracks[:, i, 0])
         if alive.sum() < POINTS and i < n - 3:
@@ -38,11 +45,13 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
         guess, start = (each.astype(np.float32).reshape(-1, 1, 2) for each in (here + flow, here))
         there, found, _ = cv2.calcOpticalFlowPyrLK(images[i], images[i + 1], start, guess, **window)
         back, again, _ = cv2.calcOpticalFlowPyrLK(images[i + 1], images[i], there, start.copy(), **window)
-        there, back = there[:, 0], back[:, 0]
-        good = (found[:, 0] > 0) & (again[:, 0] > 0) & (np.linalg.norm(back - here, axis=1) < 0.5)
+        there, back = np.asarray(there)[:, 0], np.asarray(back)[:, 0]
+        good = (
+            (np.asarray(found)[:, 0] > 0) & (np.asarray(again)[:, 0] > 0) & (np.linalg.norm(back - here, axis=1) < 0.5)
+        )
         good &= (there >= 8).all(axis=1) & (there < (width - 8, height - 8)).all(axis=1)
         tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
-    return tracks[np.isfinite(tracks[..., 0]).sum(axis=1) >= 4]
+    return np.asarray(tracks[np.isfinite(tracks[..., 0]).sum(axis=1) >= 4])
 
 
 def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, count: int) -> NDArray[np.float32]:
@@ -60,15 +69,16 @@ def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, 
             xs = slice(c * width // columns, (c + 1) * width // columns)
             found_here = cv2.goodFeaturesToTrack(image[ys, xs], each, 0.02, 12, mask=free[ys, xs])
             if found_here is not None:
-                found.append(found_here.reshape(-1, 2) + np.float32([xs.start, ys.start]))
+                found.append(np.asarray(found_here.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
     return np.concatenate(found)
 
 
 def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
     """Mean inverse depth ``[N]`` of the 5x5 pixels around `pixels` ``[N, 2]``; NaN at edges, holes and outside."""
     height, width = depth.shape
-    place = np.round(pixels)
-    inside = np.isfinite(place).all(axis=1) & (place >= 2).all(axis=1) & (place < (width - 2, height - 2)).all(axis=1)
+    place: Array = np.asarray(np.round(pixels))
+    ahead, before = (place >= 2).all(axis=1), (place < (width - 2, height - 2)).all(axis=1)
+    inside = np.asarray(np.isfinite(place).all(axis=1) & ahead & before)
     u, v = np.where(inside[:, None], place, 2).astype(np.intp).T
     around = np.arange(-2, 3)
     patch = depth[v[:, None, None] + around[:, None], u[:, None, None] + around].reshape(len(u), 25).astype(np.float64)
