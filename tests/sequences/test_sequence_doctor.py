@@ -29,8 +29,8 @@ class Rendered:
         self.timestamps = 100.0 + t
         self.ground_truth = Trajectory(self.timestamps, se3.exp(np.concatenate([swing, turn], axis=1)))
         rng = np.random.default_rng(3)
-        self.walls = [cv2.resize(rng.integers(0, 255, (40, 40), dtype=np.uint8), (800, 800), interpolation=cv2.INTER_AREA)
-                      for _ in range(6)]  # fmt: skip
+        coarse = [rng.integers(0, 255, (40, 40), dtype=np.uint8) for _ in range(6)]
+        self.walls = [cv2.resize(wall, (800, 800), interpolation=cv2.INTER_AREA) for wall in coarse]
         rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
         self.rays = np.stack(
             [(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], -1
