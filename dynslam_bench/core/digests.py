@@ -133,7 +133,7 @@ def _sha256(path: Path) -> str:
 
 
 def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str:
-    state, newest = files_state(files)
+    state, newest = _files_state(files)
     key = hashlib.sha256(f"{kind}\0{state}".encode()).hexdigest()
     if key in _MEMORY:
         return _MEMORY[key]
@@ -144,14 +144,23 @@ def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str
             _MEMORY[key] = stored
             return stored
     found = compute()
-    if time.time_ns() - newest > _SETTLED_NS:
+    if is_settled(newest):
         _MEMORY[key] = found
         with contextlib.suppress(DynslamError):  # a cache that cannot be written costs time only
             write_atomic(entry, found)
     return found
 
 
-def files_state(files: Iterable[Path | str]) -> tuple[str, int]:
+def is_settled(newest_ns: int | None) -> bool:
+    """Whether files whose newest time is this may be remembered: a change within the same tick would not show.
+
+    Args:
+        newest_ns: Time in nanoseconds since 1970; None without a file.
+    """
+    return newest_ns is not None and time.time_ns() - newest_ns > _SETTLED_NS
+
+
+def _files_state(files: Iterable[Path]) -> tuple[str, int]:
     """Digest of path, size, times and inode of each file, and the newest of the times in nanoseconds.
 
     Raises:

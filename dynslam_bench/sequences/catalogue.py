@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
 from dynslam_bench.contracts.sequence import Sequence
-from dynslam_bench.core.digests import files_state
+from dynslam_bench.core.digests import is_settled
 from dynslam_bench.core.errors import SequenceError, did_you_mean
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
 from dynslam_bench.core.plugins import load_object
@@ -34,7 +33,7 @@ __all__ = [
 ]
 
 
-_OPENED: dict[str, tuple[str, Sequence]] = {}
+_OPENED: dict[str, tuple[list[tuple[str, int, int, int, int]], Sequence]] = {}
 """Folders that were opened, with the state of their files then: an unchanged one need not be read again."""
 _MOST_OPENED = 64
 
@@ -139,17 +138,15 @@ def open_folder(
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
     chosen = chosen_camera(folder, camera)
-    wanted = (folder.absolute(), entry and entry.id, str(camera), chosen, settings)
-    try:
-        state, _ = files_state(_all_files(folder))
-    except OSError:  # a file vanished meanwhile; opening it names what is wrong
-        state = ""
-    if state and _OPENED.get(repr(wanted), ("", None))[0] == state:
-        return _OPENED[repr(wanted)][1]
-    sequence = _open_folder(folder, entry, camera, chosen, settings)
-    while len(_OPENED) >= _MOST_OPENED:
-        _OPENED.pop(next(iter(_OPENED)))
-    _OPENED[repr(wanted)] = state, sequence
+    wanted = repr((folder.absolute(), entry and entry.id, str(camera), chosen, settings))
+    state = _state_of(folder)
+    known, sequence = _OPENED.get(wanted, (None, None))
+    if sequence is None or known != state:
+        sequence = _open_folder(folder, entry, camera, chosen, settings)
+        while len(_OPENED) >= _MOST_OPENED:
+            _OPENED.pop(next(iter(_OPENED)))
+        if is_settled(max((max(file[2:4]) for file in state), default=None)):
+            _OPENED[wanted] = state, sequence
     return sequence
 
 
@@ -183,9 +180,22 @@ def _open_folder(
     )
 
 
-def _all_files(folder: Path) -> Iterator[str]:
-    for parent, _, names in os.walk(folder.absolute()):
-        yield from (os.path.join(parent, name) for name in names)  # noqa: PTH118 - thousands of them
+def _state_of(folder: Path) -> list[tuple[str, int, int, int, int]]:
+    """Name, size, times of modification and of change, and inode of every file below a folder; empty without one."""
+    state: list[tuple[str, int, int, int, int]] = []
+    waiting = [str(folder)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir():
+                        waiting.append(entry.path)
+                    else:
+                        stat = entry.stat()
+                        state.append((entry.path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino))
+        except OSError:  # it vanished meanwhile; opening it says what is wrong
+            return []
+    return state
 
 
 def _open_whole(
