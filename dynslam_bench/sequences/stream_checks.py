@@ -125,7 +125,9 @@ def _roughness(depth: Map, factor: float) -> tuple[float, float]:
     steps = []
     for values in (raw, raw.byteswap()):
         wide = values.astype(np.float64)
-        steps.append(float(np.mean(np.minimum(np.abs(np.diff(wide, axis=1))[both] / np.maximum(wide[:, 1:], 1)[both], 1))))
+        steps.append(
+            float(np.mean(np.minimum(np.abs(np.diff(wide, axis=1))[both] / np.maximum(wide[:, 1:], 1)[both], 1)))
+        )
     return steps[0], steps[1]
 
 
@@ -140,9 +142,13 @@ def _depth_contours(depth: Map, cell: int) -> Map:
     rows, columns = depth.shape[0] // cell, depth.shape[1] // cell
     blocks = depth[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
     far = cv2.dilate(blocks.max(axis=(1, 3)), np.ones((3, 3), np.uint8))
-    near = cv2.erode(np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3)).astype(np.float32), np.ones((3, 3), np.uint8))
+    near = cv2.erode(
+        np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3)).astype(np.float32), np.ones((3, 3), np.uint8)
+    )
     known = (far > 0) & np.isfinite(near)
-    return np.where(known, np.minimum(np.log(np.where(known, far / np.where(known, near, 1), 1)), 0.3), 0).astype(np.float32)
+    return np.where(known, np.minimum(np.log(np.where(known, far / np.where(known, near, 1), 1)), 0.3), 0).astype(
+        np.float32
+    )
 
 
 def _standardised(values: Map) -> Map:
@@ -184,7 +190,9 @@ def _no_contrast(streams: Streams) -> Finding | None:
     if streams.dark < 0.5 * streams.frames:
         return None
     text = f"{streams.dark} of {streams.frames} colour images hold one brightness only"
-    return Finding("colour-blank", "fault", streams.dark / streams.frames, "", text, "record or export the colour again")
+    return Finding(
+        "colour-blank", "fault", streams.dark / streams.frames, "", text, "record or export the colour again"
+    )
 
 
 def _no_depth(streams: Streams) -> Finding | None:
@@ -238,14 +246,18 @@ def _flipped(streams: Streams) -> Finding | None:
         f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard deviations so, "
         f"by {peaks['']:.0f} as stored"
     )
-    return Finding("colour-flipped", "fault", peaks[best], "sigma", text, "turn the colour images as the depth images are")
+    return Finding(
+        "colour-flipped", "fault", peaks[best], "sigma", text, "turn the colour images as the depth images are"
+    )
 
 
 def _asynchronous(streams: Streams) -> Finding | None:
     rows = np.array(streams.by_delay)
     pairs = np.isfinite(rows).sum(axis=0)
     usable = pairs >= max(10, 0.3 * len(rows))
-    peaks = np.array([_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(streams.by_shift, usable, strict=True)])
+    peaks = np.array(
+        [_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(streams.by_shift, usable, strict=True)]
+    )
     mean = np.where(usable, np.nansum(rows, axis=0) / np.maximum(pairs, 1), -np.inf)
     column = int(np.argmax(mean))
     delay = column - MOST_DELAY
@@ -269,9 +281,10 @@ def _asynchronous(streams: Streams) -> Finding | None:
 
 
 def _shifted(streams: Streams) -> Finding | None:
-    middle = streams.by_shift[MOST_DELAY - 1 : MOST_DELAY + 2] / np.maximum(
-        streams.shifted[MOST_DELAY - 1 : MOST_DELAY + 2], 1
-    )[:, None, None]
+    middle = (
+        streams.by_shift[MOST_DELAY - 1 : MOST_DELAY + 2]
+        / np.maximum(streams.shifted[MOST_DELAY - 1 : MOST_DELAY + 2], 1)[:, None, None]
+    )
     found = [(*_peak(surface, 30), float(surface[y, x])) for surface in middle
              for y, x in [_peak(surface, 30)[1]]]  # fmt: skip
     clear, (row, column), height = max(found, key=lambda each: each[2])

@@ -26,7 +26,7 @@ from dynslam_bench.sequences.doctor import diagnose, examine
 from dynslam_bench.sequences.synthetic.ids import SYNTHETIC_IDS
 
 Poses = np.ndarray
-FAULTS: dict[str, tuple[str, Callable[["Copy"], None]]] = {}
+FAULTS: dict[str, tuple[str, Callable[[Copy], None]]] = {}
 
 
 class Copy:
@@ -122,8 +122,10 @@ def delayed(kind: str, frames: int) -> Callable[[Copy], None]:
     def change(copy: Copy) -> None:
         rows = copy.rows[kind]
         stamps, files = [row[0] for row in rows], [row[1] for row in rows]
-        pairs = zip(stamps[max(0, frames) :], files[: len(files) - frames], strict=False) if frames > 0 else zip(
-            stamps[:frames], files[-frames:], strict=False
+        pairs = (
+            zip(stamps[max(0, frames) :], files[: len(files) - frames], strict=False)
+            if frames > 0
+            else zip(stamps[:frames], files[-frames:], strict=False)
         )
         copy.write(kind, [list(pair) for pair in pairs])
 
@@ -143,7 +145,9 @@ def repeated(kind: str, first: float, last: float) -> Callable[[Copy], None]:
 
 def metres_as_millimetres(copy: Copy) -> None:
     """Depth as arrays of floating-point millimetres."""
-    factor = float(dict(line.split(" = ") for line in (copy.folder / "camera.toml").read_text().splitlines())["depth_factor"])
+    factor = float(
+        dict(line.split(" = ") for line in (copy.folder / "camera.toml").read_text().splitlines())["depth_factor"]
+    )
     for row in copy.rows["depth"]:
         raw = cv2.imread(str(copy.folder / row[1]), cv2.IMREAD_UNCHANGED)
         row[1] = row[1].replace(".png", ".npy")
@@ -234,7 +238,9 @@ def write_folder(name: str, data_root: str | None, folder: Path, most: int) -> N
     (folder / "groundtruth.txt").write_text(
         "\n".join(f"{row[0]:.6f} " + " ".join(f"{value:.7f}" for value in row[1:]) for row in rows) + "\n"
     )
-    values = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "depth_factor", "readout_s")}
+    values = {
+        key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy", "depth_factor", "readout_s")
+    }
     values["distortion"] = list(camera.distortion)
     (folder / "camera.toml").write_text("\n".join(f"{key} = {value}" for key, value in values.items()) + "\n")
 
@@ -259,7 +265,10 @@ def run_faults(names: list[str], data_root: str | None, only: str, most: int) ->
                 ok = expected in ids and all(f.id == expected for f in diagnosis.findings if f.severity == "fault")
                 right, tried = right + ok, tried + 1
                 text = diagnosis.findings[0].text if diagnosis.findings else "-"
-                print(f"{'ok ' if ok else 'NOT'} {title:28} {expected:22} {','.join(ids) or '-':30} {seconds:5.1f} s  {text[:230]}", flush=True)
+                print(
+                    f"{'ok ' if ok else 'NOT'} {title:28} {expected:22} {','.join(ids) or '-':30} {seconds:5.1f} s  {text[:230]}",
+                    flush=True,
+                )
                 shutil.rmtree(folder)
             print(f"{name}: {right} of {tried} named rightly", flush=True)
 
@@ -277,7 +286,10 @@ def run_healthy(names: list[str], data_root: str | None, cut: int) -> None:
             seconds = time.process_time() - began
             parts, alarms = parts + 1, alarms + (not diagnosis.ok)
             said = "; ".join(f"{f.severity} {f.id}: {f.text}" for f in diagnosis.findings)
-            print(f"{'ALARM' if not diagnosis.ok else 'ok   '} {name}[{start}:{start + step}] {seconds:.1f} s  {said}", flush=True)
+            print(
+                f"{'ALARM' if not diagnosis.ok else 'ok   '} {name}[{start}:{start + step}] {seconds:.1f} s  {said}",
+                flush=True,
+            )
     print(f"{alarms} alarms on {parts} healthy recordings", flush=True)
 
 

@@ -1,6 +1,5 @@
 """`sequences doctor`: faults put into a recording are named, a sound one has none, nothing makes it raise."""
 
-import json
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.truth_checks import READINGS, read_as, truth_findings
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
-FRAMES = 80
+FRAMES = 60
 
 
 class Rendered:
@@ -34,7 +33,9 @@ class Rendered:
         self.walls = [cv2.resize(rng.integers(0, 255, (40, 40), dtype=np.uint8), (800, 800), interpolation=cv2.INTER_AREA)
                       for _ in range(6)]  # fmt: skip
         rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
-        self.rays = np.stack([(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], -1)
+        self.rays = np.stack(
+            [(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], -1
+        )
         self.posts = np.random.default_rng(5).uniform((-1.2, -0.7, 1.2), (1.2, 0.7, 2.0), (9, 3))
         self.frames = [self._render(index) for index in range(FRAMES)]
 
@@ -193,7 +194,11 @@ def test_pairs_give_the_camera_s_motion(sound):
 
 def test_readings_undo_each_convention(sound):
     poses = sound.ground_truth.T_world_cam
-    written = {"inverted": se3.inverse(poses), "w first": w_first(poses), "w first, inverted": w_first(se3.inverse(poses))}
+    written = {
+        "inverted": se3.inverse(poses),
+        "w first": w_first(poses),
+        "w first, inverted": w_first(se3.inverse(poses)),
+    }
     for reading, file in written.items():
         np.testing.assert_allclose(read_as(file, reading), poses, atol=1e-9)
     assert set(written) < set(READINGS)
