@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 CORNERS = 300
 FAR_ENOUGH_PX = 25.0
 """Median displacement of the corners at which a pair of frames ends: far above the tracker's noise."""
-MOST_FRAMES_APART = 10
+MOST_FRAMES_APART = 6
 INLIER_PX = 4.0
 """Reprojection error of an inlier: leaves room for a rolling shutter and for the depth sensor's noise."""
 LEAST_INLIERS = 25

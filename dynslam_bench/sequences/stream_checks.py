@@ -218,8 +218,8 @@ def _swapped(streams: Streams) -> Finding | None:
     if not swapped < stated / 3:
         return None
     text = (
-        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the two bytes "
-        "of each value swapped"
+        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the two bytes of "
+        "each value swapped"
     )
     cure = "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)"
     return Finding("depth-byte-order", "fault", float(stated), "", text, cure)
@@ -243,8 +243,8 @@ def _flipped(streams: Streams) -> Finding | None:
     if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
         return None
     text = (
-        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard deviations "
-        f"so, by {peaks['']:.0f} as stored"
+        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard deviations so, "
+        f"by {peaks['']:.0f} as stored"
     )
     return Finding(
         "colour-flipped", "fault", peaks[best], "sigma", text, "turn the colour images as the depth images are"
@@ -276,8 +276,7 @@ def _asynchronous(streams: Streams) -> Finding | None:
         f"the depth images fit the colour images of {abs(delay)} frames {'before' if delay > 0 else 'after'} "
         f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
     )
-    move = "earlier" if delay > 0 else "later"
-    cure = f"make the depth's stamps {abs(seconds):.3f} s {move} in depth.txt; it comes {later}"
+    cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt; it comes {later}"
     return Finding("depth-delay", "fault", seconds, "s", text, cure)
 
 

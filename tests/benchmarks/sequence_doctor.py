@@ -174,7 +174,7 @@ FAULTS |= {
     "truth in millimetres": ("truth-scale", scaled(1000)),
     "truth in centimetres": ("truth-scale", scaled(100)),
     "truth inverted": ("truth-inverted", lambda copy: copy.poses(se3.inverse)),
-    "quaternions w first": ("truth-quaternion-order", lambda copy: copy.truth(lambda t: t[:, [*range(4), 7, 4, 5, 6]])),
+    "quaternions w first": ("truth-quaternion-order", lambda copy: copy.truth(lambda t: t[:, [0, 1, 2, 3, 7, 4, 5, 6]])),
     "lever arm 0.25 m": ("truth-lever-arm", mounted(np.eye(3), (0.15, -0.2, 0.0))),
     "lever arm 0.12 m": ("truth-lever-arm", mounted(np.eye(3), (0.0, -0.1, 0.07))),
     "body axes": ("truth-axes", mounted(AXES, (0, 0, 0))),
@@ -208,8 +208,7 @@ FAULTS |= {
     "colour black": ("colour-blank", lambda copy: copy.images("rgb", np.zeros_like)),
     "depth empty": ("depth-empty", lambda copy: copy.images("depth", np.zeros_like)),
     "no truth": ("no-truth", lambda copy: (copy.folder / "groundtruth.txt").unlink()),
-    "no depth": ("unreadable", lambda copy: (shutil.rmtree(copy.folder / "depth"),
-                                             (copy.folder / "depth.txt").unlink())),
+    "no depth": ("unreadable", lambda copy: (shutil.rmtree(copy.folder / "depth"), (copy.folder / "depth.txt").unlink())),
     "one frame": ("too-short", lambda copy: (copy.write("rgb", copy.rows["rgb"][:1]),
                                              copy.write("depth", copy.rows["depth"][:1]))),
     "a third cut off": ("unreadable", lambda copy: [path.write_bytes(path.read_bytes()[:500])
@@ -267,8 +266,7 @@ def run_faults(names: list[str], data_root: str | None, only: str, most: int) ->
                 right, tried = right + ok, tried + 1
                 text = diagnosis.findings[0].text if diagnosis.findings else "-"
                 print(
-                    f"{'ok ' if ok else 'NOT'} {title:28} {expected:22} {','.join(ids) or '-':30} {seconds:5.1f} s  "
-                    f"{text[:230]}",
+                    f"{'ok ' if ok else 'NOT'} {title:28} {expected:22} {','.join(ids) or '-':30} {seconds:5.1f} s  {text[:230]}",
                     flush=True,
                 )
                 shutil.rmtree(folder)

@@ -1,5 +1,6 @@
 """`sequences doctor`: faults put into a recording are named, a sound one has none, nothing makes it raise."""
 
+
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.truth_checks import READINGS, read_as, truth_findings
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
-FRAMES = 45
+FRAMES = 60
 
 
 class Rendered:
@@ -29,8 +30,8 @@ class Rendered:
         self.timestamps = 100.0 + t
         self.ground_truth = Trajectory(self.timestamps, se3.exp(np.concatenate([swing, turn], axis=1)))
         rng = np.random.default_rng(3)
-        coarse = [rng.integers(0, 255, (40, 40), dtype=np.uint8) for _ in range(6)]
-        self.walls = [cv2.resize(wall, (800, 800), interpolation=cv2.INTER_AREA) for wall in coarse]
+        self.walls = [cv2.resize(rng.integers(0, 255, (40, 40), dtype=np.uint8), (800, 800), interpolation=cv2.INTER_AREA)
+                      for _ in range(6)]  # fmt: skip
         rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
         self.rays = np.stack(
             [(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], -1
@@ -120,8 +121,7 @@ def w_first(poses):
 
 
 def unrelated(truth):
-    t = truth.timestamps - 100.0
-    twist = np.stack([0.2 * np.sin(5.1 * t + k) for k in range(6)], axis=1)
+    twist = np.random.default_rng(8).normal(0, 0.02, (len(truth), 6)).cumsum(axis=0)
     return Trajectory(truth.timestamps, se3.exp(twist))
 
 
@@ -157,7 +157,7 @@ FAULTS = {
     },
     "depth-not-registered": {"frame": lambda frame, _: (frame.rgb, np.roll(frame.depth, 30, axis=1))},
     "depth-empty": {"frame": lambda frame, _: (frame.rgb, np.zeros_like(frame.depth))},
-    "depth-delay": {"frame": lambda frame, base: (frame.rgb, base[max(frame.index - 5, 0)].depth)},
+    "depth-delay": {"frame": lambda frame, base: (frame.rgb, base[frame.index - 5].depth)},
     "colour-flipped": {"frame": lambda frame, _: (frame.rgb[::-1], frame.depth)},
     "colour-frozen": {"frame": lambda frame, base: (base[0].rgb, frame.depth)},
     "colour-blank": {"frame": lambda frame, _: (np.zeros_like(frame.rgb), frame.depth)},
@@ -189,7 +189,7 @@ def test_pairs_give_the_camera_s_motion(sound):
     truth = sound.ground_truth.T_world_cam
     for pair in pairs:
         off = se3.inverse(pair.T_first_second) @ se3.inverse(truth[pair.first]) @ truth[pair.second]
-        assert np.linalg.norm(off[:3, 3]) < 0.01 and se3.rotation_angle(off) < 0.01
+        assert np.linalg.norm(off[:3, 3]) < 0.02 and se3.rotation_angle(off) < 0.01
 
 
 def test_readings_undo_each_convention(sound):
