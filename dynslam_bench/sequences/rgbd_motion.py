@@ -130,9 +130,8 @@ def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Array:
 
 
 def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Array) -> tuple[Array, NDArray[np.bool_]]:
-    how = {"winSize": (21, 21), "maxLevel": 4}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **how)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **how)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
     good = (found.reshape(-1) == 1) & (found_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < _BACK_AND_FORTH_PX
     height, width = after.shape
