@@ -38,10 +38,6 @@ class Fit:
         """Length of a value."""
         return float(np.linalg.norm(self.value[name]))
 
-    def certainty(self, name: str) -> float:
-        """Length of a value in standard deviations of it."""
-        return self.size(name) / max(float(np.linalg.norm(self.sigma[name])), 1e-12)
-
 
 _PARAMETERS = {"focal": slice(0, 1), "cx": slice(1, 2), "cy": slice(2, 3), "scale": slice(3, 4),
                "turn": slice(4, 7), "lever": slice(7, 10)}  # fmt: skip

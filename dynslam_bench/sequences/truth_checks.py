@@ -164,14 +164,12 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
     findings = []
     fine = [match(motions, readings[best.reading], best.reading, best.shift_s + d) for d in np.arange(-5, 6) * 0.005]
     shift = max(fine, key=_total).shift_s
-    so = f"so they tell {100 * best.clearest:.0f} % of the images' motion, as stored {100 * stated.clearest:.0f} %"
+    so = f"so they explain {100 * best.clearest:.0f} % of the images' motion, as stored {100 * stated.clearest:.0f} %"
     if best.reading != READINGS[0]:
         name, text, cure = _CURES[best.reading]
         findings.append(Finding(name, "fault", best.total, "", f"{text}: {so}", cure))
     if abs(shift) >= LEAST_TIME_S:
-        text = (
-            f"the truth is {abs(shift):.3f} s {'late' if shift > 0 else 'early'}: {so.replace('they tell', 'it tells')}"
-        )
+        text = f"the truth is {abs(shift):.3f} s {'late' if shift > 0 else 'early'}: {so.replace('they explain', 'it explains')}"
         change = "subtract {} s from" if shift > 0 else "add {} s to"
         cure = f"{change.format(f'{abs(shift):.3f}')} the stamps of the truth"
         findings.append(Finding("truth-time-shift", "fault", shift, "s", text, cure))
@@ -197,11 +195,11 @@ def _otherwise(
     enough = stated.weights[0] >= 0.5 and len(motions.start) >= LEAST_UNLIKE and len(motions.start) >= 0.5 * tried
     if enough and closest < UNRELATED:
         text = (
-            f"the truth tells at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
+            f"the truth explains at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
             f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
         )
         return [Finding("truth-other-sequence", "fault", closest, "", text, "take the truth of this recording")]
-    text = f"the truth tells {100 * stated.total:.0f} % of the motion between the frames, too little to compare more"
+    text = f"the truth explains {100 * stated.total:.0f} % of the motion between the frames, too little to compare more"
     return [Finding("truth-unclear", "note", stated.total, "", text, "check a part with a clearer motion")]
 
 
@@ -224,7 +222,7 @@ def _axes(X: Array, alike: float, stated: Match) -> Finding:
         f"its {body} is the camera's {'-' if X[i, rows[i]] < 0 else ''}{'xyz'[rows[i]]}" for i, body in enumerate("xyz")
     )
     text = (
-        f"the truth's axes are turned by {angle:.0f} degrees against the camera's ({names}, nearly): so they tell "
+        f"the truth's axes are turned by {angle:.0f} degrees against the camera's ({names}, nearly): so they explain "
         f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
     )
     cure = "multiply each rotation of groundtruth.txt from the right by the rotation from the camera's axes to these"
@@ -283,7 +281,7 @@ def _positions(motions: Motions, first: Array, relative: Array, stated: Match) -
         if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
             how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
             text = (
-                f"the truth's positions are {how} in the {where}'s axes against its orientations: so they tell "
+                f"the truth's positions are {how} in the {where}'s axes against its orientations: so they explain "
                 f"{100 * alike:.0f} % of the images' translation, as stored {100 * stated.translation:.0f} %"
             )
             return Finding("truth-axes", "fault", angle, "degrees", text, "use one right-handed frame for both")
@@ -308,12 +306,6 @@ def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> lis
         return []
     errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
     return [_described(name, fit, sigma, errors, camera)]
-
-
-def _consistent(parts: list[Fit], whole: Fit, name: str) -> bool:
-    """Whether both halves of the recording give the same value: one that a moving person causes does not come twice."""
-    values = [np.concatenate([fit.value[each] for each in _GROUPS[name]]) for fit in (*parts, whole)]
-    return bool(np.linalg.norm(values[0] - values[1]) <= 0.6 * np.linalg.norm(values[2]))
 
 
 _GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
