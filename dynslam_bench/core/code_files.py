@@ -95,7 +95,7 @@ def files_below(folder: Path) -> Iterator[Path]:
             continue
         if entry.is_file():
             yield entry
-        elif entry.is_dir() and not _is_left_out(entry):
+        elif entry.is_dir() and not _is_left_out(entry) and not leads_back(entry):
             yield from files_below(entry)
 
 
@@ -142,8 +142,11 @@ def _module_files(module: str, base: Path) -> list[Path]:
 
 def _linked_libraries(program: Path) -> list[Path]:
     """The shared libraries of a program that are none of the operating system's, as ``ldd`` finds them."""
-    if _is_of_system(program) or shutil.which("ldd") is None or program.open("rb").read(4) != b"\x7fELF":
+    if _is_of_system(program) or shutil.which("ldd") is None:
         return []
+    with program.open("rb") as file:
+        if file.read(4) != b"\x7fELF":
+            return []
     listed = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=False).stdout
     paths = [Path(match) for match in re.findall(r"=> (/.+) \(0x", listed)]
     return [path for path in paths if not _is_of_system(path) and path.is_file()]
@@ -207,6 +210,11 @@ def _is_folder(path: Path) -> bool:
         return path.is_dir()
     except (OSError, ValueError):
         return False
+
+
+def leads_back(entry: Path) -> bool:
+    """Whether a folder is a link to one that it lies in: following it would never end."""
+    return entry.is_symlink() and entry.resolve() in (entry.parent.resolve() / entry.name).parents
 
 
 def _is_left_out(folder: Path) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.code_files import leads_back
 from dynslam_bench.core.digests import is_settled
 from dynslam_bench.core.errors import SequenceError, did_you_mean
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
@@ -144,7 +145,7 @@ def open_folder(
     if sequence is None or known != state:
         sequence = _open_folder(folder, entry, camera, chosen, settings)
         while len(_OPENED) >= _MOST_OPENED:
-            _OPENED.pop(next(iter(_OPENED)))
+            _OPENED.pop(next(iter(list(_OPENED)), ""), None)  # another thread may do the same
         if is_settled(max((max(file[2:4]) for file in state), default=None)):
             _OPENED[wanted] = state, sequence
     return sequence
@@ -189,7 +190,7 @@ def _state_of(folder: Path) -> list[tuple[str, int, int, int, int]]:
             with os.scandir(waiting.pop()) as entries:
                 for entry in entries:
                     if entry.is_dir():
-                        waiting.append(entry.path)
+                        waiting += [] if leads_back(Path(entry.path)) else [entry.path]
                     else:
                         stat = entry.stat()
                         state.append((entry.path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino))

@@ -169,7 +169,8 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
         name, text, cure = _CURES[best.reading]
         findings.append(Finding(name, "fault", best.total, "", f"{text}: {so}", cure))
     if abs(shift) >= LEAST_TIME_S:
-        text = f"the truth is {abs(shift):.3f} s {'late' if shift > 0 else 'early'}: {so.replace('they explain', 'it explains')}"
+        when = "late" if shift > 0 else "early"
+        text = f"the truth is {abs(shift):.3f} s {when}: {so.replace('they explain', 'it explains')}"
         change = "subtract {} s from" if shift > 0 else "add {} s to"
         cure = f"{change.format(f'{abs(shift):.3f}')} the stamps of the truth"
         findings.append(Finding("truth-time-shift", "fault", shift, "s", text, cure))

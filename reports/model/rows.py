@@ -227,7 +227,7 @@ def _split_programs(rows: Sequence[RunRow]) -> None:
         varying = {name for name, found in values.items() if len(found) > 1 or name == "identity"}
         for row in group:
             row.split_by = {name: value for name, value in row.program.items() if name in varying}
-        last = max(group, key=lambda row: row.started).split_by
+        last = max(group, key=lambda row: ("identity" not in row.split_by, row.started)).split_by
         for row in group:
             row.is_current = row.split_by == last and "identity" not in row.split_by
 

@@ -141,3 +141,13 @@ def test_every_distribution_of_opencv_is_versioned(name: str, monkeypatch: pytes
     finally:
         for cached in (opencv_version, machine_digest):
             cached.cache_clear()
+
+
+def test_a_link_to_a_folder_above_it_is_not_followed(tmp_path):
+    from dynslam_bench.core.code_files import files_below
+
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    (inner / "code.py").touch()
+    (inner / "up").symlink_to(tmp_path)
+    assert list(files_below(tmp_path)) == [inner / "code.py"]

@@ -79,6 +79,14 @@ def test_a_run_of_an_older_identity_scheme_is_marked_and_never_the_reference(tmp
     assert board.reference is None
 
 
+def test_a_verified_program_stays_ranked_beside_newer_runs_that_are_not_verified(tmp_path: Path) -> None:
+    store = RunStore(tmp_path / "r")
+    add_run(store, "mine", SEQUENCES[0], identity=made_by(source="1"), started="2026-01-01T00:00:00+00:00")
+    add_run(store, "mine", SEQUENCES[1], identity={}, started="2026-01-02T00:00:00+00:00")
+    rows = [run.row for run in load_runs([store], get_protocol("tum-rgbd/v1")).runs]
+    assert {row.started[:10]: row.is_current for row in rows} == {"2026-01-01": True, "2026-01-02": False}
+
+
 def test_an_import_is_never_the_reference(tmp_path: Path) -> None:
     store = RunStore(tmp_path / "r")
     add_run(store, "orb-slam2", SEQUENCES[0], kind="imported")

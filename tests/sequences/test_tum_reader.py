@@ -329,3 +329,15 @@ def test_bonn_poses_are_the_camera_s_and_positions_stay_those_of_the_file():
     relative = se3.inverse(raw.T_world_cam) @ truth.T_world_cam
     assert np.ptp(relative[:, :3, :3], axis=0).max() < 1e-9, "one fixed rotation between markers and camera"
     assert se3.is_pose(truth.T_world_cam[0], 1e-9)
+
+
+def test_a_change_behind_a_linked_folder_is_another_content(tmp_path):
+    folder = tmp_path / "fr3_x"
+    make_folder(folder)
+    (folder / "rgb").rename(tmp_path / "elsewhere")
+    (folder / "rgb").symlink_to(tmp_path / "elsewhere")
+    (folder / "up").symlink_to(folder)
+    before = open_sequence(str(folder), camera="tum-fr3").digest()
+    images = sorted((tmp_path / "elsewhere").iterdir())
+    images[0].write_bytes(images[1].read_bytes() + b"\0")
+    assert open_sequence(str(folder), camera="tum-fr3").digest() != before

@@ -2,9 +2,9 @@
 
 A line joins the file when its run is scored for the first time; `run_list` adds those that are missing. Lines hold for
 one version of the code that makes them, and for one state (time and size) of the run's record, its stored errors, its
-trajectories and the ground truth. Errors are always replaced by a
-rename, so that none of them need be looked at while their folder has the time that is noted. The file may be deleted at
-any time, and whatever of it is damaged or out of date counts as not there.
+trajectories and the ground truth. Errors are always replaced by a rename, so that none of them need be looked at while
+their folder has the time that is noted. The file may be deleted at any time, and whatever of it is damaged or out of
+date counts as not there.
 """
 
 from __future__ import annotations

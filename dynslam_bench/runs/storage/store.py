@@ -326,6 +326,7 @@ class RunStore:
         stored = None if again else self.metrics(record, protocol)
         if stored is not None:
             return stored
+        inputs = self._inputs(record)  # before they are read: what replaces them meanwhile is scored anew
         part = record.sequence.part
         metrics = evaluate_run(
             record,
@@ -337,7 +338,7 @@ class RunStore:
         if record.kind == "imported":  # it has only one trajectory
             online = (self.folder(record.run_id) / "trajectory_online.txt").is_file()
             metrics = metrics.model_copy(update={"trajectory": "online" if online else "final"})
-        metrics = metrics.model_copy(update={"code": evaluation_code(), "inputs": self._inputs(record)})
+        metrics = metrics.model_copy(update={"code": evaluation_code(), "inputs": inputs})
         try:
             self.add_metrics(metrics)
         except DynslamError as error:  # a store that can only be read can be scored all the same
