@@ -305,7 +305,11 @@ TARGETS = [
         mutate_lines,
     ),
     Target(
-        "metric record", _read_metrics, lambda: [_stored(f"metrics/*/{RUN}.json")], (RunStore.metrics,), mutate_json
+        "metric record",
+        _read_metrics,
+        lambda: [_stored(f"metrics/*/{RUN}.json")],
+        (RunStore.stored_metrics,),
+        mutate_json,
     ),
     Target(
         "stamps and trajectories of a run",
