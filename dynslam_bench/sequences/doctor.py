@@ -110,7 +110,7 @@ def examine(
     if not streams.frames:
         return Diagnosis(sequence.id, 0, tuple(findings))
     if streams.frames < FEWEST:
-        text = f"{streams.frames} frames are too few: motion, delays and truth cannot be compared"
+        text = f"too few frames ({streams.frames}): motion, delays and truth cannot be compared"
         findings.append(Finding("too-short", "note", float(streams.frames), "frames", text, "check a longer part"))
     found = stream_findings(streams, with_depth)
     findings += found

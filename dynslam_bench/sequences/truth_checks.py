@@ -322,7 +322,7 @@ _EXPLAINED_BY_LEVER = ((5, 0.62),)
 def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -> Finding:
     if name == "focal":
         factor = float(np.exp(fit.value["focal"][0]))
-        text = f"the focal length is {factor:.3f} times the stated one (+- {sigma:.3f}): {errors}"
+        text = f"the focal length is {factor:.3f} times the stated one (+- {100 * sigma:.1f} %): {errors}"
         cure = f"fx = {camera.fx * factor:.1f}, fy = {camera.fy * factor:.1f} in camera.toml, or name the right camera"
         return Finding("camera-focal-length", "fault", factor, "", text, cure)
     if name == "centre":
@@ -332,7 +332,7 @@ def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -
         return Finding("camera-principal-point", "fault", float(np.hypot(dx, dy)), "px", text, cure)
     if name == "scale":
         factor = float(np.exp(fit.value["scale"][0]))
-        text = f"the depth is to be multiplied by {factor:.3f} (+- {sigma:.3f}) to agree with the truth: {errors}"
+        text = f"the depth is to be multiplied by {factor:.3f} (+- {100 * sigma:.1f} %) to agree with the truth: {errors}"
         cure = f"depth_factor = {camera.depth_factor / factor:.5g} in camera.toml (it is {camera.depth_factor:g})"
         return Finding("depth-factor", "fault", factor, "", text, cure)
     if name == "turn":
