@@ -332,7 +332,8 @@ def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -
         return Finding("camera-principal-point", "fault", float(np.hypot(dx, dy)), "px", text, cure)
     if name == "scale":
         factor = float(np.exp(fit.value["scale"][0]))
-        text = f"the depth is to be multiplied by {factor:.3f} (+- {100 * sigma:.1f} %) to agree with the truth: {errors}"
+        how = f"by {factor:.3f} (+- {100 * sigma:.1f} %)"
+        text = f"the depth is to be multiplied {how} to agree with the truth: {errors}"
         cure = f"depth_factor = {camera.depth_factor / factor:.5g} in camera.toml (it is {camera.depth_factor:g})"
         return Finding("depth-factor", "fault", factor, "", text, cure)
     if name == "turn":
