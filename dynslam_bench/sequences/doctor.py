@@ -1,4 +1,4 @@
-"""Compare a recording's images with each other, with its camera and with its ground truth, and name what does not fit."""
+"""Compare a recording's images with each other, with its camera and with its truth, and name what does not fit."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry.camera import Camera
 
 Array = NDArray[np.float64]
+Pixels = NDArray[np.float32]
 
 CORNERS = 300
 FAR_ENOUGH_PX = 25.0
@@ -67,7 +68,8 @@ def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
     """
     key: Frame | None = None
     gray_key = gray_last = np.zeros((0, 0), np.uint8)
-    start = points = np.zeros((0, 2), np.float32)
+    start: Pixels = np.zeros((0, 2), np.float32)
+    points: Pixels = start
     last: Frame | None = None
     for frame in frames:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -88,7 +90,7 @@ def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
         yield measure_pair(key, last, start, points, camera)
 
 
-def measure_pair(first: Frame, second: Frame, start: Array, end: Array, camera: Camera) -> RgbdPair:
+def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera) -> RgbdPair:
     """The pair of two frames whose corners `start` ``[N, 2]`` were found again at `end` ``[N, 2]``, raw pixels."""
     depth_first, depth_second = _at(first.depth, start), _at(second.depth, end)
     a, b = camera.undistort_points(start), camera.undistort_points(end)
@@ -120,7 +122,7 @@ def relative_pose(
     return inliers, pose if np.isfinite(pose).all() else None
 
 
-def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Array:
+def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     """Corners ``[N, 2]`` that lie on a surface, not at its edge."""
     window = np.ones((5, 5), np.uint8)
     near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
@@ -129,17 +131,16 @@ def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Array:
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
 
-def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Array) -> tuple[Array, NDArray[np.bool_]]:
-    how = {"winSize": (21, 21), "maxLevel": 4}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **how)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **how)
+def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels) -> tuple[Pixels, NDArray[np.bool_]]:
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
     good = (found.reshape(-1) == 1) & (found_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < _BACK_AND_FORTH_PX
     height, width = after.shape
     good &= (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
-    return there, good
+    return np.asarray(there, np.float32), np.asarray(good, np.bool_)
 
 
-def _at(depth: NDArray[np.float32], pixels: Array) -> Array:
+def _at(depth: NDArray[np.float32], pixels: Pixels) -> Array:
     x, y = np.round(pixels).astype(int).T
     return np.asarray(depth[y, x], dtype=np.float64)

@@ -109,12 +109,12 @@ class Streams:
         smooth = [np.stack([cv2.GaussianBlur(each, (0, 0), 1.0).ravel() for each in maps])
                   for maps in (colour_maps, depth_maps)]  # fmt: skip
         products = smooth[0] @ smooth[1].T
-        rows = np.full((len(products), 2 * MOST_DELAY + 1), np.nan)
+        scores = np.full((len(products), 2 * MOST_DELAY + 1), np.nan)
         for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
             diagonal = np.diagonal(products, delay)
             first = max(0, -delay)
-            rows[first : first + len(diagonal), column] = diagonal
-        self.by_delay.extend(rows)
+            scores[first : first + len(diagonal), column] = diagonal
+        self.by_delay.extend(scores)
 
 
 def _roughness(depth: Map, factor: float) -> tuple[float, float]:
@@ -218,7 +218,7 @@ def _swapped(streams: Streams) -> Finding | None:
     if not swapped < stated / 3:
         return None
     text = (
-        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the two bytes of "
+        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the bytes of "
         "each value swapped"
     )
     cure = "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)"
@@ -243,8 +243,8 @@ def _flipped(streams: Streams) -> Finding | None:
     if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
         return None
     text = (
-        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard deviations so, "
-        f"by {peaks['']:.0f} as stored"
+        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard "
+        f"deviations so, by {peaks['']:.0f} as stored"
     )
     return Finding(
         "colour-flipped", "fault", peaks[best], "sigma", text, "turn the colour images as the depth images are"
@@ -271,12 +271,11 @@ def _asynchronous(streams: Streams) -> Finding | None:
     if sure < 4 or mean[column] < 1.25 * max(mean[reference], 0) or peaks[column] < 1.1 * peaks[near].max():
         return None
     seconds = delay * streams.seconds_a_frame
-    later = "later" if delay > 0 else "earlier"
     text = (
         f"the depth images fit the colour images of {abs(delay)} frames {'before' if delay > 0 else 'after'} "
         f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
     )
-    cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt; it comes {later}"
+    cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt"
     return Finding("depth-delay", "fault", seconds, "s", text, cure)
 
 

@@ -7,7 +7,6 @@ with its quaternions read in the other order, in other axes. Where the two agree
 from __future__ import annotations
 
 from collections.abc import Sequence as PySequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,303 +16,25 @@ from dynslam_bench.geometry.association import nearest_gap
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 
+from .camera_fit import Fit, fit_camera
 from .finding import Finding
 from .rgbd_motion import RgbdPair
+from .truth_motion import (
+    READINGS,
+    ROTATION_NOISE,
+    Match,
+    Motions,
+    TruthMotion,
+    agreement,
+    best_gain,
+    match,
+    motions_of,
+    rotation_between,
+)
 
 Array = NDArray[np.float64]
 
 LARGEST_SHIFT_S = 2.0
-READINGS = ("as it stands", "inverted", "w first", "w first, inverted", "rotations inverted")
-ROTATION_NOISE = np.radians(0.25)
-TRANSLATION_NOISE = 0.006
-"""Of a measured motion: as a part of the median depth."""
-
-
-@dataclass(frozen=True, eq=False)
-class Motions:
-    """Measured motions between pairs of frames.
-
-    Attributes:
-        start: Stamps of the first frames ``[N]``.
-        end: Stamps of the second frames ``[N]``.
-        rotation: Rotation vectors ``[N, 3]`` in rad.
-        translation: Translations ``[N, 3]`` in metres of the depth images.
-        depth_m: Median depth of the corners.
-    """
-
-    start: Array
-    end: Array
-    rotation: Array
-    translation: Array
-    depth_m: float
-
-    def select(self, index: NDArray[np.bool_]) -> Motions:
-        """Some of them."""
-        return Motions(self.start[index], self.end[index], self.rotation[index], self.translation[index], self.depth_m)
-
-
-def motions_of(pairs: PySequence[RgbdPair], stamps: Array) -> Motions:
-    """The motions of pairs that have one."""
-    twists = se3.log(np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4))
-    poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
-    first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
-    depths = [float(np.median(pair.depth_first[pair.inliers])) for pair in pairs]
-    median = float(np.median(depths)) if depths else 1.0
-    return Motions(stamps[first], stamps[second], twists[:, 3:], poses[:, :3, 3], median)
-
-
-class TruthMotion:
-    """A truth that is asked for motions at any stamps: poses between its own are interpolated.
-
-    Args:
-        truth: Poses at their stamps.
-        reading: How to read them, one of `READINGS`.
-    """
-
-    def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
-        self.stamps = truth.timestamps
-        self.poses = read_as(truth.T_world_cam, reading)
-        steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
-        self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
-        gaps = np.diff(self.stamps)
-        self._widest = max(0.12, 2.5 * float(np.median(gaps))) if len(gaps) else 0.0
-
-    def at(self, stamps: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Poses ``[N, 4, 4]`` and whether the truth has them: not beyond its ends nor in its holes."""
-        if len(self.stamps) < 2:
-            return np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
-        index = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2)
-        low, high = self.stamps[index], self.stamps[index + 1]
-        share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
-        poses = self.poses[index].copy()
-        turn = np.zeros((len(stamps), 6))
-        turn[:, 3:] = share * self._turns[index]
-        poses[:, :3, :3] = poses[:, :3, :3] @ se3.exp(turn)[:, :3, :3]
-        poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
-        slack = 0.005
-        inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
-        return poses, inside & (high - low <= self._widest)
-
-    def between(self, start: Array, end: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Poses at `start`, relative poses from there to `end`, their rotation vectors, and which of them there are."""
-        first, valid = self.at(start)
-        second, valid_too = self.at(end)
-        relative = se3.inverse(first) @ second
-        return first, relative, se3.log(relative)[:, 3:], valid & valid_too
-
-
-def read_as(poses: Array, reading: str) -> Array:
-    """Poses ``[N, 4, 4]`` of a file that was written in the convention `reading` and read as if in TUM's."""
-    if reading == READINGS[0]:
-        return poses
-    if reading == "inverted":
-        return se3.inverse(poses)
-    if reading == "rotations inverted":
-        turned = poses.copy()
-        turned[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-        return turned
-    position, quaternion = se3.to_quaternion(poses)
-    turned = se3.from_quaternion(position, quaternion[:, [1, 2, 3, 0]])
-    return se3.inverse(turned) if reading == "w first, inverted" else turned
-
-
-def agreement(measured: Array, true: Array, gain: float) -> float:
-    """How well vectors ``[N, 3]`` agree up to a gain: 1 - the weighted median of their relative differences.
-
-    1 is perfect; independent directions give some 0.3; less is the opposite.
-    """
-    true = gain * true
-    size = np.linalg.norm(measured, axis=1) + np.linalg.norm(true, axis=1)
-    off = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
-    order = np.argsort(off)
-    total = np.cumsum(size[order])
-    if not len(total) or total[-1] <= 0:
-        return 0.0
-    return 1.0 - float(off[order][np.searchsorted(total, total[-1] / 2)])
-
-
-def best_gain(measured: Array, true: Array, low: float, high: float) -> float:
-    """The ratio of the lengths of vectors, by their weighted sums, within bounds."""
-    a, b = np.linalg.norm(measured, axis=1).sum(), np.linalg.norm(true, axis=1).sum()
-    return float(np.clip(a / max(b, 1e-12), low, high))
-
-
-def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Array:
-    """The orthogonal matrix ``[3, 3]`` that turns `measured` ``[N, 3]`` into `true` best, by three robust rounds."""
-    weight = np.ones(len(measured))
-    X = np.eye(3)
-    gain = 1.0 / best_gain(measured, true, 1e-6, 1e6)
-    for _ in range(4):
-        left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
-        sign = np.linalg.det(left @ right) if proper else 1.0
-        X = left @ np.diag([1.0, 1.0, sign]) @ right
-        off = np.linalg.norm(true - gain * measured @ X.T, axis=1)
-        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-12)) ** 2)
-    return np.asarray(X)
-
-
-@dataclass(frozen=True)
-class Match:
-    """How well a truth, read in one way and shifted in time, tells the measured motions.
-
-    Attributes:
-        reading: One of `READINGS`.
-        shift_s: What is added to the images' stamps to find their poses.
-        rotation: `agreement` of the rotations.
-        translation: `agreement` of the translations.
-        weights: What either counts: near 1 where the motion is far above the noise.
-        gain: Ratio of the lengths of the measured translations to the true ones.
-        share: Part of the motions for which the truth has poses.
-    """
-
-    reading: str
-    shift_s: float
-    rotation: float
-    translation: float
-    weights: tuple[float, float]
-    gain: float
-    share: float
-
-    @property
-    def total(self) -> float:
-        """Weighted mean of both agreements."""
-        w = self.weights
-        return (w[0] * self.rotation + w[1] * self.translation) / max(w[0] + w[1], 1e-9)
-
-    @property
-    def clearest(self) -> float:
-        """The same, or the agreement of the rotations where it is better and they are clear: people spoil them least."""
-        return max(self.total, self.rotation) if self.weights[0] >= 0.5 else self.total
-
-
-def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) -> Match:
-    """Compare the motions with those of a truth under a shift in time."""
-    _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
-    share = float(valid.mean()) if len(valid) else 0.0
-    if valid.sum() < 5:
-        return Match(reading, shift_s, 0.0, 0.0, (0.0, 0.0), 1.0, share)
-    v, tau = motions.rotation[valid], motions.translation[valid]
-    rho, turns = relative[valid, :3, 3], turns[valid]
-    snr = float(np.median(np.linalg.norm(v, axis=1))) / ROTATION_NOISE
-    snr_t = float(np.median(np.linalg.norm(tau, axis=1))) / (TRANSLATION_NOISE * motions.depth_m)
-    gain = best_gain(tau, rho, 1e-6, 1e6)
-    return Match(
-        reading,
-        shift_s,
-        agreement(v, turns, best_gain(v, turns, 0.4, 2.5)),
-        agreement(tau, rho, gain),
-        (snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)),
-        gain,
-        share,
-    )
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Camera and mounting that make the truth's motion carry the corners from image to image.
-
-    Attributes:
-        value: ``focal`` and ``scale`` (of the depth) as natural logarithms of the factor, ``cx`` and ``cy`` as pixels
-            to be added, ``turn`` the rotation vector ``[3]`` in rad and ``lever`` the position ``[3]`` in metres of the
-            camera in the frame of the body that the truth tracks.
-        sigma: Their standard deviations, each pair of frames being one observation.
-        residual_px: Median reprojection error.
-        cost: Mean robust cost of a corner.
-    """
-
-    value: dict[str, Array]
-    sigma: dict[str, Array]
-    residual_px: float
-    cost: float
-
-    def size(self, name: str) -> float:
-        """Length of a value."""
-        return float(np.linalg.norm(self.value[name]))
-
-    def certainty(self, name: str) -> float:
-        """Length of a value in standard deviations of it."""
-        return self.size(name) / max(float(np.linalg.norm(self.sigma[name])), 1e-12)
-
-
-_PARAMETERS = {"focal": slice(0, 1), "cx": slice(1, 2), "cy": slice(2, 3), "scale": slice(3, 4),
-               "turn": slice(4, 7), "lever": slice(7, 10)}  # fmt: skip
-_PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-_CORNERS_A_PAIR = 25
-_OUTLIER_PX = 2.0
-
-
-def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
-    """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
-
-    Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.
-    A weak prior keeps what the motion does not tell near what is stated.
-
-    Args:
-        pairs: Pairs of frames with a motion.
-        relative: Motions of the truth between them ``[N, 4, 4]``, in the depth's units.
-        camera: The stated camera.
-        free: Names of what is fitted, of `Fit.value`; the rest stays as stated.
-    """
-    from scipy.optimize import least_squares
-
-    chosen = [np.flatnonzero(pair.inliers) for pair in pairs]
-    chosen = [index[:: max(1, len(index) // _CORNERS_A_PAIR)][:_CORNERS_A_PAIR] for index in chosen]
-    number = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen])
-    first, depth, second = (
-        np.concatenate([getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)])
-        for name in ("pixels_first", "depth_first", "pixels_second")
-    )
-    back = se3.inverse(relative)
-
-    def errors(x: Array) -> Array:
-        focal = np.exp(x[0]) * np.array([camera.fx, camera.fy])
-        centre = np.array([camera.cx, camera.cy]) + x[1:3]
-        rays = np.concatenate([(first - centre) / focal, np.ones((len(first), 1))], axis=1)
-        mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
-        mount[:3, 3] = x[7:10]
-        moves = se3.inverse(mount) @ back @ mount
-        points = np.exp(x[3]) * depth[:, None] * rays
-        moved = np.einsum("nij,nj->ni", moves[number, :3, :3], points) + moves[number, :3, 3]
-        seen = moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre
-        return (seen - second).ravel()
-
-    index = np.array([i for name in free for i in range(10)[_PARAMETERS[name]]], int)
-
-    def filled(part: Array) -> Array:
-        x = np.zeros(10)
-        x[index] = part
-        return x
-
-    def robust(part: Array) -> Array:
-        x = filled(part)
-        raw = errors(x).reshape(-1, 2) / _OUTLIER_PX
-        square = (raw**2).sum(axis=1, keepdims=True)
-        shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
-        return np.concatenate([shrunk.ravel(), x / _PRIOR])
-
-    scales = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
-    x = filled(least_squares(robust, np.zeros(len(index)), x_scale=scales[index]).x) if len(index) else np.zeros(10)
-    left = errors(x).reshape(-1, 2)
-    weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
-    steps = np.diag(np.array([1e-4, 0.05, 0.05, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]))
-    slopes = np.stack([(errors(x + s) - errors(x - s)) / (2 * s.sum()) for s in steps], axis=1).reshape(-1, 2, len(x))
-    curvature = np.einsum("npi,n,npj->ij", slopes, weight, slopes) + np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
-    pulls = np.zeros((len(pairs), len(x)))
-    np.add.at(pulls, number, np.einsum("npi,n,np->ni", slopes, weight, left))
-    chosen_ones = np.ix_(index, index)
-    inverse = np.linalg.inv(curvature[chosen_ones])
-    outer = pulls.T @ pulls + np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
-    spread = inverse @ outer[chosen_ones] @ inverse
-    deviation = filled(np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(len(pairs) / max(len(pairs) - len(index), 1)))
-    names = _PARAMETERS.items()
-    return Fit(
-        {name: x[where] for name, where in names},
-        {name: deviation[where] for name, where in names},
-        float(np.median(np.linalg.norm(left, axis=1))),
-        float((robust(x[index]) ** 2).sum() / len(first)),
-    )
-
-
 SAME_FRAME_S = 0.02
 LEAST_COVERAGE = 0.15
 LEAST_PAIRS = 8
@@ -368,8 +89,8 @@ def truth_findings(
         return [_at_rest(stamps, truth, camera, usable, displacement)]
     if len(usable) < LEAST_PAIRS:
         text = (
-            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: truth "
-            "and camera were not compared"
+            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: "
+            "truth and camera were not compared"
         )
         return [
             Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
@@ -451,7 +172,8 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
         text = (
             f"the truth is {abs(shift):.3f} s {'late' if shift > 0 else 'early'}: {so.replace('they tell', 'it tells')}"
         )
-        cure = f"{'subtract' if shift > 0 else 'add'} {abs(shift):.3f} s {'from' if shift > 0 else 'to'} the stamps of the truth"
+        change = "subtract {} s from" if shift > 0 else "add {} s to"
+        cure = f"{change.format(f'{abs(shift):.3f}')} the stamps of the truth"
         findings.append(Finding("truth-time-shift", "fault", shift, "s", text, cure))
     return findings
 
@@ -475,8 +197,8 @@ def _otherwise(
     enough = stated.weights[0] >= 0.5 and len(motions.start) >= LEAST_UNLIKE and len(motions.start) >= 0.5 * tried
     if enough and closest < UNRELATED:
         text = (
-            f"the truth tells at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames show, "
-            f"under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
+            f"the truth tells at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
+            f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
         )
         return [Finding("truth-other-sequence", "fault", closest, "", text, "take the truth of this recording")]
     text = f"the truth tells {100 * stated.total:.0f} % of the motion between the frames, too little to compare more"
@@ -542,7 +264,7 @@ def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     """The true translations are `factor` times the measured ones."""
     power = 3 if factor > 300 else 2
     unit = {3: "millimetres", 2: "centimetres"}[power] if factor > 30 else ""
-    text = f"the truth's translations are {factor:.4g} times those that the depth gives (median depth {motions.depth_m:.2f} m)"
+    text = f"the truth's translations are {factor:.4g} times the measured ones (median depth {motions.depth_m:.2f} m)"
     if unit and 0.15 < motions.depth_m < 20:
         cure = f"divide the positions of groundtruth.txt by {10**power}"
         return Finding("truth-scale", "fault", factor, "", f"{text}: they are in {unit}", cure)
@@ -598,8 +320,8 @@ _GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "tu
 _LIMITS = {"focal": 0.08, "centre": 25.0, "scale": 0.1, "turn": np.radians(6), "lever": 0.04}
 """Published recordings differ from their cameras and truths by less: Bonn's lever arm is 0.019 m."""
 _EXPLAINED = ((5, 0.75), (8, 0.88))
-"""Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain in
-healthy recordings, and no value above its limit is sure to 4."""
+"""Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain
+in healthy recordings, and no value above its limit is sure to 4."""
 _EXPLAINED_BY_LEVER = ((5, 0.62),)
 """People who walk past can feign one: 0.68 remained then."""
 

@@ -51,6 +51,11 @@ class Copy:
             path.unlink()
             cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
+    def drop(self, kind: str) -> None:
+        """Remove the images of a kind and their list."""
+        shutil.rmtree(self.folder / kind)
+        (self.folder / f"{kind}.txt").unlink()
+
     def camera(self, **factors: float) -> None:
         """Multiply entries of the camera's file, or add to those of the principal point."""
         path = self.folder / "camera.toml"
@@ -165,6 +170,7 @@ def unrelated(copy: Copy) -> None:
     copy.truth(lambda _: table)
 
 
+W_FIRST = [0, 1, 2, 3, 7, 4, 5, 6]
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """Body axes, x forward and z up, in the optical frame of the camera (columns)."""
 FAULTS |= {
@@ -174,7 +180,7 @@ FAULTS |= {
     "truth in millimetres": ("truth-scale", scaled(1000)),
     "truth in centimetres": ("truth-scale", scaled(100)),
     "truth inverted": ("truth-inverted", lambda copy: copy.poses(se3.inverse)),
-    "quaternions w first": ("truth-quaternion-order", lambda copy: copy.truth(lambda t: t[:, [0, 1, 2, 3, 7, 4, 5, 6]])),
+    "quaternions w first": ("truth-quaternion-order", lambda copy: copy.truth(lambda t: t[:, W_FIRST])),
     "lever arm 0.25 m": ("truth-lever-arm", mounted(np.eye(3), (0.15, -0.2, 0.0))),
     "lever arm 0.12 m": ("truth-lever-arm", mounted(np.eye(3), (0.0, -0.1, 0.07))),
     "body axes": ("truth-axes", mounted(AXES, (0, 0, 0))),
@@ -208,7 +214,7 @@ FAULTS |= {
     "colour black": ("colour-blank", lambda copy: copy.images("rgb", np.zeros_like)),
     "depth empty": ("depth-empty", lambda copy: copy.images("depth", np.zeros_like)),
     "no truth": ("no-truth", lambda copy: (copy.folder / "groundtruth.txt").unlink()),
-    "no depth": ("unreadable", lambda copy: (shutil.rmtree(copy.folder / "depth"), (copy.folder / "depth.txt").unlink())),
+    "no depth": ("unreadable", lambda copy: copy.drop("depth")),
     "one frame": ("too-short", lambda copy: (copy.write("rgb", copy.rows["rgb"][:1]),
                                              copy.write("depth", copy.rows["depth"][:1]))),
     "a third cut off": ("unreadable", lambda copy: [path.write_bytes(path.read_bytes()[:500])
@@ -264,9 +270,10 @@ def run_faults(names: list[str], data_root: str | None, only: str, most: int) ->
                 ids = [finding.id for finding in diagnosis.findings]
                 ok = expected in ids and all(f.id == expected for f in diagnosis.findings if f.severity == "fault")
                 right, tried = right + ok, tried + 1
-                text = diagnosis.findings[0].text if diagnosis.findings else "-"
+                text = diagnosis.findings[0].text[:230] if diagnosis.findings else "-"
+                names = ",".join(ids) or "-"
                 print(
-                    f"{'ok ' if ok else 'NOT'} {title:28} {expected:22} {','.join(ids) or '-':30} {seconds:5.1f} s  {text[:230]}",
+                    f"{'ok ' if ok else 'NOT'} {title:28} {expected:22} {names:30} {seconds:5.1f} s  {text}",
                     flush=True,
                 )
                 shutil.rmtree(folder)

@@ -1,6 +1,5 @@
 """`sequences doctor`: faults put into a recording are named, a sound one has none, nothing makes it raise."""
 
-
 import cv2
 import numpy as np
 import pytest
@@ -12,10 +11,11 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.doctor import diagnose, examine, stretches
 from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
-from dynslam_bench.sequences.truth_checks import READINGS, read_as, truth_findings
+from dynslam_bench.sequences.truth_checks import truth_findings
+from dynslam_bench.sequences.truth_motion import READINGS, read_as
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
-FRAMES = 60
+FRAMES = 80
 
 
 class Rendered:
@@ -30,8 +30,8 @@ class Rendered:
         self.timestamps = 100.0 + t
         self.ground_truth = Trajectory(self.timestamps, se3.exp(np.concatenate([swing, turn], axis=1)))
         rng = np.random.default_rng(3)
-        self.walls = [cv2.resize(rng.integers(0, 255, (40, 40), dtype=np.uint8), (800, 800), interpolation=cv2.INTER_AREA)
-                      for _ in range(6)]  # fmt: skip
+        noise = rng.integers(0, 255, (3, 40, 40), dtype=np.uint8)
+        self.walls = [cv2.resize(each, (800, 800), interpolation=cv2.INTER_AREA) for each in noise]
         rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
         self.rays = np.stack(
             [(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], -1
