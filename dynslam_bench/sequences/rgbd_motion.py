@@ -68,7 +68,8 @@ def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
     """
     key: Frame | None = None
     gray_key = gray_last = np.zeros((0, 0), np.uint8)
-    start = points = np.zeros((0, 2), np.float32)
+    start: Pixels = np.zeros((0, 2), np.float32)
+    points: Pixels = start
     last: Frame | None = None
     for frame in frames:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)

@@ -1,5 +1,7 @@
 """`sequences doctor`: faults put into a recording are named, a sound one has none, nothing makes it raise."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -98,6 +100,11 @@ def sound():
     return Rendered()
 
 
+@pytest.fixture(scope="module")
+def diagnosed(sound):
+    return cache(lambda name: examine(Altered(sound, **FAULTS[name])))
+
+
 def of_poses(change):
     return lambda truth: Trajectory(truth.timestamps, change(truth.T_world_cam))
 
@@ -118,6 +125,12 @@ def scaled(factor):
 def w_first(poses):
     position, quaternion = se3.to_quaternion(poses)
     return se3.from_quaternion(position, quaternion[:, [3, 0, 1, 2]])
+
+
+def wander(seed):
+    """A truth of another recording: a random walk."""
+    twist = np.random.default_rng(seed).normal(0, 0.02, (FRAMES, 6)).cumsum(axis=0)
+    return lambda truth: Trajectory(truth.timestamps, se3.exp(twist))
 
 
 BODY = se3.exp(np.zeros(6))
@@ -164,17 +177,24 @@ def test_a_sound_recording_has_no_fault(sound):
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_named(sound, name):
-    diagnosis = examine(Altered(sound, **FAULTS[name]))
+def test_a_fault_is_named(diagnosed, name):
+    diagnosis = diagnosed(name)
     assert [finding.id for finding in diagnosis.findings if finding.severity == "fault"] == [name]
     assert not diagnosis.ok and all(finding.text and finding.cure for finding in diagnosis.findings)
 
 
 @pytest.mark.parametrize(("name", "value"), [("truth-time-shift", 0.2), ("truth-scale", 1000.0), ("depth-factor", 5.0),
                                              ("camera-focal-length", 0.5), ("truth-lever-arm", 0.25)])  # fmt: skip
-def test_a_fault_is_measured(sound, name, value):
-    (finding,) = examine(Altered(sound, **FAULTS[name])).findings
+def test_a_fault_is_measured(diagnosed, name, value):
+    (finding,) = diagnosed(name).findings
     assert finding.value == pytest.approx(value, rel=0.1)
+
+
+def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound):
+    pairs = [pair for start in range(0, FRAMES, 40) for pair in rgbd_pairs(sound.frames[start : start + 40], CAMERA)]
+    found = [truth_findings(sound.timestamps, wander(k)(sound.ground_truth), CAMERA, pairs) for k in (8, 9, 10)]
+    ids = [finding.id for (finding,) in found]
+    assert set(ids) <= {"truth-other-sequence", "truth-unclear"} and "truth-other-sequence" in ids
 
 
 def test_pairs_give_the_camera_s_motion(sound):
