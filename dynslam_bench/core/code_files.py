@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +17,7 @@ _TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".y
          ".xml")  # fmt: skip
 _LARGEST_TEXT = 1 << 20
 _WORD = re.compile(rb"[\w./~+\-]+")
+_FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([A-Za-z_]\w*)|import[ \t]+([A-Za-z_][\w., \t]*))", re.MULTILINE)
 _SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
 _STORE = ("index", "metrics", "sequences", "latest")
@@ -55,9 +58,9 @@ def foreign_modules(file: Path) -> set[str]:
 def program_files(folder: Path) -> list[Path]:
     """The files below a folder that decide what its code does.
 
-    These are all code files, and each other file whose name, or whose suffix, is written in one of the text files among
-    them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``, ``f"{name}.yaml"``. Hidden folders, virtual environments,
-    results folders and recordings are left out.
+    These are all code files, and each other file of which the name, or its end with a dot in it, is written in one of
+    the text files among them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``, ``f"{name}_v2.yaml"``. Hidden folders,
+    virtual environments, results folders and recordings are left out.
 
     Args:
         folder: For example that of a plug-in's file.
@@ -71,17 +74,40 @@ def program_files(folder: Path) -> list[Path]:
 
 
 def imported_modules(files: Iterable[Path]) -> set[str]:
-    """Top-level names of the modules that Python sources import.
+    """Top-level names of the modules that Python sources import, by statements or by names in ``import_module``.
 
     Raises:
         OSError: A file cannot be read.
     """
     found: set[str] = set()
-    for file in files:
-        for single, several in _IMPORT.findall(file.read_bytes()) if file.suffix == ".py" else ():
-            for name in (single or several).decode().split(","):
-                found.add(name.split()[0].partition(".")[0] if name.split() else "")
-    return found - {""}
+    for file in filter(is_python, files):
+        source = file.read_bytes()
+        try:
+            nodes = list(ast.walk(ast.parse(source)))
+        except (SyntaxError, ValueError, RecursionError):  # of another version of Python
+            for single, several in _IMPORT.findall(source):
+                found |= {name.strip() for name in (single or several).decode().split(",")}
+            continue
+        for node in nodes:
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                found.add(node.module or "")
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+                first = node.args[0] if node.args else None
+                found.add(first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else "")
+    return {name.partition(".")[0].partition(" ")[0] for name in found} - {""}
+
+
+def is_python(file: Path) -> bool:
+    """Whether a file is Python source: by its suffix, or by the first line of a script without one."""
+    if file.suffix == ".py":
+        return True
+    if file.suffix or not _is_file(file):
+        return False
+    with file.open("rb") as opened:
+        first = opened.readline(200)
+    return first.startswith(b"#!") and b"python" in first
 
 
 def files_below(folder: Path) -> Iterator[Path]:
@@ -103,8 +129,9 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     """The files that decide what a command does.
 
     These are its program with the libraries it is linked with, the files and folders among its arguments (also behind
-    ``=``), the code of ``python -m MODULE``, all code in the folder of a Python script, and what scripts and
-    configuration files name. Files of the operating system are left out.
+    ``=``), the code of ``python -m MODULE``, all code in the folder of a Python script and what it imports from
+    elsewhere but installed distributions, and what scripts and configuration files name. Files of the operating system
+    are left out.
 
     Args:
         command: Program and arguments.
@@ -122,8 +149,12 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     if program is not None and program.name.startswith("python") and "-m" in command[:-1]:
         found += _module_files(command[command.index("-m") + 1], base)
     named = _with_named_files(found, base)
-    scripts = {file.parent for file in named if file.suffix == ".py" and file.parent not in found}
-    own = [file for script in sorted(scripts) for file in program_files(script)]
+    shells = [file for file in named if file.suffix in (".sh", ".bash") or (not file.suffix and _words(file))]
+    named += [each for file in shells for each in _named([file], list(files_below(file.parent)))]
+    scripts = [file for file in named if is_python(file) and not _is_of_system(file)]
+    own = [file for folder in sorted({script.parent for script in scripts}) for file in program_files(folder)]
+    modules = {name for script in scripts for name in foreign_modules(script)} - set(sys.stdlib_module_names)
+    own += [file for name in sorted(modules) for file in _module_files(name, base) if not _is_installed(file)]
     return list(dict.fromkeys(file.resolve() for file in (*named, *own)))
 
 
@@ -135,9 +166,17 @@ def _module_files(module: str, base: Path) -> list[Path]:
             return program_files(place / top)
         if (place / f"{top}.py").is_file():
             return program_files(place)
-    spec = find_spec(top)
-    folders = [] if spec is None else list(spec.submodule_search_locations or ())
-    return [file for place in folders for file in files_below(Path(place))]
+    try:
+        spec = find_spec(top)
+    except (ImportError, ValueError):
+        spec = None
+    folders = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
+    return [file for place in folders if not _is_installed(place) for file in files_below(place)]
+
+
+def _is_installed(path: Path) -> bool:
+    """Whether a path belongs to an installed distribution, which its version tells."""
+    return any(part in ("site-packages", "dist-packages") for part in path.parts)
 
 
 def _linked_libraries(program: Path) -> list[Path]:
@@ -175,7 +214,10 @@ def _named(code: list[Path], others: list[Path]) -> list[Path]:
     waiting = list(code)
     while waiting and others:
         words = {word.rpartition("/")[2] for file in waiting for word in _words(file)}
-        waiting = [file for file in others if file.name in words or (file.suffix and file.suffix in words)]
+        ends = tuple(word for word in words if "." in word.strip(".")) + tuple(
+            w for w in words if w[:1] == "." and w[1:]
+        )
+        waiting = [file for file in others if file.name in words or file.name.endswith(ends)]
         others = [file for file in others if file not in set(waiting)]
         found += waiting
     return found
@@ -189,7 +231,8 @@ def _words(file: Path) -> set[str]:
         with file.open("rb") as opened:
             if file.suffix not in _TEXT and (file.suffix or opened.read(2) != b"#!"):
                 return set()
-        return {word.decode(errors="replace").rstrip(".") for word in _WORD.findall(file.read_bytes())}
+        text = _FORMAT.sub(b" ", file.read_bytes())
+        return {word.decode(errors="replace").rstrip(".") for word in _WORD.findall(text)}
     except OSError:
         return set()
 

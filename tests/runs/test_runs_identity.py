@@ -140,6 +140,35 @@ def test_comments_docstrings_and_what_no_code_names_change_nothing(
     assert resolve(spec).run_id == before
 
 
+@pytest.mark.parametrize(
+    "named", ['"gain_%d.txt" % 3', '"gain" + "_3.txt"', 'f"gain_{3}.txt"', '"my gain_3.txt"', '"gain_3.txt"']
+)
+def test_a_data_file_counts_however_its_name_is_put_together(named: str, tmp_path: Path) -> None:
+    spec, folder = plugin(tmp_path)
+    write(folder / "helper.py", f"FILE = {named}\n")
+    for name in ("gain_3.txt", "my gain_3.txt"):
+        write(folder / name, "1111")
+    before = resolve(spec).run_id
+    edit(folder / ("my gain_3.txt" if "my" in named else "gain_3.txt"), "1111", "2222")()
+    assert resolve(spec).run_id != before
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["import os; import identity_toy_module", 'import importlib; importlib.import_module("identity_toy_module")'],
+)
+def test_an_import_counts_however_it_is_written(
+    statement: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, folder = plugin(tmp_path)
+    module = write(tmp_path / "elsewhere" / "identity_toy_module.py", "gain = 1\n")
+    monkeypatch.syspath_prepend(str(module.parent))
+    write(folder / "mine.py", f"{PLUGIN}\ndef later():\n    {statement}\n")
+    before = resolve(spec).run_id
+    edit(module, "1", "2")()
+    assert resolve(spec).run_id != before
+
+
 def test_what_a_plug_in_imports_from_elsewhere_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec, folder = plugin(tmp_path)
     library = write(tmp_path / "elsewhere" / "identity_toy_library" / "__init__.py", "gain = 1\n")
@@ -166,6 +195,10 @@ def a_program(tmp_path: Path) -> Path:
     write(folder / "package" / "__init__.py", "")
     write(folder / "package" / "__main__.py", "x = 1\n")
     write(folder / "run.sh", "#!/bin/sh\nexec python slam.py\n").chmod(0o755)
+    write(folder / "here.sh", '#!/bin/bash\npython "$(dirname "$0")/inner/main.py"\n').chmod(0o755)
+    write(folder / "sub.sh", "#!/bin/sh\ncd inner && python main.py\n").chmod(0o755)
+    write(folder / "inner" / "main.py", "x = 1\n")
+    write(folder / "script", "#!/usr/bin/env python3\nimport part\n").chmod(0o755)
     return folder
 
 
@@ -184,6 +217,9 @@ def a_program(tmp_path: Path) -> Path:
         ("{python} -m part", "part.py", "1", "2"),
         ("./run.sh", "run.sh", "exec", "echo"),
         ("./run.sh", "part.py", "1", "2"),
+        ("./here.sh", "inner/main.py", "1", "2"),
+        ("./sub.sh", "inner/main.py", "1", "2"),
+        ("./script", "part.py", "1", "2"),
     ],
 )
 def test_a_changed_program_is_another_run(command: str, file: str, old: str, new: str, tmp_path: Path) -> None:
