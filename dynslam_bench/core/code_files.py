@@ -214,9 +214,7 @@ def _named(code: list[Path], others: list[Path]) -> list[Path]:
     waiting = list(code)
     while waiting and others:
         words = {word.rpartition("/")[2] for file in waiting for word in _words(file)}
-        ends = tuple(word for word in words if "." in word.strip(".")) + tuple(
-            w for w in words if w[:1] == "." and w[1:]
-        )
+        ends = tuple(word for word in words if "." in word)
         waiting = [file for file in others if file.name in words or file.name.endswith(ends)]
         others = [file for file in others if file not in set(waiting)]
         found += waiting
