@@ -87,7 +87,7 @@ _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
 def shown_cell(name: str, value: Any) -> Any:
     """A cell of the table: paths without their folders, which ``--json`` and ``runs show`` have."""
-    if name in ("tracker", "masks"):
+    if name in ("tracker", "segmentation"):
         return label_text(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
