@@ -215,7 +215,7 @@ FAULTS |= {
     "colour black": ("colour-blank", lambda copy: copy.images("rgb", np.zeros_like)),
     "depth empty": ("depth-empty", lambda copy: copy.images("depth", np.zeros_like)),
     "no truth": ("no-truth", lambda copy: (copy.folder / "groundtruth.txt").unlink()),
-    "no depth": ("unreadable", lambda copy: copy.drop("depth")),
+    "no depth": ("no-depth", lambda copy: copy.drop("depth")),
     "one frame": ("too-short", lambda copy: (copy.write("rgb", copy.rows["rgb"][:1]),
                                              copy.write("depth", copy.rows["depth"][:1]))),
     "a third cut off": ("unreadable", lambda copy: [path.write_bytes(path.read_bytes()[:500])
