@@ -169,11 +169,10 @@ def doctor(
     with progress(name) as advance:
         diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
     if as_json:
-        write_json({**asdict(diagnosis), "ok": diagnosis.ok})
+        write_json({**asdict(diagnosis), "ok": diagnosis.ok, "verdict": diagnosis.verdict})
     else:
-        faults = sum(finding.severity == "fault" for finding in diagnosis.findings)
-        verdict = "no fault found" if diagnosis.ok else f"{faults} fault{'s' * (faults != 1)}"
-        write(f"{diagnosis.id}: {verdict}, {diagnosis.frames} frames compared")
+        frames = f"{diagnosis.frames} frame{'s' * (diagnosis.frames != 1)}"
+        write(f"{diagnosis.id}: {diagnosis.verdict} ({frames} read)")
         for finding in diagnosis.findings:
             write(f"  {finding.severity} {finding.id}: {finding.text}")
             write(f"    cure: {finding.cure}")

@@ -226,7 +226,7 @@ def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.floa
         texts.append(parts[0])
         if len(parts) != columns:
             raise TrajectoryError(
-                f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(len(parts))
+                f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(parts)
             )
         try:
             values.extend(map(float, parts))
@@ -260,9 +260,9 @@ def is_number(text: str) -> bool:
     return True
 
 
-def _hint(found: int) -> str:
-    if found == 12:
+def _hint(parts: list[str]) -> str:
+    if len(parts) == 12:
         return "12 values a line are KITTI's format: give their stamps with --timestamps FILE"
-    if found == 2:
+    if len(parts) == 2 and is_number(parts[0]) and not is_number(parts[1]):
         return "this looks like a list of images"
     return ""

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.core.errors import DynslamError, SequenceError
+from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
 from dynslam_bench.geometry.camera import Camera
 
 from .finding import Finding
 from .rgbd_motion import RgbdPair, rgbd_pairs
 from .stream_checks import Streams, stream_findings
-from .truth_checks import truth_findings
+from .truth_checks import RESAVE, truth_findings
 
 MOST_FRAMES = 240
 FEWEST = 10
@@ -26,10 +26,10 @@ STRETCH = 40
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the doctor found in a recording.
+    """What the check of a recording found.
 
     Attributes:
-        id: The sequence's id, or what it was called if it cannot be opened.
+        id: What the caller named: an id or the path of a folder.
         frames: Frames that were read.
         findings: What was found, faults first.
     """
@@ -42,6 +42,18 @@ class Diagnosis:
     def ok(self) -> bool:
         """Whether no fault was found."""
         return not any(finding.severity == "fault" for finding in self.findings)
+
+    @property
+    def verdict(self) -> str:
+        """A phrase for the first line of a report; every note stands for a comparison that was not made."""
+        faults = sum(finding.severity == "fault" for finding in self.findings)
+        if faults:
+            return f"{faults} fault{'s' * (faults != 1)}"
+        if not self.findings:
+            return "no fault found"
+        if any(finding.id == "no-truth" for finding in self.findings):
+            return "no fault found in the images; there is no ground truth to compare"
+        return "no fault found in the images, but the ground truth could not be compared"
 
 
 def diagnose(
@@ -67,7 +79,7 @@ def diagnose(
         sequence = open_sequence(name, data_root=data_root, camera=camera)
     except (DynslamError, OSError, ValueError) as error:
         return Diagnosis(str(name), 0, (_unopened(name, data_root, camera, error),))
-    return examine(sequence, most_frames=most_frames, progress=progress)
+    return replace(examine(sequence, most_frames=most_frames, progress=progress), id=str(name))
 
 
 def examine(
@@ -94,7 +106,7 @@ def examine(
             try:
                 frames.append(sequence[index])
             except (DynslamError, OSError, ValueError) as error:
-                unreadable.append(f"frame {index}: {error}")
+                unreadable.append(f"frame {index}: {_message(error)}")
             done += 1
             if progress is not None:
                 progress(done, todo)
@@ -105,7 +117,7 @@ def examine(
     findings = []
     if unreadable:
         text = f"{len(unreadable)} of {todo} frames cannot be read; {unreadable[0]}"
-        cure = "export or fetch these files again, or remove their lines from the lists"
+        cure = "export or fetch these files again, or remove them from the lists"
         findings.append(Finding("unreadable", "fault", float(len(unreadable)), "frames", text, cure))
     if not streams.frames:
         return Diagnosis(sequence.id, 0, tuple(findings))
@@ -142,11 +154,21 @@ def _unopened(
         base = getattr(loose, "base", loose)
         frame = base[0]
     except (DynslamError, OSError, ValueError):
-        hint = getattr(error, "hint", "") or "see docs/sequences.md"
-        text = " ".join(str(error.args[0] if error.args else error).split())
-        kind = "depth-format" if isinstance(error, SequenceError) and text.startswith("depth image") else "unreadable"
-        return Finding(kind, "fault", None, "", text, hint)
+        text, cure = _message(error), getattr(error, "hint", "")
+        if isinstance(error, TrajectoryError):
+            return Finding("unreadable", "fault", None, "", text, cure or RESAVE)
+        kind = "unreadable"
+        if isinstance(error, SequenceError) and text.startswith("depth image"):
+            kind = "depth-format"
+        elif text.endswith("nor a folder depth"):
+            kind, cure = "no-depth", "record or export depth images: a folder is read only with depth"
+        return Finding(kind, "fault", None, "", text, cure or "docs/sequences.md says what a folder holds")
     (height, width), (rows, columns) = frame.rgb.shape[:2], frame.depth.shape
     text = f"depth images are {columns}x{rows}, colour images {width}x{height}"
     cure = "register the depth to the colour images, pixel by pixel; resizing serves only if both have one view"
     return Finding("depth-size", "fault", columns / width, "", text, cure)
+
+
+def _message(error: Exception) -> str:
+    """The message of an error on one line, without the hint."""
+    return " ".join(str(error.args[0] if error.args else error).split())

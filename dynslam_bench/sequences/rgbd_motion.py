@@ -42,6 +42,7 @@ class RgbdPair:
         T_first_second: Pose of the second camera in the first one's frame ``[4, 4]``, metres; None if too few corners
             agree on any motion.
         displacement_px: Median displacement of the corners.
+        depth_share: Part of the first depth image that holds depth.
     """
 
     first: int
@@ -53,6 +54,7 @@ class RgbdPair:
     inliers: NDArray[np.bool_]
     T_first_second: Array | None
     displacement_px: float
+    depth_share: float
 
 
 def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
@@ -96,7 +98,8 @@ def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera
     a, b = camera.undistort_points(start), camera.undistort_points(end)
     displacement = float(np.median(np.linalg.norm(b - a, axis=1)))
     inliers, pose = relative_pose(a, depth_first, b, camera)
-    return RgbdPair(first.index, second.index, a, depth_first, b, depth_second, inliers, pose, displacement)
+    share = float(np.mean(first.depth[::4, ::4] > 0))
+    return RgbdPair(first.index, second.index, a, depth_first, b, depth_second, inliers, pose, displacement, share)
 
 
 def relative_pose(

@@ -209,7 +209,7 @@ def _frozen(streams: Streams) -> Finding | None:
         return None
     run, name = (streams.colour_run, "colour") if colour else (streams.depth_run, "depth")
     other = "depth" if colour else "colour"
-    text = f"one {name} image is repeated {run} times in a row while the {other} changes"
+    text = f"one {name} image is repeated in {run} or more successive frames while the {other} changes"
     return Finding(f"{name}-frozen", "fault", float(run), "frames", text, f"export the {name} images again")
 
 
@@ -260,7 +260,7 @@ def _asynchronous(streams: Streams) -> Finding | None:
     )
     mean = np.where(usable, np.nansum(rows, axis=0) / np.maximum(pairs, 1), -np.inf)
     column = int(np.argmax(mean))
-    delay = column - MOST_DELAY
+    delay = float(column - MOST_DELAY)
     if abs(delay) < LEAST_DELAY or peaks[column] < CLEAR_PEAK:
         return None
     near = slice(MOST_DELAY - 1, MOST_DELAY + 2)
@@ -270,9 +270,12 @@ def _asynchronous(streams: Streams) -> Finding | None:
     sure = float(better.mean() / max(better.std() / np.sqrt(len(better) / 5), 1e-9))
     if sure < 4 or mean[column] < 1.25 * max(mean[reference], 0) or peaks[column] < 1.1 * peaks[near].max():
         return None
+    around = mean[max(column - 1, 0) : column + 2]
+    if len(around) == 3 and np.isfinite(around).all():  # the vertex of the parabola through the peak
+        delay += float((around[0] - around[2]) / (2 * (around[0] - 2 * around[1] + around[2])))
     seconds = delay * streams.seconds_a_frame
     text = (
-        f"the depth images fit the colour images of {abs(delay)} frames {'before' if delay > 0 else 'after'} "
+        f"the depth images fit the colour images of {abs(delay):.1f} frames {'before' if delay > 0 else 'after'} "
         f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
     )
     cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt"

@@ -42,21 +42,23 @@ REST_PX = 2.0
 GOOD = 0.75
 """`Match.total` of a truth that tells the motion: healthy recordings have 0.78 to 0.98, other readings up to 0.5."""
 SURE = 0.86
-"""The same where few pairs are searched for a shift in time: one of 160 shifts fits by chance to 0.84."""
+"""The same for a shift in time of a recording that is shorter than the range of shifts searched, or has few pairs: one
+of 160 shifts fits by chance to 0.84."""
+MANY_PAIRS = 25
 UNLIKE = 0.6
 LEAST_TIME_S = 0.05
 UNRELATED = 0.48
 """The best agreement of a truth of another recording stays below; where moving things fill the view it is 0.55."""
 LEAST_UNLIKE = 12
 _STEP_S = 0.025
-_RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
+RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
 _CURES = {
     "inverted": ("truth-inverted", "the poses are world-to-camera", "invert them: p -> -R^T p, R -> R^T"),
-    "w first": ("truth-quaternion-order", "the quaternions are in the order qw qx qy qz", _RESAVE),
+    "w first": ("truth-quaternion-order", "the quaternions are in the order qw qx qy qz", RESAVE),
     "w first, inverted": (
         "truth-quaternion-order",
         "the quaternions are in the order qw qx qy qz, and the poses are world-to-camera",
-        _RESAVE,
+        RESAVE,
     ),
     "rotations inverted": (
         "truth-inverted",
@@ -146,7 +148,8 @@ def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[Rgbd
     if unshifted.total > stated.total - 0.02:
         stated = unshifted
     differs = best.reading != READINGS[0] or abs(best.shift_s) >= LEAST_TIME_S
-    needed = GOOD if len(pairs) >= 25 or abs(best.shift_s) < LEAST_TIME_S else SURE
+    long = len(pairs) >= MANY_PAIRS and float((motions.end - motions.start).sum()) >= 2 * LARGEST_SHIFT_S
+    needed = GOOD if long or abs(best.shift_s) < LEAST_TIME_S else SURE
     now, then = stated.clearest, best.clearest
     if differs and then >= needed and 1 - then < 0.65 * (1 - now) and now < then - 0.05:
         turned = None if best.reading == READINGS[0] else _turned(motions, readings[READINGS[0]], stated, best)
@@ -200,8 +203,12 @@ def _otherwise(
             f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
         )
         return [Finding("truth-other-sequence", "fault", closest, "", text, "take the truth of this recording")]
-    text = f"the truth explains {100 * stated.total:.0f} % of the motion between the frames, too little to compare more"
-    return [Finding("truth-unclear", "note", stated.total, "", text, "check a part with a clearer motion")]
+    text = (
+        f"the truth explains {100 * stated.total:.0f} % of the motion between the frames, too little to compare more: "
+        "it may belong to another recording"
+    )
+    cure = "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion"
+    return [Finding("truth-unclear", "note", stated.total, "", text, cure)]
 
 
 def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
@@ -218,16 +225,19 @@ def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) ->
 
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
     angle = float(np.degrees(np.linalg.norm(se3.log(_pose(X))[3:])))
-    rows = np.abs(X).argmax(axis=1)
-    names = ", ".join(
-        f"its {body} is the camera's {'-' if X[i, rows[i]] < 0 else ''}{'xyz'[rows[i]]}" for i, body in enumerate("xyz")
-    )
     text = (
-        f"the truth's axes are turned by {angle:.0f} degrees against the camera's ({names}, nearly): so they explain "
+        f"the truth's axes are turned by {angle:.0f} degrees against the camera's: so they explain "
         f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
     )
-    cure = "multiply each rotation of groundtruth.txt from the right by the rotation from the camera's axes to these"
-    return Finding("truth-axes", "fault", angle, "degrees", text, cure)
+    return Finding("truth-axes", "fault", angle, "degrees", text, _turn(X))
+
+
+def _turn(R_body_cam: Array) -> str:
+    """How to give a truth the camera's axes; a rotation within 20 degrees of swapped axes is written as such."""
+    swapped = np.round(R_body_cam)
+    near = not np.array_equal(swapped, np.eye(3)) and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
+    rows = [", ".join(f"{value:g}" for value in row) for row in (swapped if near else R_body_cam.round(3)) + 0.0]
+    return f"multiply each rotation of groundtruth.txt from the right by [{'; '.join(rows)}]"
 
 
 def _pose(rotation: Array) -> Array:
@@ -303,6 +313,8 @@ def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> lis
     )
     left = fit.cost / before.cost
     rules = _EXPLAINED if name != "lever" else _EXPLAINED_BY_LEVER
+    if name == "lever" and float(np.median([pair.depth_share for pair in pairs])) < _DEPTH_FOR_LEVER:
+        return []
     if size < _LIMITS[name] or not any(size >= sigmas * sigma and left <= share for sigmas, share in rules):
         return []
     errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
@@ -317,6 +329,8 @@ _EXPLAINED = ((5, 0.75), (8, 0.88))
 in healthy recordings, and no value above its limit is sure to 4."""
 _EXPLAINED_BY_LEVER = ((5, 0.62),)
 """People who walk past can feign one: 0.68 remained then."""
+_DEPTH_FOR_LEVER = 0.5
+"""Part of the image that has depth. With less, the corners may lie on moving people alone: 0.61 remained then."""
 
 
 def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -> Finding:
@@ -339,7 +353,8 @@ def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -
     if name == "turn":
         angle = float(np.degrees(fit.size("turn")))
         text = f"the truth's axes are turned by {angle:.1f} degrees against the camera's: {errors}"
-        return Finding("truth-axes", "fault", angle, "degrees", text, "give the truth the camera's axes")
+        turn = se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
+        return Finding("truth-axes", "fault", angle, "degrees", text, _turn(turn))
     lever = fit.value["lever"]
     where = ", ".join(f"{value:+.3f}" for value in lever)
     text = f"the camera is {fit.size('lever'):.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}"

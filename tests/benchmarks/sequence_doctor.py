@@ -1,10 +1,11 @@
 """What `sequences doctor` finds: faults put into healthy recordings, healthy recordings, and its time.
 
     python tests/benchmarks/sequence_doctor.py faults FOLDER_OR_ID... [--only NAME]
-    python tests/benchmarks/sequence_doctor.py healthy FOLDER_OR_ID... [--cut 60]
+    python tests/benchmarks/sequence_doctor.py healthy FOLDER_OR_ID... [--cut 60] [--first-scene 93] [--frames 100]
 
 Every fault is put into a copy of the recording in TUM layout; a row says which finding was expected and which came.
-`healthy` without names runs every rendered family, 75 frames of a scene each.
+`healthy` without names runs every rendered family, a scene each. The thresholds were chosen on the scenes of
+`--first-scene 0`; those of any other first scene are new to them.
 """
 
 from __future__ import annotations
@@ -214,7 +215,7 @@ FAULTS |= {
     "colour black": ("colour-blank", lambda copy: copy.images("rgb", np.zeros_like)),
     "depth empty": ("depth-empty", lambda copy: copy.images("depth", np.zeros_like)),
     "no truth": ("no-truth", lambda copy: (copy.folder / "groundtruth.txt").unlink()),
-    "no depth": ("unreadable", lambda copy: copy.drop("depth")),
+    "no depth": ("no-depth", lambda copy: copy.drop("depth")),
     "one frame": ("too-short", lambda copy: (copy.write("rgb", copy.rows["rgb"][:1]),
                                              copy.write("depth", copy.rows["depth"][:1]))),
     "a third cut off": ("unreadable", lambda copy: [path.write_bytes(path.read_bytes()[:500])
@@ -283,7 +284,7 @@ def run_faults(names: list[str], data_root: str | None, only: str, most: int) ->
 def run_healthy(names: list[str], data_root: str | None, cut: int) -> None:
     """A row for each healthy recording, or part of one."""
     alarms = parts = 0
-    for name in names or [f"{family}@{7 * i % 200}?frames=75" for i, family in enumerate(SYNTHETIC_IDS)]:
+    for name in names:
         sequence = open_sequence(name, data_root=data_root)
         step = cut or len(sequence)
         for start in range(0, max(1, len(sequence) - step // 2), step):
@@ -307,9 +308,14 @@ if __name__ == "__main__":
     parser.add_argument("--data-root")
     parser.add_argument("--only", default="")
     parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--first-scene", type=int, default=0)
     parser.add_argument("--cut", type=int, default=0)
     given = parser.parse_args()
     if given.what == "faults":
         run_faults(given.names, given.data_root, given.only, given.frames)
     else:
-        run_healthy(given.names, given.data_root, given.cut)
+        rendered = [
+            f"{family}?scene={(7 * number + given.first_scene) % 200}&frames={given.frames}"
+            for number, family in enumerate(SYNTHETIC_IDS)
+        ]
+        run_healthy(given.names or rendered, given.data_root, given.cut)

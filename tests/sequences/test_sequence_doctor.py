@@ -1,5 +1,7 @@
 """`sequences doctor`: faults put into a recording are named, a sound one has none, nothing makes it raise."""
 
+import re
+import shutil
 from functools import cache
 
 import cv2
@@ -11,7 +13,8 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.doctor import diagnose, examine, stretches
+from dynslam_bench.sequences.doctor import Diagnosis, diagnose, examine, stretches
+from dynslam_bench.sequences.finding import Finding
 from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.truth_checks import truth_findings
 from dynslam_bench.sequences.truth_motion import READINGS, read_as
@@ -257,6 +260,29 @@ def test_damaged_folders_never_raise(tmp_path):
     assert [f.id for f in diagnose(folder).findings] == ["depth-format"]
     (folder / "groundtruth.txt").write_text("1 2 3\n")
     assert [f.id for f in diagnose(folder).findings] == ["unreadable"]
+
+
+def test_the_verdict_says_whether_the_truth_was_compared():
+    note = Finding("truth-unclear", "note", 0.2, "", "unclear", "look")
+    fault = Finding("truth-scale", "fault", 1000.0, "", "millimetres", "divide")
+    verdicts = [Diagnosis("x", 40, findings).verdict for findings in ((), (note,), (fault, note))]
+    assert verdicts[0] == "no fault found" and verdicts[2] == "1 fault"
+    assert "could not be compared" in verdicts[1]
+
+
+def test_the_cure_of_turned_axes_is_their_inverse(diagnosed):
+    (finding,) = diagnosed("truth-axes").findings
+    rows = re.search(r"\[(.*)\]", finding.cure).group(1).split(";")
+    cure = np.array([[float(value) for value in row.split(",")] for row in rows])
+    np.testing.assert_allclose(BODY[:3, :3] @ cure, np.eye(3), atol=0.02)
+
+
+def test_a_folder_without_depth_is_named(tmp_path):
+    folder, _, _ = make_folder(tmp_path / "one")
+    (folder / "depth.txt").unlink(missing_ok=True)
+    shutil.rmtree(folder / "depth")
+    (finding,) = diagnose(folder).findings
+    assert (finding.id, finding.severity) == ("no-depth", "fault")
 
 
 def test_stretches_cover_a_short_recording_and_sample_a_long_one():
