@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core import moved
+from dynslam_bench.core import moved
 
 __version__: str
 
@@ -24,7 +24,7 @@ moved.install()
 def __getattr__(name: str) -> str:
     """``__version__``, looked up when somebody asks for it: that takes longer than all else here."""
     if name == "__version__":
-        from .core.version import version
+        from dynslam_bench.core.version import version
 
         return version()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

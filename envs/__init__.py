@@ -7,19 +7,19 @@ worker processes write ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequ
 from __future__ import annotations
 
 from dynslam_bench.contracts.checks import TrackerContractError
-
-from .control import ActionMap
-from .degrade_frames import Degradation, DegradeFrames
-from .device import resolve_device
-from .drop_frames import DropFrames
-from .observation import STATS_LAYOUT
-from .record_timings import RecordTimings
-from .record_trajectory import RecordTrajectory
-from .registration import GENERIC_ID, env_id, register_envs
-from .reward import REWARDS
-from .sequence_sampler import SequenceSampler
-from .slam_env import SlamEnv
-from .small_images import SmallImages
+from dynslam_bench.envs.arguments import resolve_device
+from dynslam_bench.envs.registration import GENERIC_ID, env_id, register_envs
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.spaces import REWARDS, STATS_LAYOUT, ActionMap
+from dynslam_bench.envs.wrappers import (
+    Degradation,
+    DegradeFrames,
+    DropFrames,
+    RecordTimings,
+    RecordTrajectory,
+    SequenceSampler,
+    SmallImages,
+)
 
 __all__ = [
     "GENERIC_ID",

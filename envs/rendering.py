@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.envs.episode import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.geometry import se3
-
-from .episode import Episode
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -1,8 +1,9 @@
-"""The Gymnasium environment: one sequence is one episode, one step runs a whole tracker on one frame."""
+"""Copies of an environment in mid-episode."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -18,8 +19,29 @@ from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
-from dynslam_bench.core.settings import Settings, apply_overrides
-from dynslam_bench.core.steering import Steerable
+from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
+from dynslam_bench.envs.arguments import (
+    RENDER_MODES,
+    Frames,
+    check_arguments,
+    check_frames,
+    check_same_size,
+    open_frames,
+    preprocessing_of,
+    resolve_device,
+)
+from dynslam_bench.envs.episode import Episode, FrameOutcome, FrameTransform, episode_metrics, frame_info, track_one
+from dynslam_bench.envs.spaces import (
+    ActionMap,
+    ObservationContext,
+    ObservationKind,
+    RewardKind,
+    reward_named,
+    rgbd_observation,
+    rgbd_space,
+    stats_observation,
+    stats_space,
+)
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
@@ -27,24 +49,35 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.availability import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
-from .arguments import RENDER_MODES, check_arguments
-from .control import ActionMap
-from .copying import deep_copy
-from .device import resolve_device
-from .episode import Episode, FrameOutcome
-from .info import frame_info
-from .metrics import episode_metrics
-from .observation import (
-    ObservationContext,
-    ObservationKind,
-    rgbd_observation,
-    rgbd_space,
-    stats_observation,
-    stats_space,
-)
-from .one_frame import FrameTransform, track_one
-from .reward import RewardKind, reward_named
-from .source import Frames, check_frames, check_same_size, open_frames, preprocessing_of
+_SHARED = ("sequence", "_source", "tracker_spec", "protocol", "settings")
+"""What nobody writes to."""
+
+
+def deep_copy(env: SlamEnv, memo: dict[int, Any]) -> SlamEnv:
+    """The environment at the same frame of its episode, with a tracker of its own: both go on alike, apart.
+
+    What nobody writes to is shared: the sequence, the specs and the settings.
+
+    Raises:
+        TrackerError: The tracker cannot be copied, as a program of its own cannot.
+    """
+    parts = vars(env)
+    for name in _SHARED:
+        memo[id(parts[name])] = parts[name]
+    copied = memo[id(env)] = object.__new__(type(env))
+    try:
+        tracker = deepcopy(parts["_tracker"], memo)
+    except Exception as error:
+        raise TrackerError(
+            f"tracker '{env.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
+            "make a second environment, or give the tracker a __deepcopy__",
+        ) from error
+    rest = {name: value for name, value in parts.items() if name not in ("_tracker", "_canvas")}
+    vars(copied).update(deepcopy(rest, memo), _tracker=tracker, _canvas=None)
+    return copied
+
+
+# The Gymnasium environment: one sequence is one episode, one step runs a whole tracker on one frame.
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -55,7 +88,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     **Action.** ``Discrete(1)`` without `control` (pure evaluation); otherwise ``Box(-1, 1, (k,))`` over the named
     online settings (see `ActionMap`), in force from the frame of the step on; an episode begins with `settings`.
-    The tracker then needs the method of `core.steering.Steerable`, ``configure(settings)``: it takes the complete
+    The tracker then needs the method of `core.steering.Reconfigurable`, ``configure(settings)``: it takes the complete
     settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
 
     **Observation.** ``stats``: float32 ``[24]`` (see `observation.STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
@@ -308,7 +341,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if not self.episode.outcomes:
             raise DynslamError("render() was called before reset()")
         if self._canvas is None:
-            from .rendering import Canvas
+            from dynslam_bench.envs.rendering import Canvas
 
             self._canvas = Canvas(self.sequence, self.tracker_spec.label)
         image: NDArray[np.uint8] = self._canvas.draw(self.frame, self.result, self.episode)
@@ -379,7 +412,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             with tracker_code():
                 self._tracker = build_tracker(self.tracker_spec, self.settings, context)
             self._tracker_key = key
-            if self._actions.parameters and not isinstance(self._tracker, Steerable):
+            if self._actions.parameters and not isinstance(self._tracker, Reconfigurable):
                 raise TrackerError(
                     f"tracker '{self.tracker_spec.id}' cannot be steered in mid-episode",
                     "it has no configure(settings) method: leave control empty",

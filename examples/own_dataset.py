@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from dynslam_bench.contracts import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.runs import RunSpec, RunStore, run_many, score
 
 FPS, FX, DEPTH_M, STEP_PX = 30.0, 300.0, 2.0, 3

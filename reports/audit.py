@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
-from dynslam_bench.evaluation.never_move import never_move
-from dynslam_bench.evaluation.pairs import select_pairs
+from dynslam_bench.evaluation.ape import static_camera
 from dynslam_bench.evaluation.protocol import RPESpec
+from dynslam_bench.evaluation.rpe import select_pairs
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .model.published import Claimed, claimed, published
-from .tables.table import Column, Table, TableCell, to_markdown
+from dynslam_bench.reports.model.published import Claimed, claimed, published
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, to_markdown
 
 OURS = "EMFOA-OFT-SLAM"
 _HALF_DIGIT = 0.5
@@ -274,7 +273,7 @@ def _stored_never_move() -> dict[tuple[str, str], float]:
 def _computed_never_move(ground_truth: Mapping[str, Trajectory]) -> dict[tuple[str, str], float]:
     found: dict[tuple[str, str], float] = {}
     for sequence, truth in ground_truth.items():
-        found[sequence, "ape_rmse"] = never_move(truth)["constant_rmse_m"]
+        found[sequence, "ape_rmse"] = static_camera(truth)["constant_rmse_m"]
         pairs = select_pairs(truth.timestamps, truth.T_world_cam, RPESpec(delta=1, unit="s", max_pairs=0))
         if len(pairs):
             moved = truth.positions[pairs[:, 1]] - truth.positions[pairs[:, 0]]

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import dynslam_bench
-from dynslam_bench.core.records import write_atomic
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.runs.storage.store import RunStore
+from jinja2 import Environment
 
-from .html import sections
-from .html.draft import Draft
-from .html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
-from .html.page import render
-from .html.paper_section import add_paper
-from .html.run_data import MOST_FRAMES
-from .model.board import Board, On, make_board
-from .model.crew import Crew, helpers_for
-from .model.report_data import REPORT_FILE, ReportData
-from .model.rows import Loaded, OnProgress, load_runs, open_stores, unheard
-from .tables.latex import to_latex
-from .tables.table import Table, csv_text, prose, to_csv, to_markdown
+import dynslam_bench
+from dynslam_bench.core.errors import ReportError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.reports.html import sections
+from dynslam_bench.reports.html.explore import PICTURE_SECONDS, RUN_PAGE, Explored, write_explore
+from dynslam_bench.reports.html.page import Draft, render
+from dynslam_bench.reports.html.run_page import MOST_FRAMES
+from dynslam_bench.reports.html.sections import add_paper
+from dynslam_bench.reports.model.board import Board, On, make_board
+from dynslam_bench.reports.model.load import Crew, Loaded, OnProgress, helpers_for, load_runs, no_progress, open_stores
+from dynslam_bench.reports.model.row import REPORT_FILE, ReportData
+from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_csv, to_latex, to_markdown
+from dynslam_bench.runs.store import RunStore
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def build_report(
     most_pages: int | None = None,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
-    on_progress: OnProgress = unheard,
+    on_progress: OnProgress = no_progress,
 ) -> ReportPaths:
     """Make one offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it.
 
@@ -207,3 +208,99 @@ def _markdown(draft: Draft, data: ReportData, facts: Sequence[tuple[str, str]]) 
     notes = "".join(f"> {prose(note)}\n\n" for section in draft.sections for note in section.notes)
     tables = "\n".join(to_markdown(table) for table in draft.tables)
     return f"# {prose(data.title)}\n\n{data.protocol}\n\n{counted}\n\n{notes}{tables}"
+
+
+# A report and a study as a static site: one folder that can be put on any web server, or into a repository.
+
+STUDY_PAGE = "index.html"
+FRAMES = 100
+"""Frames of a run that its published page shows: a site of hundreds of runs has to fit into a repository."""
+_KEPT = ("*.html", "*.csv", "*.toml", "csv/*.csv", "data/*")
+"""What of a study's folder is published; its runs and its journal are not."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """A published site.
+
+    Attributes:
+        index: Its first page.
+        files: How many files it has.
+        size_mb: Their size in MB.
+    """
+
+    index: Path
+    files: int
+    size_mb: float
+
+
+def publish(
+    runs: Sequence[Path],
+    output: Path,
+    *,
+    study: Path | None = None,
+    title: str = "Visual SLAM in dynamic scenes",
+    note: str = "",
+    picture_seconds: float = PICTURE_SECONDS,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    on_progress: OnProgress = no_progress,
+) -> Site:
+    """Make the report of some results folders, take a study's page beside it, and write a first page for both.
+
+    The site needs nothing outside of its folder, and the command that it shows for itself names no path of this
+    machine.
+
+    Args:
+        runs: Results folders.
+        output: The site's folder; what it holds of an earlier site is replaced, other files are left alone.
+        study: Folder of a study with its page; None for none.
+        title: Heading.
+        note: What a reader should know, shown on the first page.
+        picture_seconds: Time that drawing pictures of frames may take; the frames of an earlier site stay.
+        protocol: How to evaluate.
+        on_progress: As in `build_report`.
+
+    Raises:
+        ReportError: There are no runs, or the study's folder holds no page.
+        DynslamError: The folder cannot be written.
+    """
+    output = output.expanduser().absolute()
+    if study is not None and not (study / STUDY_PAGE).is_file():
+        raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
+    for part in ("leaderboard/data", "leaderboard/csv", "study"):
+        shutil.rmtree(output / part, ignore_errors=True)
+    report = build_report(
+        list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
+        picture_seconds=picture_seconds, most_frames=FRAMES, on_progress=on_progress,
+    )  # fmt: skip
+    for path in (report.data, report.markdown, report.latex):  # for work with the results, not for looking at them
+        path.unlink()
+    pages = [("leaderboard/index.html", "Leaderboard", "Trackers, sequences, errors, speed and failures.")]
+    if study is not None:
+        inside = study.resolve()
+        found = {path for pattern in _KEPT for path in study.glob(pattern) if path.is_file()}
+        for source in sorted(path for path in found if path.resolve().is_relative_to(inside)):  # no link to elsewhere
+            target = output / "study" / source.relative_to(study)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+        pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
+    write_atomic(output / "index.html", render_site(title, pages, note))
+    write_atomic(output / ".nojekyll", "")
+    sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
+    return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)
+
+
+# The first page of a published site.
+
+
+def render_site(title: str, pages: Sequence[tuple[str, str, str]], note: str = "") -> str:
+    """A page that leads to others.
+
+    Args:
+        title: Heading.
+        pages: Relative address, name and what it shows, of each.
+        note: What a reader should know; empty for nothing.
+    """
+    source = files("dynslam_bench.reports.html") / "templates" / "site.html.j2"
+    template = Environment(autoescape=True, trim_blocks=True).from_string(source.read_text(encoding="utf-8"))
+    return template.render(title=title, pages=pages, note=note, version=dynslam_bench.__version__)

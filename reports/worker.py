@@ -14,14 +14,12 @@ from typing import Any, TextIO
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.runs.storage.store import RunStore
-
-from .html.explore import write_pages
-from .html.pictures import PictureBook
-from .model.common import Tracked, common_of
-from .model.known_rows import KnownRows
-from .model.row import RunRow
-from .model.rows import LoadedRun
+from dynslam_bench.reports.html.explore import write_pages
+from dynslam_bench.reports.html.pictures import PictureBook
+from dynslam_bench.reports.model.common_frames import Tracked, common_of
+from dynslam_bench.reports.model.load import LoadedRun, RowCache
+from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.runs.store import RunStore
 
 Job = Mapping[str, Any]
 Told = Callable[[str], None]
@@ -49,7 +47,7 @@ class Worker:
 
     def rows(self, job: Job) -> list[Any]:
         """The rows of some runs: ``store`` is the folder of their store, ``runs`` holds their ids."""
-        rows = KnownRows(RunStore(job["store"]), self._protocol)
+        rows = RowCache(RunStore(job["store"]), self._protocol)
         taken, unreadable = rows.take_all(job["runs"], self._told)
         return [[each.answer() for each in taken], unreadable]
 

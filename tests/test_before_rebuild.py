@@ -15,7 +15,7 @@ import pytest
 from dynslam_bench.core.moved import MOVED
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs import RunStore, load_frames, score
-from dynslam_bench.runs.frame_row import read_csv, write_csv
+from dynslam_bench.runs.frames import read_csv, write_csv
 from dynslam_bench.testing import CornerSequence
 from dynslam_bench.tuning import StudySummary, Tuner, read_study, write_page
 

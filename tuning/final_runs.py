@@ -1,4 +1,4 @@
-"""After the trials: the best judged again on blocks that none has seen, the choice, the held-out check, the preset."""
+"""After the trials: the best judged again on instances that none has seen, the choice, the held-out check, the preset."""
 
 from __future__ import annotations
 
@@ -10,23 +10,18 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.records import write_atomic
-
-from .constraints import violations
-from .evaluate import BlockFailedError, held_protocol
-from .front import PICKS, pick
-from .importance import importances, inert_parameters
-from .objectives import ACCURACY, SPEED, Objective, Outcomes, together
-from .presets import write_presets
-from .ratio import Ratio, compared
-from .seen import splits_seen
-from .study import Tuner
-from .study_file import StudySpec
-from .summary import Candidate, StudySummary, choose, conclude
-from .trials import best_trials, count_states
+from dynslam_bench.tuning.evaluate import InstanceFailedError, held_protocol
+from dynslam_bench.tuning.objectives import ACCURACY, SPEED, Objective, Outcomes, together, violations
+from dynslam_bench.tuning.presets import write_presets
+from dynslam_bench.tuning.splits import splits_seen
+from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.summary import PICKS, Candidate, Ratio, StudySummary, choose, compared, conclude, pick
+from dynslam_bench.tuning.trials import best_trials, count_states, importances, inert_parameters
+from dynslam_bench.tuning.tuner import Tuner
 
 
 def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: int = 1) -> StudySummary:
-    """Judge the best trials on the `confirm` blocks, choose one or the default, check it, write preset and summary.
+    """Judge the best trials on the `confirm` instances, choose one or the default, check it, write preset and summary.
 
     The choice has the smallest upper confidence bound of its ratio to the default on `confirm`, allowing for the number
     of candidates; where no bound lies below 1, it is the default. The held-out split and the recordings only judge.
@@ -49,11 +44,11 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
     candidates = []
     if best:
-        note(f"the default and {_named(best)} on {len(design.confirm)} blocks that no trial has seen")
+        note(f"the default and {_named(best)} on {len(design.confirm)} instances that no trial has seen")
         default, *again = tuner.evaluate_beside(
             [spec.space.fixed, *map(tuner.settings_of, best)], design.confirm, jobs=jobs
         )
-        if isinstance(default, BlockFailedError):
+        if isinstance(default, InstanceFailedError):
             raise default
         candidates = [
             _confirmed(tuner, trial, found, default, len(best)) for trial, found in zip(best, again, strict=True)
@@ -61,7 +56,7 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
     chosen = choose(candidates)
     picks = _picks(spec, candidates, chosen)
     for trial_number in dict.fromkeys(number for number in picks.values() if number is not None):
-        note(f"trial {trial_number} on the held-out blocks")
+        note(f"trial {trial_number} on the held-out instances")
         place = next(index for index, each in enumerate(candidates) if each.trial == trial_number)
         candidates[place] = _judged(tuner, candidates[place], jobs)
     if chosen is not None:
@@ -87,15 +82,15 @@ def _summary(
         trials=count_states(tuner.study),
         candidates=candidates,
         chosen=None if chosen is None else chosen.trial,
-        improves=chosen is not None and chosen.holds_up and not notes,
+        improves=chosen is not None and chosen.is_confirmed and not notes,
         conclusion=conclude(candidates, None if chosen is None else chosen.trial, notes),
         split_notes=notes,
         importances=importances(tuner.study, names),
         inert=inert_parameters(finished, names),
-        confirm=[str(block) for block in design.confirm],
-        held_out=[str(block) for block in design.held_out],
-        recorded=[str(block) for block in design.recorded],
-        tune=[str(block) for block in design.race],
+        confirm=[str(instance) for instance in design.confirm],
+        held_out=[str(instance) for instance in design.held_out],
+        recorded=[str(instance) for instance in design.recorded],
+        tune=[str(instance) for instance in design.race],
         picks=picks,
         seen=splits_seen(tuner.defaults, design),
     )
@@ -106,11 +101,11 @@ def _named(trials: Sequence[FrozenTrial]) -> str:
 
 
 def _confirmed(
-    tuner: Tuner, trial: FrozenTrial, again: Outcomes | BlockFailedError, default: Outcomes, candidates: int
+    tuner: Tuner, trial: FrozenTrial, again: Outcomes | InstanceFailedError, default: Outcomes, candidates: int
 ) -> Candidate:
-    """A trial's settings on the blocks for the choice, of several candidates."""
+    """A trial's settings on the instances for the choice, of several candidates."""
     candidate = Candidate(trial=trial.number, params=trial.params, values=list(trial.values))
-    if isinstance(again, BlockFailedError):
+    if isinstance(again, InstanceFailedError):
         return candidate.model_copy(update={"failed": str(again), "feasible": False})
     found = {
         "confirm": compared(again, default, objective=together(tuner.objectives), candidates=candidates),
@@ -124,16 +119,16 @@ def _confirmed(
 
 
 def _judged(tuner: Tuner, chosen: Candidate, jobs: int) -> Candidate:
-    """The choice on the held-out blocks and on recordings."""
+    """The choice on the held-out instances and on recordings."""
     fixed, found = tuner.spec.space.fixed, dict[str, Any]()
-    for split, blocks in (("held_out", tuner.design.held_out), ("recorded", tuner.design.recorded)):
-        if not blocks:
+    for split, instances in (("held_out", tuner.design.held_out), ("recorded", tuner.design.recorded)):
+        if not instances:
             continue
-        default, tuned = tuner.evaluate_beside([fixed, {**fixed, **chosen.params}], blocks, jobs=jobs)
+        default, tuned = tuner.evaluate_beside([fixed, {**fixed, **chosen.params}], instances, jobs=jobs)
         for each in (default, tuned):
-            if isinstance(each, BlockFailedError):
+            if isinstance(each, InstanceFailedError):
                 return chosen.model_copy(update={"failed": str(each), "feasible": False})
-        assert not isinstance(default, BlockFailedError) and not isinstance(tuned, BlockFailedError)
+        assert not isinstance(default, InstanceFailedError) and not isinstance(tuned, InstanceFailedError)
         after: Objective = ACCURACY if split == "recorded" else together(tuner.objectives)
         found[split] = compared(tuned, default, objective=after)
         found |= {"on_held_out": _beside(tuned, default)} if split == "held_out" else {}

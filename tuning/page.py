@@ -13,24 +13,19 @@ from optuna.trial import TrialState
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.core.toml import setting_text
-from dynslam_bench.reports.figures.style import GRID, axis, guide, layout_of
+from dynslam_bench.reports.figures import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block as Piece
 from dynslam_bench.reports.html.page import Section, render
-from dynslam_bench.reports.model.row import SEEN
-from dynslam_bench.reports.model.row_values import command_line
+from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
-
-from .blocks import Block, scenes
-from .design import FEWEST_STARTS, Design
-from .importance import FEWEST_TRIALS, importances, inert_parameters
-from .page_figures import MOST_SLICES, Star, front, history, settings_table, slices
-from .preset import preset_text
-from .ratio import Ratio
-from .samplers import is_feasible
-from .seen import seen_note, splits_seen
-from .study import Tuner
-from .summary import Candidate, StudySummary, worth
-from .trials import best_trials, errors_of
+from dynslam_bench.tuning.figures import MOST_SLICES, Star, front, history, settings_table, slices
+from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.presets import preset_text
+from dynslam_bench.tuning.samplers import is_feasible
+from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note, splits_seen
+from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, worth
+from dynslam_bench.tuning.trials import FEWEST_TRIALS, best_trials, errors_of, importances, inert_parameters
+from dynslam_bench.tuning.tuner import Tuner
 
 
 def write_page(tuner: Tuner, summary: StudySummary) -> Path:
@@ -94,8 +89,8 @@ def _found(summary: StudySummary) -> list[str]:
     return [summary.verdict, *filter(None, [seen_note(summary.seen)])]
 
 
-def _size(blocks: Sequence[Block]) -> str:
-    return f"{len(blocks)} runs, {len(scenes(blocks))} scenes" if blocks else "none"
+def _size(instances: Sequence[ProblemInstance]) -> str:
+    return f"{len(instances)} runs, {len(scenes(instances))} scenes" if instances else "none"
 
 
 def _names(tuner: Tuner) -> list[str]:
@@ -233,9 +228,9 @@ def _ratio_trace(name: str, points: list[tuple[str, Ratio]], colour: str, symbol
 
 def _shown(tuner: Tuner, figures: dict[str, dict[str, Any]], *names: str) -> list[Piece]:
     captions = {
-        "ratios": "Ratio to the default settings and its 95 % interval: on the blocks of the choice (confirm), which "
-        "no trial had seen, and, for the choice alone, on the held-out blocks and on recordings.",
-        "history": "Every trial that came to the end of the race, on its own blocks; trial 0 is the default."
+        "ratios": "Ratio to the default settings and its 95 % interval: on the instances of the choice (confirm), which "
+        "no trial had seen, and, for the choice alone, on the held-out instances and on recordings.",
+        "history": "Every trial that came to the end of the race, on its own instances; trial 0 is the default."
         + fewer_starts(tuner.design),
         "front": "One objective against the other, with those that no other trial beats in both.",
         "importances": "",
@@ -267,25 +262,25 @@ def warnings_of(tuner: Tuner) -> list[str]:
     broken = [trial for trial in finished if not is_feasible(trial)]
     if broken and len(broken) == len(finished):
         notes.append(
-            f"None of the {len(finished)} trials fulfils the constraints on its own blocks, which may be too few to "
-            "show it: the least bad were judged on blocks that no trial had seen, and have to fulfil them there."
+            f"None of the {len(finished)} trials fulfils the constraints on its own instances, which may be too few to "
+            "show it: the least bad were judged on instances that no trial had seen, and have to fulfil them there."
         )
     elif broken:
         notes.append(f"{len(broken)} trials violate a constraint and are not candidates.")
     if "speed" in tuner.spec.objectives:
         notes.append(
             "Trials ran at different times: what else the machine did then is in their ratios of processor time. On "
-            "the blocks of the choice and on held-out ones the default and the candidates ran in turn: those count."
+            "the instances of the choice and on held-out ones the default and the candidates ran in turn: those count."
         )
     return notes
 
 
 def _copies(tuner: Tuner) -> list[str]:
     """What seeds changed: runs of the same trial that differ in the seed only and are equal to the last bit."""
-    errors: dict[tuple[int, Block], list[float]] = {}
+    errors: dict[tuple[int, ProblemInstance], list[float]] = {}
     for trial in tuner.study.get_trials(deepcopy=False):
-        for block, ate in errors_of(trial).items():
-            errors.setdefault((trial.number, replace(block, seed=0)), []).append(ate)
+        for instance, ate in errors_of(trial).items():
+            errors.setdefault((trial.number, replace(instance, seed=0)), []).append(ate)
     several = [each for each in errors.values() if len(each) > 1]
     if not several or any(len(set(each)) > 1 for each in several):
         return []
@@ -322,15 +317,15 @@ def _candidates(summary: StudySummary) -> Table:
         for each in summary.candidates
     ]
     caption = (
-        "Ratios to the default settings on the same blocks: the median of a scene's starts, the mean over scenes "
-        "(trimmed from ten on), and the 95 % interval over scenes. On blocks that no trial had seen the one with the "
-        "smallest upper bound is chosen, where that lies below 1, and else the default; held-out blocks and recordings "
+        "Ratios to the default settings on the same instances: the median of a scene's starts, the mean over scenes "
+        "(trimmed from ten on), and the 95 % interval over scenes. On instances that no trial had seen the one with the "
+        "smallest upper bound is chosen, where that lies below 1, and else the default; held-out instances and recordings "
         f"only judge the choice. Frame times without the stage cache.{_cautions(summary)}"
     )
     optimistic = "the trial's own value, optimistic: it was selected for it"
     one_sided = "one-sided upper bound for the choice; allows for the number of candidates"
     race, confirm, held_out = _marked(
-        summary, ("in the race", "tune"), ("unseen blocks", "confirm"), ("held-out", "held_out")
+        summary, ("in the race", "tune"), ("unseen instances", "confirm"), ("held-out", "held_out")
     )
     columns = [Column("trial"), Column(race, meaning=optimistic), *numbers(confirm)]
     columns += [Column("upper bound", meaning=one_sided), *numbers(held_out, "recorded", "frame ms")]

@@ -17,11 +17,10 @@ from dynslam_bench.core.settings import (
     field_names,
     parameters,
     value_of,
+    why_unused,
 )
-from dynslam_bench.core.steering import why_unused
-
-from .seen import source_of_masks
-from .study_file import SpaceSpec
+from dynslam_bench.tuning.splits import source_of_masks
+from dynslam_bench.tuning.study_file import SpaceSpec
 
 
 def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
@@ -126,3 +125,45 @@ def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
     if hasattr(settings, "segmentation"):
         return apply_overrides(settings, {"segmentation.source": source_of_masks(settings, sequences)})
     return settings
+
+
+# Beginning a study from settings that are known to be good.
+
+
+def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
+    """A preset as a configuration of a study; what it does not say is as the default has it.
+
+    Args:
+        preset: Settings by dotted name.
+        space: The study's, from `search_space`.
+        base: Values of all settings that are not tuned.
+
+    Raises:
+        StudyError: The preset sets what the study does not tune to something else, or to a value out of its range.
+    """
+    tuned = {parameter.name: parameter for parameter in space}
+    for name, value in preset.items():
+        if name not in base:
+            raise StudyError(
+                f"the preset to start from sets '{name}', which there is not", did_you_mean(name, list(base))
+            )
+        if name not in tuned and base[name] != value:
+            raise StudyError(
+                f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
+                f'tune it, or say "{name}" = ... under [space.fixed]',
+            )
+        if name in tuned and not _fits(tuned[name], value):
+            raise StudyError(
+                f"the preset to start from sets {name} = {value!r}, outside the range that the study tunes"
+            )
+    given = {**base, **preset}
+    live = default_configuration(list(space), given)
+    return {name: given[name] for name in live}
+
+
+def _fits(parameter: Parameter, value: Any) -> bool:
+    span = distribution(parameter)
+    try:
+        return bool(span._contains(span.to_internal_repr(value)))
+    except ValueError:
+        return False

@@ -1,18 +1,141 @@
-"""Whether a study's blocks are what they say: apart by content, by the catalogue, by the scenes."""
+"""Which instances of a study are for what: to race on, to choose on, to be judged on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations, islice, product
 from typing import Any, Literal, cast
 
-from dynslam_bench.core.errors import StudyError
-from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.part import Part, part_of
-from dynslam_bench.sequences.synthetic import HELD_OUT_INSTANCES, TUNE_INSTANCES
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from .blocks import Block
-from .same_recording import is_rendered, same_recording
+from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.reports.model.row import SEEN
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
+from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
+from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
+from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.objectives import place_of
+from dynslam_bench.tuning.pruning import running_order
+from dynslam_bench.tuning.study_file import StudySpec
+
+FEWEST_STARTS = 3
+"""The default settings run from so many starts at every place: the luck of one would be shared by all trials."""
+ENOUGH_SCENES = 12
+"""With so many tune scenes a third of them is kept for the choice; else other starts in all of them are."""
+FRESH_SEED = 1000
+"""Seeds of fresh starts: none that a trial has used."""
+RECORDED_FRAMES, RECORDED_STARTS = 120, 4
+
+
+@dataclass(frozen=True)
+class Design:
+    """The instances of a study.
+
+    Attributes:
+        race: What trials run on, in the order in which all meet them.
+        reference: What the default settings run on beforehand: `race`, and more starts where those are few.
+        confirm: What the best trials and the default run on for the choice; no trial has seen them.
+        held_out: What judges the choice.
+        recorded: Recordings on which the choice must not be worse.
+        notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
+    """
+
+    race: tuple[ProblemInstance, ...]
+    reference: tuple[ProblemInstance, ...]
+    confirm: tuple[ProblemInstance, ...]
+    held_out: tuple[ProblemInstance, ...]
+    recorded: tuple[ProblemInstance, ...]
+    notes: tuple[str, ...] = ()
+
+
+def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
+    """Lay out the instances of a study and check them.
+
+    Args:
+        spec: The study.
+        accept: Whether splits that are not apart are only noted, as for a study that is only looked at.
+
+    Raises:
+        DynslamError: See `splits.check_splits`.
+    """
+    race, confirm = _race_and_confirm(spec.instances(*spec.tune), spec.instances(*spec.confirm))
+    held_out = spec.instances(*spec.held_out)
+    notes = check_splits(
+        spec.name,
+        {"tune": race, "confirm": confirm, "held_out": held_out},
+        data_root=spec.data_root,
+        accept=accept or spec.allow_overlap,
+    )
+    taken = {instance.scene for instance in (*race, *confirm, *held_out)}
+    recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
+    if spec.recorded:
+        apart: dict[Split, list[ProblemInstance]] = {"tune": [*race, *confirm], "held_out": recorded}
+        notes += check_splits(spec.name, apart, data_root=spec.data_root, accept=accept or spec.allow_overlap)
+    race = running_order(race, spec.sampler_seed)
+    return Design(
+        tuple(race), tuple(with_more_starts(race)), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes)
+    )
+
+
+def with_more_starts(instances: Collection[ProblemInstance]) -> list[ProblemInstance]:
+    """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
+    found = list(instances)
+    for place in dict.fromkeys(place_of(instance) for instance in instances):
+        own = [instance for instance in instances if place_of(instance) == place]
+        missing = FEWEST_STARTS - len({instance.offset for instance in own})
+        found += [replace(own[0], offset=offset) for offset in _unused(own, missing)]
+    return found
+
+
+def fresh_starts(instances: Collection[ProblemInstance]) -> list[ProblemInstance]:
+    """As many instances at each place from starts, and with seeds, that none of the instances has."""
+    found = []
+    for place in dict.fromkeys(place_of(instance) for instance in instances):
+        own = [instance for instance in instances if place_of(instance) == place]
+        offsets = _unused(own, len(own))
+        found += [replace(place, offset=offset, seed=FRESH_SEED + index) for index, offset in enumerate(offsets)]
+    return found
+
+
+def _unused(instances: Collection[ProblemInstance], count: int) -> list[int]:
+    used = {instance.offset for instance in instances}
+    return [offset for offset in range(len(used) + max(count, 0)) if offset not in used][: max(count, 0)]
+
+
+def _race_and_confirm(
+    tune: list[ProblemInstance], confirm: list[ProblemInstance]
+) -> tuple[list[ProblemInstance], list[ProblemInstance]]:
+    if confirm:
+        return tune, confirm
+    groups = list(scenes(tune).values())
+    if len(groups) < ENOUGH_SCENES:
+        return tune, fresh_starts(tune)
+    kept = groups[2::3]
+    return [instance for group in groups if group not in kept for instance in group], [
+        b for group in kept for b in group
+    ]
+
+
+def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
+    """The first frames of the first held-out recording that is here and that the study does not name itself."""
+    root = find_data_root(spec.data_root)
+    for entry in catalogue().values():
+        if entry.split == "held-out" and entry.id not in taken and entry.find(root) is not None:
+            frames = min(RECORDED_FRAMES + RECORDED_STARTS - 1, len(open_public(entry.id, data_root=root)))
+            return [ProblemInstance(entry.id, (0, frames), offset) for offset in range(RECORDED_STARTS)]
+    return []
+
+
+# Whether a study's instances are what they say: apart by content, by the catalogue, by the scenes.
 
 OVERRIDE = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
 
@@ -20,9 +143,13 @@ Split = Literal["tune", "confirm", "held_out"]
 
 
 def check_splits(
-    name: str, splits: Mapping[Split, Sequence[Block]], *, data_root: str | None = None, accept: bool = False
+    name: str,
+    splits: Mapping[Split, Collection[ProblemInstance]],
+    *,
+    data_root: str | None = None,
+    accept: bool = False,
 ) -> list[str]:
-    """Open every block of a study and compare its splits.
+    """Open every instance of a study and compare its splits.
 
     Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
     a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
@@ -31,7 +158,7 @@ def check_splits(
 
     Args:
         name: Of the study.
-        splits: Its blocks: to tune on, to judge the survivors on, and held out.
+        splits: Its instances: to tune on, to judge the survivors on, and held out.
         data_root: Folder of the recorded sequences.
         accept: Whether the study accepts it (`StudySpec.allow_overlap`).
 
@@ -39,13 +166,13 @@ def check_splits(
         What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, a split names the same frames twice, or a block is longer than
+        StudyError: Something is wrong and not accepted, a split names the same frames twice, or a instance is longer than
             its sequence, too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
     tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
-    tuned = dict.fromkeys(block.sequence for block in tune)
-    judged = dict.fromkeys(block.sequence for block in held_out)
+    tuned = dict.fromkeys(instance.sequence for instance in tune)
+    judged = dict.fromkeys(instance.sequence for instance in held_out)
     whole: dict[str, Any] = {each: open_sequence(each, data_root=data_root) for each in (*tuned, *judged)}
     for own in (tune, held_out):
         _check_repeats(own, whole)
@@ -63,27 +190,27 @@ def check_splits(
     return faults
 
 
-def _check_repeats(blocks: Sequence[Block], whole: Mapping[str, Any]) -> None:
-    """Within a split, blocks of one scene are repeats of the same frames or share no frame."""
-    if len(set(blocks)) < len(blocks):
-        twice = next(block for block in blocks if list(blocks).count(block) > 1)
-        raise StudyError(f"block '{twice}' is named twice", "leave one out")
-    by_scene: dict[str, list[tuple[Block, Part]]] = {}
-    for block in blocks:
-        part = part_of(cast("Any", block.cut(whole[block.sequence])), block.offset)
-        by_scene.setdefault(part.scene, []).append((block, part))
+def _check_repeats(instances: Collection[ProblemInstance], whole: Mapping[str, Any]) -> None:
+    """Within a split, instances of one scene are repeats of the same frames or share no frame."""
+    if len(set(instances)) < len(instances):
+        twice = next(instance for instance in instances if list(instances).count(instance) > 1)
+        raise StudyError(f"instance '{twice}' is named twice", "leave one out")
+    by_scene: dict[str, list[tuple[ProblemInstance, Part]]] = {}
+    for instance in instances:
+        part = part_of(cast("Any", instance.cut(whole[instance.sequence])), instance.offset)
+        by_scene.setdefault(part.scene, []).append((instance, part))
     for same in by_scene.values():
         for (one, here), (other, there) in combinations(same, 2):
             if _seen(one, here) == _seen(other, there):
                 raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
             if (here.start, here.stop) != (there.start, there.stop) and _common(here, there) > 0:
                 raise StudyError(
-                    f"'{one}' and '{other}' share {_common(here, there)} frames", "write blocks of a sequence apart"
+                    f"'{one}' and '{other}' share {_common(here, there)} frames", "write instances of a sequence apart"
                 )
 
 
-def _seen(block: Block, part: Part) -> tuple[object, ...]:
-    own = (block.offset, block.degradation, block.seed, part.noise, part.start, part.stop, part.stride)
+def _seen(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
+    own = (instance.offset, instance.degradation, instance.seed, part.noise, part.start, part.stop, part.stride)
     return (part.content, *own)
 
 
@@ -98,7 +225,7 @@ def _split(sequence: Any) -> str:
 def _misplaced(name: str, used: str, own: str) -> str:
     who = "the catalogue"
     if name.startswith("synthetic/"):
-        own_range = HELD_OUT_INSTANCES if own == "held-out" else TUNE_INSTANCES
+        own_range = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
         who = f"its scene ({own_range.start}-{own_range.stop - 1})"
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
@@ -110,3 +237,133 @@ def _overlap(one: Any, part: Part, other: Any, other_part: Part) -> bool:
     if is_rendered(one) and is_rendered(other):
         return False  # rendered scenes are told apart by their parameters
     return same_recording(one, other)
+
+
+# Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.
+
+_AROUND_S = np.array([-0.1, -0.05, 0.05, 0.1])
+"""The camera's distances from where it was and will be so long before and after a frame are the shape of its way."""
+_PAIRS = 6
+"""So many pairs of frames with the likest shapes, and as many with equal stamps, are compared by what they show."""
+_LEAST_M = 1e-3
+"""Of a way shorter than this the shape is the ground truth's rounding."""
+_THUMB = (32, 24)
+_GREY_LEVELS = 1.5
+_DEPTH_SHARE = 0.002
+_ENOUGH = 3
+"""Pairs that are alike; fewer may be a chance, as two ways may cross."""
+
+
+def same_recording(one: Sequence, other: Sequence) -> bool:
+    """Whether frames of one recording are frames of the other.
+
+    Frames are paired where the ground truths have the same shape around them (in whatever frame of reference, at
+    whatever stamps), where stamps are equal, and in order from the first and from the last frame; of a few pairs the
+    decoded images are compared, reduced to `_THUMB` pixels. Other names, shifted stamps, other image files, frames left
+    out and a smaller size leave a copy a copy.
+    """
+    thumbs = tuple(cache(lambda index, of=of: _thumbnail(of, index)) for of in (one, other))
+    pairs = dict.fromkeys(_likely_pairs(one, other))
+    alike = ((here, there) for here, there in pairs if _alike(thumbs[0](here), thumbs[1](there)))
+    return len(list(islice(alike, _ENOUGH))) == min(_ENOUGH, len(one), len(other))
+
+
+def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
+    shapes = [_shapes(each) for each in (one, other)]
+    if len(shapes[0]) and len(shapes[1]):
+        found = cKDTree(shapes[1]).query(shapes[0])
+        likest = np.asarray(found[1], np.intp)
+        apart = np.asarray(found[0], np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+        yield from ((int(here), int(likest[here])) for here in np.argsort(apart, kind="stable")[:_PAIRS])
+    if is_rendered(one) or is_rendered(other):
+        return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
+    stamps: NDArray[np.float64] = np.round(one.timestamps, 6)
+    twins: NDArray[np.float64] = np.round(other.timestamps, 6)
+    _, here, there = np.intersect1d(stamps, twins, assume_unique=True, return_indices=True)
+    spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
+    yield from ((int(here[k]), int(there[k])) for k in spread)
+    yield from ((0, 0), (len(one) - 1, len(other) - 1))
+
+
+def is_rendered(sequence: Sequence) -> bool:
+    """Whether the frames of a sequence are computed and its content is known by its parameters."""
+    return hasattr(sequence, "scene_digest")
+
+
+def _shapes(sequence: Sequence) -> NDArray[np.float64]:
+    """Distances in metres ``[N, 4]`` of the camera at every frame from itself `_AROUND_S` earlier and later.
+
+    They depend neither on the frame of reference nor on a shift of the stamps. Empty without ground truth.
+    """
+    truth = sequence.ground_truth
+    if truth is None or len(truth) < 2:
+        return np.empty((0, len(_AROUND_S)))
+
+    def positions(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+        axes = [np.interp(stamps, truth.timestamps, truth.positions[:, axis]) for axis in range(3)]
+        return np.stack(axes, axis=-1)
+
+    stamps = sequence.timestamps
+    around = positions(stamps[:, None] + _AROUND_S)
+    return np.asarray(np.linalg.norm(around - positions(stamps)[:, None], axis=2), np.float64)
+
+
+def _thumbnail(sequence: Sequence, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Colour ``[24, 32, 3]`` and depth ``[24, 32]`` of a frame, depth in the numbers that its file holds."""
+    frame = sequence[index]
+    raw = (frame.depth * sequence.camera.depth_factor).astype(np.float32)  # as stored, whatever the camera says
+    colour = cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(raw, _THUMB, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(colour, np.float32), np.asarray(depth, np.float32)
+
+
+def _alike(
+    one: tuple[NDArray[np.float32], NDArray[np.float32]], other: tuple[NDArray[np.float32], NDArray[np.float32]]
+) -> bool:
+    if np.abs(one[0] - other[0]).mean() > _GREY_LEVELS:
+        return False
+    allowed = _DEPTH_SHARE * float(np.median(one[1])) + 0.5
+    return bool(np.median(np.abs(one[1] - other[1])) <= allowed)
+
+
+# Which instances of a study show scenes that the network behind the masks was trained on: a best case there.
+
+
+def source_of_masks(settings: Settings, sequences: Collection[str]) -> str:
+    """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
+
+    Args:
+        settings: Of the system.
+        sequences: What it runs on.
+
+    Returns:
+        For example ``embedded``; empty for a system without masks.
+    """
+    source = str(getattr(getattr(settings, "segmentation", None), "source", ""))
+    rendered = bool(sequences) and all(name.startswith("synthetic/") for name in sequences)
+    return "embedded" if source == "auto" and rendered else source
+
+
+def splits_seen(settings: Settings, design: Design) -> list[str]:
+    """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
+    splits = {"tune": design.race, "confirm": design.confirm, "held_out": design.held_out}
+    return [name for name, instances in splits.items() if any(_masks_seen(settings, instances))]
+
+
+def seen_note(splits: Collection[str]) -> str:
+    """What such splits mean for a study, in one sentence; empty without any."""
+    if not splits:
+        return ""
+    named = " and ".join(
+        {"tune": "race", "confirm": "choice", "held_out": "held-out instances"}[name] for name in splits
+    )
+    judged = (
+        "so nothing here judges the masks: held-out instances are rendered scenes from 100 on"
+        if "held_out" in splits
+        else "so the errors there flatter it, and the held-out instances, which it has not seen, may gain less"
+    )
+    return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."
+
+
+def _masks_seen(settings: Settings, instances: Iterable[ProblemInstance]) -> Iterable[bool]:
+    return (seen_in_training(source_of_masks(settings, [each.sequence]), each.sequence) for each in instances)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,12 +12,10 @@ from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.toml import read_toml
-
-from .blocks import Block, parse_blocks
-from .old_form import converted
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
-RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
+PrunerName = Literal["halving", "rejection", "wilcoxon", "none"]
 EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
 """Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
@@ -47,34 +45,34 @@ class StudySpec(_Part):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        tune: Blocks that trials run on, written as `blocks.parse_blocks` reads them:
+        tune: Instances that trials run on, written as `instances.parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
+        confirm: Instances that no trial runs on, on which the best of them are judged again and the choice is made. Empty
             for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
-        held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.
-        recorded: Blocks of recordings that the choice must not be worse on; None for the first frames of a held-out
+        held_out: Instances that decide at the end whether tuning helped; neither trials nor the choice see them.
+        recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.
         space: Which settings are tuned.
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their scene gives to the
             other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
             minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
-            the worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost
+            the worst quarter of the scenes; ``robustness``: ATE on the degraded instances; ``coverage``: share of lost
             frames.
         ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
             ATE ratio must lie below 1 + this.
         pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
-        seeds: Seeds of the blocks that name none. A seed changes nothing for a tracker that draws nothing from it.
-        offsets: Start offsets of the blocks that name none: so many leading frames are left out.
+        seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that draws nothing from it.
+        offsets: Start offsets of the instances that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the default settings) included.
         timeout_s: No trial begins after this many seconds; None for no limit.
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
-        race: How trials drop out: by sequential ``halving`` over growing sets of blocks, by successive ``rejection``
-            after every block, by ``wilcoxon``'s test against the best one, or ``none``.
+        race: How trials drop out: by sequential ``halving`` over growing sets of instances, by successive ``rejection``
+            after every instance, by ``wilcoxon``'s test against the best one, or ``none``.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
             ``~/.pgpass``): it is in no file that is written.
@@ -104,7 +102,7 @@ class StudySpec(_Part):
     top: int = Field(default=3, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
-    race: RaceName = "halving"
+    race: PrunerName = "halving"
     storage: str = ""
     protocol: str = "tum-rgbd/v1"
     cache: bool = True
@@ -118,22 +116,24 @@ class StudySpec(_Part):
             twice = sorted({str(value) for value in values if list(values).count(value) > 1})
             if twice:
                 raise ValueError(f"{name} names '{twice[0]}' twice")
-        judged = {block.scene: text for text in reversed(self.held_out) for block in self.blocks(text)}
-        both = {block.scene: text for text in (*self.tune, *self.confirm) for block in self.blocks(text)
-                if block.scene in judged}  # fmt: skip
+        judged = {instance.scene: text for text in reversed(self.held_out) for instance in self.instances(text)}
+        both = {instance.scene: text for text in (*self.tune, *self.confirm) for instance in self.instances(text)
+                if instance.scene in judged}  # fmt: skip
         if both and not self.allow_overlap:
             scene, one = next(iter(both.items()))
             spelled = "" if one == judged[scene] else f", held out as '{judged[scene]}'"
             raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{one}'{spelled}")
         return self
 
-    def blocks(self, *texts: str) -> list[Block]:
-        """The blocks that texts of this study name.
+    def instances(self, *texts: str) -> list[ProblemInstance]:
+        """The instances that texts of this study name.
 
         Raises:
             StudyError: One cannot be read.
         """
-        return [block for text in texts for block in parse_blocks(text, offsets=self.offsets, seeds=self.seeds)]
+        return [
+            instance for text in texts for instance in parse_instances(text, offsets=self.offsets, seeds=self.seeds)
+        ]
 
     @property
     def at_equal_accuracy(self) -> bool:
@@ -190,3 +190,31 @@ def make_spec(values: Any, where: str) -> StudySpec:
             raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, known)) from None
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None
+
+
+# Study files of before there were instances and races, in today's form.
+
+RACES = {"median": "halving", "hyperband": "halving", "wilcoxon": "wilcoxon", "none": "none"}
+"""Who ends trials early now, by the `pruner` that did."""
+NEW = ("confirm", "recorded", "race", "ate_margin")
+"""What the old form could not say."""
+
+
+def is_old(values: Mapping[str, Any]) -> bool:
+    """Whether a study, or its stored identity, has the old form."""
+    return "pruner" in values
+
+
+def converted(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """A study's values in today's form, and what was changed, a line each.
+
+    The names of sequences are instances as they stand. What cannot be converted is left for the validation to refuse.
+    """
+    found, notes = dict(values), []
+    if is_old(found):
+        pruner = found.pop("pruner")
+        found.setdefault("race", RACES.get(str(pruner), pruner))
+        notes.append(f'pruner = "{pruner}" became race = "{found["race"]}"')
+        if "speed" in str(found.get("objectives", "")):
+            notes.append('objective "speed" is the processor time beside the default\'s, no real-time factor')
+    return found, notes

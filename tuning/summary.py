@@ -1,17 +1,100 @@
-"""What came out of a study, and what may be concluded from it."""
+"""A ratio to the default settings, with its interval."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 from pydantic import Field, model_validator
 
 from dynslam_bench.core.records import Record
+from dynslam_bench.tuning.objectives import ACCURACY, FEWEST_SCENES, Objective, Outcomes, bounds, centre, upper
 
-from .ratio import Ratio
-from .statistics import FEWEST_SCENES
+_LARGEST_LOG = 700.0
+"""Larger logarithms overflow."""
+FALSE_CHOICES = 0.05
+"""At most this share of the studies in which nothing is better may choose something."""
+
+
+class Ratio(Record):
+    """A ratio to the default settings, of the ATE or whatever a study is after, with its 95 % interval.
+
+    Attributes:
+        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the default.
+        low: Lower end of the interval over scenes (`statistics.bounds`); below three scenes over starts, which tells
+            nothing of other scenes. None for a single run. Summaries of older versions hold a bootstrap interval, which
+            was too narrow.
+        high: Upper end.
+        n: Paired runs.
+        sequences: How many scenes they come from.
+        bound: One-sided upper bound, wide enough for the number of candidates compared; None for a single run.
+        what: What the ratio is one of.
+    """
+
+    ratio: float
+    low: float | None
+    high: float | None
+    n: int
+    sequences: int
+    bound: float | None = None
+    what: str = "ATE"
+
+    @property
+    def shows_gain(self) -> bool:
+        """Whether the whole interval lies below 1, over enough scenes for an interval."""
+        return self.high is not None and self.high < 1 and self.sequences >= FEWEST_SCENES
+
+    @property
+    def shows_loss(self) -> bool:
+        """Whether the whole interval lies above 1, over enough scenes for an interval."""
+        return self.low is not None and self.low > 1 and self.sequences >= FEWEST_SCENES
+
+    @property
+    def verdict(self) -> str:
+        """What may be concluded."""
+        if self.sequences < FEWEST_SCENES:
+            return f"on {self.sequences} scene{'s' * (self.sequences > 1)} only, from which nothing follows for others"
+        if self.shows_gain:
+            return f"better than the default by {100 * (1 - self.ratio):.1f} %"
+        if self.shows_loss:
+            return f"worse than the default by {100 * (self.ratio - 1):.1f} %"
+        return "no difference to the default that these runs could show"
+
+    @property
+    def interval(self) -> str:
+        """The interval in brackets; empty without one."""
+        return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
+
+    def __str__(self) -> str:
+        return f"{self.what} x {self.ratio:.3f} {self.interval or 'without an interval'}"
+
+
+def compared(outcomes: Outcomes, default: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1) -> Ratio:
+    """A configuration beside the default on the same instances.
+
+    Args:
+        outcomes: Of the configuration.
+        default: Of the default settings.
+        objective: What is compared.
+        candidates: How many configurations are compared for one choice; the bound allows for all of them (Bonferroni).
+    """
+    scenes = objective.ratios(outcomes, default)
+    sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, default)
+    sample = objective.counted(sample)
+    found, middle = bounds(sample), centre(sample)
+    about: dict[str, Any] = {"n": len(outcomes), "sequences": len(scenes), "what": objective.what}
+    if found is None:
+        return Ratio(ratio=_ratio(middle), low=None, high=None, **about)
+    bound = _ratio(upper(sample, 1 - FALSE_CHOICES / candidates))
+    return Ratio(ratio=_ratio(middle), low=_ratio(found[0]), high=_ratio(found[1]), bound=bound, **about)
+
+
+def _ratio(logarithm: float) -> float:
+    return math.exp(min(logarithm, _LARGEST_LOG))
+
+
+# What came out of a study, and what may be concluded from it.
 
 
 class Candidate(Record):
@@ -21,10 +104,10 @@ class Candidate(Record):
         trial: Its number.
         params: The tuned settings.
         values: What its trial had been worth.
-        confirm: On the blocks for the choice, which no trial had seen.
+        confirm: On the instances for the choice, which no trial had seen.
         held_out: On the held-out split; None without one, or if it was not chosen.
         recorded: ATE on recordings; None without any, or if it was not chosen.
-        on_confirm: ATE and processor time on the blocks for the choice, by objective.
+        on_confirm: ATE and processor time on the instances for the choice, by objective.
         on_held_out: The same on the held-out split.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
         frame_ms: Mean milliseconds a frame, timed without the stage cache.
@@ -74,7 +157,7 @@ class Candidate(Record):
         return self.recorded is not None and self.recorded.low is not None and self.recorded.low > 1
 
     @property
-    def holds_up(self) -> bool:
+    def is_confirmed(self) -> bool:
         """Whether it beats the default on the held-out split and is not worse on recordings."""
         gain = self.held_out is not None and self.held_out.shows_gain
         return self.feasible and gain and self.nothing_lost(self.on_held_out) and not self.worse_on_recordings
@@ -95,7 +178,7 @@ class StudySummary(Record):
         conclusion: One sentence, see `conclude`.
         importances: Shares of the parameters that matter more than chance, see `importance`.
         inert: Parameters that changed nothing, or never took part.
-        tune: The blocks that trials ran on.
+        tune: The instances that trials ran on.
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
@@ -125,7 +208,7 @@ class StudySummary(Record):
     @model_validator(mode="before")
     @classmethod
     def _of_an_older_version(cls, values: Any) -> Any:
-        """The repeats are told by the blocks now."""
+        """The repeats are told by the instances now."""
         return {key: value for key, value in values.items() if key != "repeats"} if isinstance(values, dict) else values
 
     @property
@@ -188,7 +271,7 @@ def _conclude(chosen: Candidate, overlapping: bool) -> str:
     if held is None:
         return (
             f"Not judged, keep the default: no held-out split was given, and what trial {chosen.trial} reaches on the "
-            f"blocks that it was chosen on ({again}) says nothing about others."
+            f"instances that it was chosen on ({again}) says nothing about others."
         )
     on = f"on {held.sequences} held-out scene{'s' * (held.sequences != 1)}"
     chosen_on = f"where it was chosen: {again}"
@@ -233,3 +316,35 @@ def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) ->
         judged.append(f"failed when it was judged: {candidate.failed}")
     apart = f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else ""
     return f"The '{name}' pick is trial {candidate.trial} ({'; '.join(judged)}).{apart}"
+
+
+# Which configuration for whom: the fast, the balanced and the accurate one of a study's best trials.
+
+PickName = Literal["fast", "balanced", "accurate"]
+PICKS: tuple[PickName, ...] = get_args(PickName)
+
+
+def pick(name: PickName, candidates: Sequence[Candidate], margin: float) -> Candidate | None:
+    """A study's pick; None stands for the default.
+
+    Args:
+        name: ``fast``: the least processor time at (nearly) the default's accuracy; ``accurate``: the least ATE;
+            ``balanced``: the least of the study's objectives together, at (nearly) the default's accuracy.
+        candidates: The trials to choose from, feasible ones.
+        margin: What may be lost of accuracy, as a share.
+    """
+    asked = 1 + margin if name != "accurate" else math.inf
+    equal = [each for each in candidates if _bound(each.on_confirm["accuracy"]) < asked]
+    best = min(equal, key=lambda each: _decides(name, each), default=None)
+    return best if best is not None and _decides(name, best) < 1 else None
+
+
+def _decides(name: PickName, candidate: Candidate) -> float:
+    """The upper bound that a pick is chosen by."""
+    if name == "balanced":
+        return _bound(candidate.confirm)
+    return _bound(candidate.on_confirm["speed" if name == "fast" else "accuracy"])
+
+
+def _bound(ratio: Ratio | None) -> float:
+    return math.inf if ratio is None or ratio.bound is None else ratio.bound

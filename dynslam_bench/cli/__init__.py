@@ -14,14 +14,14 @@ def main() -> None:
     import sys
     from io import TextIOWrapper
 
-    from .ending import leave_interrupted, watch_signals
+    from dynslam_bench.cli.ending import leave_interrupted, watch_signals
 
     watch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal of another encoding shows ? in place of what it lacks
             stream.reconfigure(errors="replace")
     try:
-        from .app import start
+        from dynslam_bench.cli.app import start
 
         start()
     except KeyboardInterrupt:

@@ -1,5 +1,5 @@
 """``python -m dynslam_bench.cli``."""
 
-from . import main
+from dynslam_bench.cli import main
 
 main()

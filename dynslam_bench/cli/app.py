@@ -8,26 +8,19 @@ from typing import Annotated, Optional
 
 import typer
 
+from dynslam_bench.cli import maintenance as caches
+from dynslam_bench.cli import maintenance as doctor
+from dynslam_bench.cli import maintenance as environments
+from dynslam_bench.cli import reports as presentation
+from dynslam_bench.cli import running, segmenters, sequences, studies, trackers
+from dynslam_bench.cli import runs as stored
+from dynslam_bench.cli import trajectories as evaluating
+from dynslam_bench.cli import trajectories as imports
+from dynslam_bench.cli.ending import interrupted, leave_interrupted
+from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START
+from dynslam_bench.cli.output import complain_of, drawn_download, for_scripts
 from dynslam_bench.core.download_progress import show_downloads
 from dynslam_bench.core.errors import DynslamError
-
-from . import (
-    caches,
-    doctor,
-    environments,
-    evaluating,
-    imports,
-    presentation,
-    running,
-    segmenters,
-    sequences,
-    stored,
-    studies,
-    trackers,
-)
-from .ending import interrupted, leave_interrupted
-from .output import complain_of, drawn_download, for_scripts
-from .panels import CARE, MEASURE, REPORT, START
 
 INTERRUPT_CODE = 130
 app = typer.Typer(
@@ -46,10 +39,10 @@ app.add_typer(stored.app, name="runs", rich_help_panel=MEASURE)
 evaluating.add(app)
 app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 presentation.add_report(app)
-imports.add(app)
+imports.add_exchange(app)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 app.add_typer(caches.app, name="cache", rich_help_panel=CARE)
-environments.add(app)
+environments.add_envs(app)
 doctor.add(app)
 
 

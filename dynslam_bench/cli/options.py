@@ -1,14 +1,117 @@
-"""Options that several verbs share."""
+"""What the shell offers when one presses Tab: trackers, sequences, settings, presets, suites, protocols and tags."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
+from typer.core import TyperGroup
 
-from . import completion
-from .output import for_scripts
+from dynslam_bench.cli.output import for_scripts
+from dynslam_bench.core.errors import DynslamError
+
+if TYPE_CHECKING:
+    from dynslam_bench.contracts.tracker import TrackerSpec
+
+
+def trackers(incomplete: str) -> list[str]:
+    """Trackers by their id."""
+    from dynslam_bench.trackers import TRACKERS
+
+    return _beginning(incomplete, (found.spec.id for found in TRACKERS.all()))
+
+
+def sequences(incomplete: str) -> list[str]:
+    """Ids of the catalogue and of rendered sequences."""
+    from dynslam_bench.sequences.catalogue import summaries
+
+    return _beginning(incomplete, (each.id for each in summaries()))
+
+
+def settings(ctx: typer.Context, incomplete: str) -> list[str]:
+    """``NAME=`` of every setting of the tracker that the line names, and ``NAME=CHOICE`` where it has choices."""
+    from dynslam_bench.core.settings import flatten, parameters
+
+    try:
+        chosen = _tracker(ctx).settings
+    except DynslamError:
+        return []
+    names = [f"{name}=" for name in flatten(chosen())]
+    choices = [f"{each.name}={choice}" for each in parameters(chosen) for choice in each.choices or ()]
+    return _beginning(incomplete, names + (choices if "=" in incomplete else []))
+
+
+def presets(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Presets of the tracker that the line names."""
+    try:
+        return _beginning(incomplete, _tracker(ctx).presets)
+    except DynslamError:
+        return []
+
+
+def suites(incomplete: str) -> list[str]:
+    """Names of the suites that come along, and TOML files."""
+    from dynslam_bench.suites import suite_names
+
+    return _beginning(incomplete, [*suite_names(), *map(str, Path().glob("*.toml"))])
+
+
+def export_formats(incomplete: str) -> list[str]:
+    """Formats that `export` writes."""
+    from dynslam_bench.runs.exchange.export import FORMATS
+
+    return _beginning(incomplete, FORMATS)
+
+
+def protocols(incomplete: str) -> list[str]:
+    """Protocols by their id."""
+    from dynslam_bench.evaluation.protocol import PROTOCOLS
+
+    return _beginning(incomplete, PROTOCOLS)
+
+
+def statuses(incomplete: str) -> list[str]:
+    """How runs end."""
+    from typing import get_args
+
+    from dynslam_bench.runs.record import Status
+
+    return _beginning(incomplete, get_args(Status))
+
+
+def _tracker(ctx: typer.Context) -> TrackerSpec:
+    """The tracker that the line names: its first word; while a line is completed it may not have been read yet."""
+    from dynslam_bench.trackers import TRACKERS
+
+    return TRACKERS.get(str(ctx.params.get("tracker") or next(iter(ctx.args), "")))
+
+
+def _beginning(incomplete: str, names: Iterable[str]) -> list[str]:
+    return [name for name in names if name.startswith(incomplete)]
+
+
+# Headings below which the program's help lists its verbs.
+
+START, MEASURE = "Begin here", "Run and measure"
+REPORT, CARE = "Report and tune", "Extend and care"
+
+
+# A command group with a default verb.
+
+
+class DefaultGroup(TyperGroup):
+    """Arguments that begin with no known verb go to the verb ``make``: ``report results`` makes a report."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the default verb where none is named."""
+        if not args or (args[0] not in self.commands and args[0] not in ("-h", "--help")):
+            args = ["make", *args]
+        return super().parse_args(ctx, args)
+
+
+# Options that several verbs share.
 
 FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
 TRAJECTORY_FORMATS = "TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP"
@@ -71,7 +174,7 @@ Assignments = Annotated[
         metavar="NAME=VALUE",
         help="Set a setting, e.g. features.n_features=800; repeatable.",
         rich_help_panel=SETTINGS,
-        autocompletion=completion.settings,
+        autocompletion=settings,
     ),
 ]
 SettingsFile = Annotated[
@@ -94,7 +197,7 @@ ProtocolId = Annotated[
         "--protocol",
         help="How to evaluate; see `protocols list`.",
         rich_help_panel=OUTPUT,
-        autocompletion=completion.protocols,
+        autocompletion=protocols,
     ),
 ]
 Retry = Annotated[
@@ -103,14 +206,12 @@ Retry = Annotated[
         "--retry",
         help="Run again what ended so: failed, or a status.",
         rich_help_panel=OUTPUT,
-        autocompletion=completion.statuses,
+        autocompletion=statuses,
     ),
 ]
 Preset = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option(
-        "--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=completion.presets
-    ),
+    typer.Option("--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=presets),
 ]
 Realtime = Annotated[
     bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=FRAMES)
@@ -160,9 +261,7 @@ Label = Annotated[
 ]
 Trackers = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option(
-        "--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=completion.trackers
-    ),
+    typer.Option("--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=trackers),
 ]
 Scheduler = Annotated[
     Optional[str],  # noqa: UP045

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 from dynslam_bench.core.download_progress import Report
-from dynslam_bench.core.harmless import printable
+from dynslam_bench.core.sanitise import printable
 
 if TYPE_CHECKING:
     from dynslam_bench.core.errors import DynslamError

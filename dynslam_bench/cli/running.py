@@ -5,15 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import typer
 
-from dynslam_bench.core.toml import label_text
-
-from . import completion
-from .expected_time import plan_words
-from .options import (
+from dynslam_bench.cli import options as completion
+from dynslam_bench.cli.options import (
+    MEASURE,
     AsJson,
     Assignments,
     Cache,
@@ -48,9 +47,9 @@ from .options import (
     Yes,
     gather_settings,
 )
-from .output import SOME_RUNS_FAILED, announce, can_ask, complain, complain_of, note, progress
-from .panels import MEASURE
-from .run_rows import drift_note, recording_note, seen_note, show_pictures, show_runs
+from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, can_ask, complain, complain_of, note, progress
+from dynslam_bench.cli.runs import drift_note, recording_note, seen_note, show_pictures, show_runs
+from dynslam_bench.core.toml import label_text
 
 if TYPE_CHECKING:
     from dynslam_bench.core.errors import DynslamError
@@ -58,6 +57,7 @@ if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent, RunRecord, RunSpec, RunStore
     from dynslam_bench.runs.identity import ResolvedRun
     from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
+
 
 R = TypeVar("R", bound="Record")
 
@@ -271,7 +271,7 @@ def finish(
     from dynslam_bench.runs.many import pictures_asked
     from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
     from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
-    from dynslam_bench.slam.mapping.saved_map import MAP_FILE
+    from dynslam_bench.slam.map_files import MAP_FILE
 
     store = RunStore(results)
     reused: set[str] = set()
@@ -399,3 +399,53 @@ def dask_executor(address: str) -> Any:
         return Client(address, timeout="10s").get_executor()
     except (OSError, ValueError) as error:
         raise RunError(f"no Dask scheduler answers at {address}: {error}", "for example tcp://host:8786") from error
+
+
+# How many frames runs have, and how long they take by what stored runs of the same trackers took here.
+
+MOST_LOOKED_AT, MOST_ALIKE = 100, 5
+"""Stored runs, the newest first, that are looked through for those of a tracker, and how many of these count."""
+
+
+def plan_words(runs: Collection[ResolvedRun], store: RunStore, jobs: int) -> str:
+    """How many frames are to be tracked, and how long that takes by what stored runs of the same trackers took."""
+    from dynslam_bench.runs.one import PROGRESS_EVERY
+
+    frames = sum(len(run.sequence) for run in runs)
+    words = f"{len(runs)} run{'s' * (len(runs) != 1)}, {frames} frames"
+    times = frame_times(runs, store)
+    known = [run for run in runs if _kind(run) in times]
+    if not known:
+        later = f"; how long it takes is known after the first {PROGRESS_EVERY}" if frames > PROGRESS_EVERY else ""
+        return words + later
+    expected_s = sum(len(run.sequence) * times[_kind(run)] for run in known) / min(jobs, len(runs))
+    low, high = _seconds(min(times.values())), _seconds(max(times.values()))
+    rate = low if low == high else f"{low} to {high}"
+    some = f" for {len(known)} of them" if len(known) < len(runs) else ""
+    return f"{words}, about {_seconds(expected_s)}{some} (stored runs on this machine took {rate} a frame)"
+
+
+def frame_times(runs: Collection[ResolvedRun], store: RunStore) -> dict[tuple[str, str], float]:
+    """Seconds of wall-clock time a frame of stored runs on a machine like this: the median by tracker and masks."""
+    from dynslam_bench.core.fingerprint import this_machine
+
+    wanted, times = {_kind(run) for run in runs}, dict[tuple[str, str], list[float]]()
+    newest = sorted(store.ids(), key=lambda run_id: -store.folder(run_id).stat().st_mtime)
+    machine = this_machine()
+    for record in filter(None, map(store.get, newest[:MOST_LOOKED_AT])):
+        kind = (record.tracker.id, record.segmentation)
+        here = record.machine is not None and (record.machine.cpu, record.machine.cores) == (machine.cpu, machine.cores)
+        if kind in wanted and here and record.status in ("ok", "lost") and record.n_processed and record.wall_s:
+            times.setdefault(kind, []).append(record.wall_s / record.n_processed)
+    return {kind: median(found[:MOST_ALIKE]) for kind, found in times.items()}
+
+
+def _kind(run: ResolvedRun) -> tuple[str, str]:
+    return run.tracker.id, run.segmentation
+
+
+def _seconds(value: float) -> str:
+    for unit, seconds in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
+        if value >= 1.5 * seconds:
+            return f"{value / seconds:.2g} {unit}" if value < 10 * seconds else f"{value / seconds:.0f} {unit}"
+    return f"{1000 * value:.0f} ms"

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from . import completion
-from .options import AsJson, Camera, DataRoot, Device, Frames, Threads, gather_settings
-from .output import progress, write, write_fields, write_json, write_table
+from dynslam_bench.cli import options as completion
+from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Device, Frames, Threads, gather_settings
+from dynslam_bench.cli.output import progress, write, write_fields, write_json, write_table
 
 TrainingAssignments = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
@@ -128,7 +128,7 @@ def record(
     """Write a segmenter's masks of a sequence as PNG files; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
     from dynslam_bench.envs import resolve_device
-    from dynslam_bench.segmentation.masks.recording import record_masks
+    from dynslam_bench.segmentation.recorded import record_masks
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -151,7 +151,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write one of our networks as an ONNX file of fixed shapes, which lighter runtimes can serve."""
-    from dynslam_bench.segmentation.networks.onnx.export import export_network, parse_size, weights_of
+    from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size, weights_of
 
     chosen = weights_of(source, side)
     done = export_network(chosen.path, output, size=parse_size(size), side=chosen.side)

@@ -10,12 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from . import completion
-from .options import AsJson, Camera, DataRoot, Frames
-from .output import VERIFICATION_FAILED, complain, note, progress, write, write_fields, write_json, write_table
+from dynslam_bench.cli import options as completion
+from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Frames
+from dynslam_bench.cli.output import (
+    VERIFICATION_FAILED,
+    complain,
+    note,
+    progress,
+    write,
+    write_fields,
+    write_json,
+    write_table,
+)
 
 if TYPE_CHECKING:
-    from dynslam_bench.sequences.listing import Summary
+    from dynslam_bench.sequences.catalogue import Summary
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
 
@@ -30,7 +39,7 @@ def list_(
 ) -> None:
     """List all sequences and whether they are on this machine."""
     from dynslam_bench.core.errors import SequenceError, did_you_mean
-    from dynslam_bench.sequences.listing import summaries
+    from dynslam_bench.sequences.catalogue import summaries
 
     everything = summaries(data_root=data_root)
     tags = sorted({each for summary in everything for each in summary.tags})
@@ -79,7 +88,7 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """Show what is known of a sequence, and what it holds if it is on this machine."""
-    from dynslam_bench.sequences.listing import describe
+    from dynslam_bench.sequences.catalogue import describe
 
     found: dict[str, Any] = describe(name, data_root=data_root, camera=camera)
     if as_json:
@@ -100,9 +109,9 @@ def fetch(
 ) -> None:
     """Download public sequences; a call that was cut short goes on where it stopped."""
     from dynslam_bench.core.download import Progress
+    from dynslam_bench.sequences.catalogue import expand
     from dynslam_bench.sequences.fetch import RECEIPT, Receipt, status
     from dynslam_bench.sequences.fetch import fetch as fetch_one
-    from dynslam_bench.sequences.listing import expand
 
     for name in expand(names):
         new = status(name, data_root=data_root).folder is None
@@ -130,8 +139,8 @@ def verify(
     as_json: AsJson = False,
 ) -> None:
     """Decode every frame, and compare every file with the checksum taken when it was fetched."""
+    from dynslam_bench.sequences.catalogue import expand
     from dynslam_bench.sequences.fetch import verify as verify_one
-    from dynslam_bench.sequences.listing import expand
 
     reports = []
     for name in expand(names):
@@ -233,8 +242,8 @@ def calibrate(
 ) -> None:
     """Measure the readout time of a rolling shutter, the delay of depth, and the depth factor."""
     from dynslam_bench.sequences.calibration import calibrate as measure
+    from dynslam_bench.sequences.cameras import write_camera
     from dynslam_bench.sequences.catalogue import open_sequence
-    from dynslam_bench.sequences.published.cameras import write_camera
 
     sequence = open_sequence(name, data_root=data_root, camera=camera, frames=frames)
     with progress(name) as advance:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from .options import AsJson, Jobs, Results
-from .output import Advance, note, progress, write, write_fields, write_json, write_table
-from .running import run_words
+from dynslam_bench.cli.options import AsJson, Jobs, Results
+from dynslam_bench.cli.output import Advance, note, progress, write, write_fields, write_json, write_table
+from dynslam_bench.cli.running import run_words
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
@@ -37,7 +37,7 @@ def space(study: Study, as_json: AsJson = False) -> None:
     from dynslam_bench.tuning import read_study, search_space
 
     spec = read_study(study, note)
-    sequences = {block.sequence for block in spec.blocks(*spec.tune)}
+    sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
     found = search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
     if as_json:
         write_json([asdict(parameter) for parameter in found])
@@ -57,7 +57,7 @@ def space(study: Study, as_json: AsJson = False) -> None:
 
 @app.command()
 def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
-    """Measure the spread of a study's blocks: what it could show, and what 5, 10 and 20 % would take."""
+    """Measure the spread of a study's instances: what it could show, and what 5, 10 and 20 % would take."""
     from dynslam_bench.tuning import Tuner, pilot_of, read_study
 
     found = pilot_of(Tuner(read_study(study, note), results), jobs=jobs)
@@ -66,7 +66,7 @@ def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_j
         return
     write(f"{found.sentence}.")
     write()
-    rows = [(f"{100 * need.effect:.0f} %", need.scenes, need.blocks, f"{need.minutes:.0f}") for need in found.needs]
+    rows = [(f"{100 * need.effect:.0f} %", need.scenes, need.instances, f"{need.minutes:.0f}") for need in found.needs]
     write_table(("gain", "scenes", "runs of one configuration", "minutes"), rows)
     if found.warning:
         write()
@@ -79,15 +79,15 @@ def screen(
     results: Results = Path("results"),
     jobs: Jobs = 1,
     points: Annotated[int, typer.Option(min=1, help="Points to move from: the default, and others near it.")] = 2,
-    blocks: Annotated[int, typer.Option(min=2, help="Blocks of the study to run on.")] = 4,
+    instances: Annotated[int, typer.Option(min=2, help="Instances of the study to run on.")] = 4,
     as_json: AsJson = False,
 ) -> None:
-    """Find which settings matter, before a study: one at a time, on several blocks; print the few worth tuning."""
+    """Find which settings matter, before a study: one at a time, on several instances; print the few worth tuning."""
     from dynslam_bench.tuning import Tuner, read_study, screen_study
 
     tuner = Tuner(read_study(study, note), results)
     with progress(f"screening {tuner.spec.name}") as advance:
-        found = screen_study(tuner, points=points, blocks=blocks, jobs=jobs, on_done=advance)
+        found = screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
     if as_json:
         write_json(found)
         return
@@ -102,7 +102,7 @@ def screen(
         write(f"{name} broke a run: {reason}")
     if not found.kept:
         write(
-            f"No setting matters more than chance on these {found.blocks} blocks ({found.runs} runs): try more blocks."
+            f"No setting matters more than chance on these {found.instances} instances ({found.runs} runs): try more instances."
         )
         return
     write("[space]")
@@ -262,7 +262,7 @@ def conclude(tuner: Tuner, jobs: int = 1) -> StudySummary:
 
 def show_summary(tuner: Tuner, summary: StudySummary, page: Path, *, as_json: bool) -> None:
     """Conclusion, chosen settings and where everything lies."""
-    from dynslam_bench.tuning.seen import seen_note
+    from dynslam_bench.tuning.splits import seen_note
 
     preset = tuner.folder / "best.toml"
     if as_json:

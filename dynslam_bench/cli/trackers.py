@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from . import completion
-from .options import AsJson, Assignments, MemoryLimit, SettingsFile, gather_settings
-from .output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
+from dynslam_bench.cli import options as completion
+from dynslam_bench.cli.options import AsJson, Assignments, MemoryLimit, SettingsFile, gather_settings
+from dynslam_bench.cli.output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
 
 if TYPE_CHECKING:
     from dynslam_bench.core.settings import Settings
@@ -139,7 +139,7 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
     """Say which plug-ins are not available, and why."""
-    from dynslam_bench.testing.doctor import diagnose
+    from dynslam_bench.testing.installation import diagnose
 
     found = diagnose()
     if as_json:

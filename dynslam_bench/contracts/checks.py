@@ -15,14 +15,12 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
 from dynslam_bench.core.errors import SequenceError, TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .result import TrackingState, TrackResult
-from .sequence import Frame, Sequence
-from .tracker import TrackerSpec
 
 STATES = get_args(TrackingState)
 FARTHEST_M = 1e9

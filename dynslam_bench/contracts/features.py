@@ -70,7 +70,7 @@ class FeatureExtractor(Protocol):
 class MaskedExtractor(FeatureExtractor, Protocol):
     """An extractor that can see to it that what lies on a mask takes no place of what lies outside."""
 
-    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
         """As `extract`; where less than a share of the keypoints sought lies outside, all are sought there too.
 
         Args:

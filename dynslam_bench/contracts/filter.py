@@ -9,13 +9,12 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.tracker import Provenance as Provenance
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-
-from .features import Keypoints
-from .flow import FlowResult
-from .provenance import Provenance as Provenance
-from .segmenter import Instances
 
 Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
 """What a filter asks for: `FilterState` and `FrameBundle` hold it."""

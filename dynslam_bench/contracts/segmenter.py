@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from .sequence import Frame, MaskSource
+from dynslam_bench.contracts.sequence import Frame, MaskSource
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DynslamError
-from .reading import read_bytes
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.reading import read_bytes
 
 MOST_BYTES = 1 << 28
 """Of a file, and of all arrays in it together."""

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import hashlib
 import http.client
+import ipaddress
 import json
 import shutil
 import time
@@ -14,14 +15,14 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+from urllib.parse import SplitResult, urlsplit
 
-from .address import check_address, connect
-from .download_progress import Progress, Report, reporting
-from .errors import DownloadError, DynslamError
-from .locks import claimed
-from .passwords import without_passwords
-from .reading import read_json
+from dynslam_bench.core.download_progress import Progress, Report, reporting
+from dynslam_bench.core.errors import DownloadError, DynslamError
+from dynslam_bench.core.files import claimed
+from dynslam_bench.core.passwords import without_passwords
+from dynslam_bench.core.reading import read_json
 
 __all__ = ["CHUNK", "Progress", "Report", "download", "file_sha256", "forget"]
 
@@ -292,3 +293,73 @@ def _write_notes(part: Path, url: str, total: int | None, headers: Any) -> None:
     }
     with contextlib.suppress(OSError):  # without notes the next call begins anew, which is safe
         _notes(part).write_text(json.dumps(notes))
+
+
+# Which web addresses are fetched from: https, or http where the content is checked, and nothing they redirect to else.
+
+
+def check_address(url: str, *, checked: bool) -> SplitResult:
+    """The parts of an address that may be fetched.
+
+    Args:
+        url: The address.
+        checked: Whether a checksum of the content is known; then plain http will do, and on this machine always.
+
+    Raises:
+        DownloadError: Another scheme, no host, characters that no address has, or a password.
+    """
+    try:
+        parts = urlsplit(url)
+        host, port = (parts.hostname or "").encode("idna").decode(), parts.port
+    except ValueError as error:
+        raise DownloadError(f"cannot download {url[:200]!r}: {error}") from error
+    if parts.scheme not in ("http", "https"):
+        raise DownloadError(f"cannot download {url[:200]!r}", "the address has to begin with http:// or https://")
+    if not host or port == 0 or not url.isascii() or not url.isprintable() or " " in url:
+        raise DownloadError(f"cannot download {url[:200]!r}: it is no web address", "for example https://host/name.tgz")
+    if parts.username is not None or parts.password is not None:
+        raise DownloadError(f"cannot download from {host}: the address holds a name or password", "leave them out")
+    if parts.scheme == "http" and not checked and not _is_here(host):
+        raise DownloadError(
+            f"cannot download {url[:200]!r}: http without a known checksum could bring anything", "use https"
+        )
+    return parts
+
+
+def connect(request: urllib.request.Request, timeout_s: float) -> Any:
+    """As the standard library opens an address, for http and https alone, whatever a server redirects to.
+
+    Raises:
+        DownloadError: The server redirects to another scheme.
+        OSError: It cannot be reached, or answers with an error.
+    """
+    opener = urllib.request.OpenerDirector()
+    for handler in (
+        urllib.request.ProxyHandler,
+        urllib.request.HTTPHandler,
+        urllib.request.HTTPSHandler,
+        urllib.request.HTTPDefaultErrorHandler,
+        urllib.request.HTTPErrorProcessor,
+        _Redirect,
+    ):
+        opener.add_handler(handler())
+    return opener.open(request, timeout=timeout_s)
+
+
+class _Redirect(urllib.request.HTTPRedirectHandler):
+    """Follows redirects to https, and from http to http."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
+    ) -> urllib.request.Request | None:
+        scheme = urlsplit(newurl).scheme
+        if scheme != "https" and scheme != req.type:
+            raise DownloadError(f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _is_here(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DynslamError
-from .image_header import image_size, is_whole_jpeg
-from .reading import MEGABYTE, read_bytes
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.image_header import image_size, is_whole_jpeg
+from dynslam_bench.core.reading import MEGABYTE, read_bytes
 
 Image = NDArray[np.integer | np.floating]
 MOST_PIXELS = 1 << 26

@@ -9,7 +9,7 @@ import sys
 import types
 from collections.abc import Sequence
 
-from .deprecated import warn_deprecated
+from dynslam_bench.core.deprecated import warn_deprecated
 
 CONTRACTS = "dynslam_bench.contracts"
 GONE_IN = "0.2"
@@ -21,10 +21,10 @@ MOVED: dict[str, tuple[str, ...]] = {
     "dynslam_bench.segmentation.instances": ("dynslam_bench.contracts.segmenter",),
     "dynslam_bench.sequences.datasets": (
         "dynslam_bench.contracts.sequence",
-        "dynslam_bench.sequences.published.datasets",
+        "dynslam_bench.sequences.catalogue",
     ),
     "dynslam_bench.sequences.frame": ("dynslam_bench.contracts.sequence", "dynslam_bench.sequences.view"),
-    "dynslam_bench.slam.result": ("dynslam_bench.contracts.result",),
+    "dynslam_bench.slam.result": ("dynslam_bench.contracts.tracker",),
     "dynslam_bench.trackers.protocol": ("dynslam_bench.contracts.tracker",),
 }
 """Old module: the modules in which its names are now, looked up in this order."""

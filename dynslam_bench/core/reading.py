@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import DynslamError
+from dynslam_bench.core.errors import DynslamError
 
 MEGABYTE = 1 << 20
 RECORD_BYTES = 16 * MEGABYTE

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DynslamError
-from .files import replacing
-from .folders import STAGES_VARIABLE, stage_cache_folder
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import replacing
+from dynslam_bench.core.folders import STAGES_VARIABLE, stage_cache_folder
 
 DEFAULT_MAX_BYTES = 8 * 2**30
 _PRUNE_EVERY = 512

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .errors import DynslamError, SequenceError, SettingsError
-from .reading import read_text
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError
+from dynslam_bench.core.reading import read_text
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .protocol import Protocol
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -10,20 +10,15 @@ from pydantic import field_validator
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.evaluation import prepare as frames
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG, Similarity, align
+from dynslam_bench.evaluation.ape import absolute_errors, named, static_camera
+from dynslam_bench.evaluation.association import Association, match
+from dynslam_bench.evaluation.prepare import apply_policy, compared, truth_of_file
+from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
+from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_file import load_trajectory
-from dynslam_bench.geometry.tum_file import TumFile
-
-from . import frames
-from .alignment import Similarity, align
-from .ape import absolute_errors
-from .association import Association, match
-from .conditioning import RELIABLE_DEG
-from .error_statistics import named
-from .never_move import never_move
-from .prepare import apply_policy, compared, truth_of_file
-from .protocol import Alignment, Protocol, get_protocol
-from .relative import relative_metrics, segment_metrics
+from dynslam_bench.geometry.trajectory_files import TumFile, load_trajectory
 
 SCHEMA_VERSION = 1
 
@@ -308,8 +303,8 @@ def _never_move(
     """What not moving scores under the protocol's alignment, over the input frames where they are known."""
     if input_timestamps is None or protocol.thins:
         selected = ground_truth.select(np.unique(association.ground_truth))
-        errors = never_move(selected)
+        errors = static_camera(selected)
     else:
-        errors = never_move(ground_truth, input_timestamps, protocol.max_dt)
+        errors = static_camera(ground_truth, input_timestamps, protocol.max_dt)
     joined = protocol.alignment in ("none", "origin")
     return errors["first_rmse_m" if joined else "constant_rmse_m"]

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.records import digest
-from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.settings import Reconfigurable, Settings
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.core.steering import Steerable
-
-from .registry import FEATURES
+from dynslam_bench.features.registry import FEATURES
 
 _ROOMS = ("core", "contracts", "features")
 """The rooms whose code decides what an extractor finds."""
@@ -49,7 +47,7 @@ class CachedExtractor:
 
     def configure(self, settings: Settings) -> None:
         """Put other settings into force, the extractor's too."""
-        if isinstance(self._extractor, Steerable):
+        if isinstance(self._extractor, Reconfigurable):
             self._extractor.configure(settings)
         self._address(settings)
 
@@ -84,10 +82,10 @@ class CachedMaskedExtractor(CachedExtractor):
 
     _extractor: MaskedExtractor
 
-    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image beside a mask; see `MaskedExtractor`."""
         inputs = [content_digest(gray), content_digest(mask), share]
-        return self._answer(inputs, lambda: self._extractor.extract_beside(gray, mask, share))
+        return self._answer(inputs, lambda: self._extractor.extract_masked(gray, mask, share))
 
 
 def cached_extractor(

@@ -39,7 +39,7 @@ def empty_result() -> FlowResult:
     return FlowResult(np.empty((0, 2), np.float32), np.empty(0, np.bool_), np.empty(0, np.float32), flow_stats(0))
 
 
-def unseen_result(points: NDArray[np.float32]) -> FlowResult:
+def invalid_result(points: NDArray[np.float32]) -> FlowResult:
     """The result for images that allow no flow: each point stays where it is, or at 0 where it is not finite."""
     n = len(points)
     stats = flow_stats(n, degenerate=True)
@@ -47,7 +47,7 @@ def unseen_result(points: NDArray[np.float32]) -> FlowResult:
     return FlowResult(xy, np.zeros(n, np.bool_), np.ones(n, np.float32), stats)
 
 
-def says_nothing(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bool:
+def is_degenerate(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bool:
     """Whether a pair of images says nothing about motion: equal pixel by pixel, or one of them without texture.
 
     Raises:
@@ -90,7 +90,7 @@ def request(
     points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
     if not len(points):
         return empty_result()
-    if says_nothing(reference, target):
-        return unseen_result(points)
+    if is_degenerate(reference, target):
+        return invalid_result(points)
     usable = usable_points(points, reference.shape)
     return Request(np.where(usable[:, None], points, 0).astype(np.float32), usable)

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
-
-from . import se3
-from .stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,35 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.core.digests import contents_digest
-from dynslam_bench.core.errors import PluginError, RunError, did_you_mean
-from dynslam_bench.core.fingerprint import code_digest, distribution_of_module, named_digests, plugin_digest
-from dynslam_bench.core.machine import this_machine, versions
+from dynslam_bench.core.errors import PluginError, RunError, SettingsError, did_you_mean
+from dynslam_bench.core.fingerprint import (
+    code_digest,
+    contents_digest,
+    distribution_of_module,
+    named_digests,
+    plugin_digest,
+    this_machine,
+    versions,
+)
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
-from dynslam_bench.envs.degrade_frames import Degradation
-from dynslam_bench.envs.device import resolve_device
-from dynslam_bench.envs.source import check_frames, open_frames, preprocessing_of
+from dynslam_bench.envs.arguments import check_frames, open_frames, preprocessing_of, resolve_device
+from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.registry import FEATURES
+from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.registry import FLOWS
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
+from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.build_segmenter import weights_digest
-from dynslam_bench.segmentation.registry import SEGMENTERS
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.part import part_of
-from dynslam_bench.sequences.published.datasets import DATASETS
+from dynslam_bench.sequences.catalogue import DATASETS
+from dynslam_bench.sequences.view import part_of
+from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
+from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
-
-from .spec import MAP_SETTING, RunSpec
-from .start_map import start_map_of
-from .storage.record import IDENTITY_SCHEME, StartMap
 
 _ROOMS = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
@@ -221,3 +228,49 @@ def _check_degradation(strengths: dict[str, float]) -> None:
     if unknown:
         raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], known))
     Degradation(seed=0, **strengths)
+
+
+# The map that a run begins in, looked up before anything runs.
+
+
+def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:
+    """A run began in the map that was looked up for it, and in no other at its path.
+
+    Raises:
+        RunError: The file has changed since.
+        PluginError: It is gone.
+    """
+    if start_map is not None and named_digests(settings)[MAP_SETTING] != start_map.digest:
+        raise RunError(f"the map {start_map.file} has changed since the run was asked for", "the run is not stored")
+
+
+def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:
+    """The map that settings name; None where they name none.
+
+    Args:
+        settings: A tracker's complete settings.
+        camera: Of the sequence, as the tracker sees it.
+        sensors: Of the tracker.
+        digests: Of the files that the settings name, by the setting's name.
+
+    Raises:
+        SettingsError: The tracker has features of its own; the file is no map, or one of another camera, other features
+            or another sensor.
+    """
+    backend, features = getattr(settings, "backend", None), getattr(settings, "features", None)
+    if not isinstance(backend, BackendSettings) or not backend.map.file:
+        return None
+    if not isinstance(features, FeatureSettings):
+        raise SettingsError(f"'{MAP_SETTING}' is set, and the tracker's features are none that maps are made of")
+    path = Path(backend.map.file).expanduser()
+    saved = read_map(path)
+    made_of = MapFeatures(extractor=features.extractor, levels=features.levels, scale_factor=features.scale_factor)
+    saved.check(camera, made_of, sensors, str(path))
+    return StartMap(
+        digest=digests[MAP_SETTING],
+        file=str(path),
+        made_by=saved.header.made_by,
+        keyframes=len(saved.arrays["kf_id"]),
+        points=len(saved.arrays["id"]),
+        localisation_only=backend.map.localisation_only,
+    )

@@ -11,22 +11,24 @@ from typing import IO, Any
 import gymnasium as gym
 import numpy as np
 
-from dynslam_bench.envs.degrade_frames import DegradeFrames
-from dynslam_bench.envs.drop_frames import DropFrames
 from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
 from dynslam_bench.evaluation.masks import compare_masks
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.tum_file import write_tum
-
-from .exchange.recording import RECORDING_FILE, RecordingWriter
-from .frame_row import FRAMES_FILE, FrameRow
-from .kept_map import keep_map
-from .process.failures import at
-from .sheet_collector import SHEET_FILE, SheetWriter
-from .snapshots import SnapshotWriter, taken
-from .spec import RunSpec
-from .truth import aligned_truth
-from .video import VideoWriter
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.runs.artifacts import (
+    SHEET_FILE,
+    SheetWriter,
+    SnapshotWriter,
+    VideoWriter,
+    aligned_truth,
+    keep_map,
+    taken,
+)
+from dynslam_bench.runs.exchange.recording import RECORDING_FILE, RecordingWriter
+from dynslam_bench.runs.frames import FRAMES_FILE, FrameRow
+from dynslam_bench.runs.process.child import at
+from dynslam_bench.runs.spec import RunSpec
 
 Send = Callable[[dict[str, Any]], None]
 

@@ -11,25 +11,19 @@ from typing import Any
 
 from dynslam_bench.contracts.sequence import exact_stamps, timestamps_ns
 from dynslam_bench.core.errors import InfrastructureError, RunError
-from dynslam_bench.core.machine import git_revision, this_machine, versions
+from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.sequences.part import part_of
-
-from .frame_row import FRAMES_FILE
-from .identity import ResolvedRun, resolve
-from .process.child import LOG_FILE
-from .process.handle import start_child
-from .process.job import make_job
-from .process.log_file import LogFile
-from .process.supervise import Verdict, supervise
-from .spec import RunSpec, place_of
-from .start_map import check_unchanged
-from .storage.frames import FrameLog
-from .storage.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
-from .storage.scoring import DEFAULT_PROTOCOL
-from .storage.store import RunStore
+from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
+from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
+from dynslam_bench.runs.process.child import LOG_FILE
+from dynslam_bench.runs.process.fork_server import make_job, start_child
+from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
+from dynslam_bench.runs.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
+from dynslam_bench.runs.spec import RunSpec, place_of
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
+from dynslam_bench.sequences.view import part_of
 
 WORK = "dynslam_bench.runs.loop:run_loop"
 """What the child does."""

@@ -8,12 +8,10 @@ from pathlib import Path
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.settings import Settings
-
-from .build_segmenter import build_oracle, resolve_source
-from .masks.recorded import RecordedSegmenter
-from .networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
-from .registry import SEGMENTERS, SegmenterContext
-from .settings import SegmentationSettings
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, SegmenterContext, build_oracle, resolve_source
+from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
+from dynslam_bench.segmentation.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
 def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool = True) -> str:
@@ -77,10 +75,10 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
 def _check_network(kind: str, path: Path, settings: SegmentationSettings, stamp: tuple[int, int] | None) -> None:
     """Load it once in a process, as long as size and time of the file stay."""
     if kind == "onnx":
-        from .networks.onnx.segmenter import OnnxSegmenter
+        from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
 
         OnnxSegmenter(path, settings)
     else:
-        from .networks.mask_rcnn.loading import load_network
+        from dynslam_bench.segmentation.networks.loading import load_network
 
         load_network(path)

@@ -1,20 +1,50 @@
-"""Choose and construct the segmenter that the settings ask for."""
+"""All segmenters by id: built in, from entry points ``dynslam_bench.segmenters``, from the environment variable."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from dynslam_bench.contracts.segmenter import Instances, Segmenter
+from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
 from dynslam_bench.contracts.sequence import Frame, MaskSource
-from dynslam_bench.core.digests import path_digest
 from dynslam_bench.core.errors import DynslamError, SegmentationError
-from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.fingerprint import path_digest
+from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.segmentation.networks.checkpoints import (
+    COCO,
+    Checkpoint,
+    cached_checkpoint,
+    embedded_weights,
+    fetch_checkpoint,
+)
+from dynslam_bench.segmentation.postprocess import select
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .masks.postprocess import select
-from .networks.checkpoints import COCO, Checkpoint, cached_checkpoint, embedded_weights, fetch_checkpoint
-from .registry import SEGMENTERS, SegmenterContext
-from .settings import SegmentationSettings
+__all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
+
+
+def _builtin() -> Iterable[SegmenterSpec]:
+    here = "dynslam_bench.segmentation.build_segmenter"
+    mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
+    return (
+        SegmenterSpec("oracle", f"{here}:build_oracle", "exact masks of rendered sequences"),
+        SegmenterSpec("oracle-classes", f"{here}:build_oracle",
+                      "exact masks of rendered sequences, by class alone: a perfect network"),
+        SegmenterSpec("recorded", f"{here}:build_recorded", "PNG masks from a folder (recorded:DIR)"),
+        SegmenterSpec("onnx", f"{here}:build_onnx", "YOLO-seg, semantic or torchvision networks (onnx:PATH)"),
+        SegmenterSpec("embedded", f"{here}:build_embedded", "small CFPN Mask R-CNN trained on rendered sequences",
+                      "MIT", mask_rcnn),
+        SegmenterSpec("coco", f"{here}:build_coco", "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights",
+                      "BSD-3-Clause (weights)", mask_rcnn),
+        SegmenterSpec("weights", f"{here}:build_weights", "Mask R-CNN with weights of your own (weights:PATH)",
+                      "", mask_rcnn),
+    )  # fmt: skip
+
+
+SEGMENTERS: Registry[SegmenterSpec] = Registry("segmenters", SegmenterSpec, _builtin)
+
+
+# Choose and construct the segmenter that the settings ask for.
 
 SYNTHETIC = "synthetic/"
 LOWEST_CONFIDENCE = 0.1
@@ -219,7 +249,7 @@ def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> S
     Raises:
         SegmentationError: The sequence has no exact masks.
     """
-    from .masks.oracle import OracleSegmenter
+    from dynslam_bench.segmentation.recorded import OracleSegmenter
 
     if context.masks is None:
         raise SegmentationError(
@@ -231,14 +261,14 @@ def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> S
 
 def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
     """Masks from a folder."""
-    from .masks.recorded import RecordedSegmenter
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
     return RecordedSegmenter(Path(context.argument))
 
 
 def build_onnx(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
     """A network from an ONNX file."""
-    from .networks.onnx.segmenter import OnnxSegmenter
+    from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
 
     return OnnxSegmenter(Path(context.argument), settings, threads=context.threads, floor=context.floor)
 
@@ -266,7 +296,7 @@ def build_weights(settings: SegmentationSettings, context: SegmenterContext) -> 
 
 
 def _mask_rcnn(path: Path, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    from .networks.mask_rcnn.segmenter import MaskRCNNSegmenter
+    from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
 
     return MaskRCNNSegmenter.from_file(
         path, settings, device=context.device, threads=context.threads, floor=context.floor

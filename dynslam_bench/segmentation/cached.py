@@ -12,10 +12,14 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.stage_cache import Arrays, StageCache
-
-from .build_segmenter import LOWEST_CONFIDENCE, ConfiguredSegmenter, DeferredSegmenter, weights_digest
-from .masks.schedule import MaskScheduler
-from .registry import SEGMENTERS
+from dynslam_bench.segmentation.build_segmenter import (
+    LOWEST_CONFIDENCE,
+    SEGMENTERS,
+    ConfiguredSegmenter,
+    DeferredSegmenter,
+    weights_digest,
+)
+from dynslam_bench.segmentation.schedule import MaskScheduler
 
 NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
 """Sources whose masks depend on the colour image alone."""

@@ -24,9 +24,7 @@ from scipy.stats import t as student
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
-
-from .continuous_time import LEAST_POINTS, Unusable, Window
-from .keypoint_tracks import corners, track
+from dynslam_bench.sequences.continuous_time import LEAST_POINTS, Unusable, Window, corners, track
 
 Array = NDArray[np.float64]
 

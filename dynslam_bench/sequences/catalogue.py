@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
+from collections.abc import Iterator
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts.sequence import DatasetSpec, Sequence
 from dynslam_bench.core.code_files import leads_back
-from dynslam_bench.core.digests import is_settled
 from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.core.fingerprint import is_settled
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
-from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.geometry.camera import Camera
-
-from .published.cameras import MARKER_TO_CAMERA, chosen_camera, find_camera
-from .published.datasets import DATASETS
-from .published.entries import CatalogueEntry, by_folder, catalogue, entry_of, public_datasets
-from .settings import PreprocessingSettings
-from .synthetic import open_synthetic
-from .view import SequenceView
+from dynslam_bench.sequences.cameras import MARKER_TO_CAMERA, chosen_camera, find_camera
+from dynslam_bench.sequences.published.entries import CatalogueEntry, by_folder, catalogue, entry_of, public_datasets
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
+from dynslam_bench.sequences.view import SequenceView
 
 __all__ = [
     "CatalogueEntry",
@@ -76,7 +78,7 @@ def open_sequence(
     root = find_data_root(data_root)
     sequence = _open_whole(str(name), root, camera, settings)
     if settings.changes_images:
-        from .preprocessing import Preprocessed
+        from dynslam_bench.sequences.preprocessing import Preprocessed
 
         sequence = cast("Sequence", Preprocessed(sequence, settings))
     return _part(sequence, frames, stride)
@@ -158,8 +160,8 @@ def _open_folder(
     chosen: tuple[Camera, float | None] | None,
     settings: PreprocessingSettings,
 ) -> Sequence:
-    from .readers.layouts import find_layout, layout_of
-    from .readers.recorded import Description, RecordedSequence
+    from dynslam_bench.sequences.readers.layouts import find_layout, layout_of
+    from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
 
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
     stated = None if chosen is None else chosen[1]
@@ -202,7 +204,7 @@ def _state_of(folder: Path) -> list[tuple[str, int, int, int, int]]:
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
-    from .readers.layouts import is_bag
+    from dynslam_bench.sequences.readers.layouts import is_bag
 
     path = Path(name).expanduser()
     entry = None if _is_path(name) else entry_of(name)
@@ -268,3 +270,157 @@ def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int 
     if start < 0 or (stop is not None and stop <= start):
         raise SequenceError(f"frames {start}:{'' if stop is None else stop} is no range of frames", "0 <= A < B")
     return start, stop
+
+
+# Data sets as plug-ins: each serves the sequences below one prefix, ``tum/...`` for example.
+
+__all__ = ["DATASETS", "DatasetSpec"]
+
+OPENERS = "dynslam_bench.sequences.catalogue"
+"""The module that opens sequences of the built-in data sets; loaded when the first one is opened."""
+
+
+def _builtin() -> Iterator[DatasetSpec]:
+    """The data sets that come with the package."""
+    for name, first in public_datasets().items():
+        ids = tuple(entry.id for entry in catalogue().values() if entry.dataset == name)
+        yield DatasetSpec(name, f"{OPENERS}:open_public", ids, first.title, first.license, first.citation)
+    summary = "rendered rooms with exact poses, masks and flow"
+    yield DatasetSpec("synthetic", f"{OPENERS}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
+
+
+DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
+
+
+# Sequences described for people: lists, and everything known of one.
+
+KNOWN = "known: another archive is refused"
+FIRST_USE = "not published: the first fetch takes it, every later one has to bring the same"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One line of the list of sequences.
+
+    Attributes:
+        id: Its id.
+        here: Whether it is on this machine; rendered ones are always.
+        size: Size of the archive, for people.
+        tags: For example ``high-dynamic``.
+        split: ``tune``, ``held-out`` or empty.
+        ground_truth: Whether the ground truth is public.
+        license: Licence of the data.
+        url: Where the archive lies.
+        dataset: Name of the data set.
+        layout: How its files were known when the reader was written: ``verified``, ``not verified`` on the publisher's
+            files, or empty where there are none.
+        by_hand: Why this program cannot fetch it; empty where it can.
+        checksum: Whether its checksum is known before it is fetched; None for what is rendered.
+    """
+
+    id: str
+    here: bool
+    size: str = ""
+    tags: tuple[str, ...] = ()
+    split: str = ""
+    ground_truth: bool = True
+    license: str = ""
+    url: str = ""
+    dataset: str = ""
+    layout: str = ""
+    by_hand: str = ""
+    checksum: bool | None = None
+
+
+def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
+    """All listed sequences.
+
+    Args:
+        data_root: Folder of the sequences.
+    """
+    root, entries, found = find_data_root(data_root), catalogue(), []
+    for dataset in DATASETS.all():
+        for name in dataset.spec.sequences:
+            entry = entries.get(name)
+            if entry is None:
+                rendered = dataset.spec.id == "synthetic"
+                tags = parse_synthetic_id(name).tags if rendered else ()
+                split = parse_synthetic_id(name).split if rendered else ""
+                size = "rendered" if rendered else ""
+                title, licence = dataset.spec.summary or dataset.spec.id, dataset.spec.license
+                found.append(Summary(name, True, size, tags, split, license=licence, dataset=title))
+                continue
+            layout = "verified" if entry.verified else "not verified"
+            found.append(
+                Summary(
+                    name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
+                    entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
+                )
+            )  # fmt: skip
+    return found
+
+
+def describe(name: str, *, data_root: str | Path | None = None, camera: str | Path | None = None) -> dict[str, Any]:
+    """Everything known of a sequence: the catalogue's entry, and what it holds if it is here.
+
+    Args:
+        name: Id, published folder name or path.
+        data_root: Folder of the sequences.
+        camera: In place of what the catalogue or the folder says.
+
+    Raises:
+        SequenceError: Unknown name, or it is here but damaged.
+    """
+    root, entry = find_data_root(data_root), entry_of(name)
+    facts: dict[str, Any] = {}
+    if entry is not None:
+        facts = {
+            "id": entry.id, "alias": entry.folder, "url": entry.url, "page": entry.page, "size": entry.size_text(),
+            "size_bytes": entry.size_bytes, "sha256": entry.sha256, "license": entry.license,
+            "checksum": KNOWN if entry.sha256 else FIRST_USE,
+            "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
+            "ground_truth": "public" if entry.ground_truth else "not public",
+            "camera": repr(entry.intrinsics() or "as its files or its layout state"),
+            "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
+            "remark": entry.remark,
+        }  # fmt: skip
+        if entry.find(root) is None:
+            return facts | {"here": False, "fetch": entry.how_to_get()}
+    sequence = open_sequence(name, data_root=data_root, camera=camera)
+    truth = sequence.ground_truth
+    dropped, folder = getattr(sequence, "dropped", None), getattr(sequence, "folder", None)
+    stamps = sequence.timestamps
+    return facts | {
+        "id": sequence.id,
+        "here": True,
+        "folder": None if folder is None else str(folder),
+        "frames": len(sequence),
+        "duration_s": round(float(stamps[-1] - stamps[0]), 3),
+        "fps": round(sequence.fps, 3),
+        "camera": repr(sequence.camera),
+        "ground_truth_poses": 0 if truth is None else len(truth),
+        "path_length_m": None if truth is None else round(truth.path_length_m, 3),
+        "masks": "exact" if sequence.masks is not None else "none",
+        "license": sequence.license,
+        "citation": sequence.citation,
+        "association": None if dropped is None else dropped.describe(),
+        "digest": sequence.digest(),
+    }
+
+
+def expand(names: PySequence[str]) -> list[str]:
+    """Ids that match patterns such as ``bonn/*``; everything else stays as it is.
+
+    Raises:
+        SequenceError: A pattern matches nothing.
+    """
+    expanded: list[str] = []
+    for name in names:
+        if any(character in name for character in "*[") and not Path(name).exists():
+            matching = fnmatch.filter(catalogue(), name)
+            if not matching:
+                raise SequenceError(f"no public sequence matches '{name}'", "see: dynslam-bench sequences list")
+            expanded += matching
+        else:
+            expanded.append(name)
+    return list(dict.fromkeys(expanded))

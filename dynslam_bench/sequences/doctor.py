@@ -11,11 +11,9 @@ import numpy as np
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
 from dynslam_bench.geometry.camera import Camera
-
-from .finding import Finding
-from .rgbd_motion import RgbdPair, rgbd_pairs
-from .stream_checks import Streams, stream_findings
-from .truth_checks import RESAVE, truth_findings
+from dynslam_bench.sequences.rgbd_motion import RgbdPair, rgbd_pairs
+from dynslam_bench.sequences.stream_checks import Finding, Streams, stream_findings
+from dynslam_bench.sequences.truth_checks import RESAVE, truth_findings
 
 MOST_FRAMES = 240
 FEWEST = 10
@@ -73,7 +71,7 @@ def diagnose(
         most_frames: Frames that are read at most, in stretches spread over the recording.
         progress: Called with the frames done and the frames to do.
     """
-    from .catalogue import open_sequence
+    from dynslam_bench.sequences.catalogue import open_sequence
 
     try:
         sequence = open_sequence(name, data_root=data_root, camera=camera)
@@ -145,8 +143,8 @@ def _unopened(
     name: str | Path, data_root: str | Path | None, camera: str | Path | Camera | None, error: Exception
 ) -> Finding:
     """Why a recording cannot be opened: depth of another size is a fault of its own, the rest is said as it is."""
-    from .catalogue import open_sequence
-    from .settings import PreprocessingSettings
+    from dynslam_bench.sequences.catalogue import open_sequence
+    from dynslam_bench.sequences.settings import PreprocessingSettings
 
     any_size = PreprocessingSettings(width=64, height=48)
     try:

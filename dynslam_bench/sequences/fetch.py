@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,16 +14,15 @@ from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha25
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.harmless import inside, is_inside
-from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.passwords import without_passwords
+from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.core.records import Record, schema
-
-from . import first_use
-from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
-from .published.archives import extract
-from .published.cameras import find_camera
-from .readers.diagnostics import Dropped
-from .readers.layouts import TUM, find_layout, layout_of
+from dynslam_bench.core.sanitise import inside, is_inside
+from dynslam_bench.sequences.archives import extract
+from dynslam_bench.sequences.cameras import find_camera
+from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
+from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
+from dynslam_bench.sequences.readers.lists import Dropped
 
 RECEIPT = "fetched.json"
 MANIFEST = "manifest.sha256"
@@ -160,10 +160,10 @@ def fetch(
     parts = _downloaded(entry, (url or entry.url, *entry.more_urls), root, checksum, how)
     unstated = [part for part in parts if part is not parts[0] or entry.sha256 is None]
     for part in unstated if checksum else ():
-        first_use.compare(root, part.address, part.archive, part.sha256)
+        compare(root, part.address, part.archive, part.sha256)
     _take(found, parts, checksum and entry.sha256 is not None, progress)
     for part in unstated:
-        first_use.remember(root, part.address, part.sha256)
+        remember(root, part.address, part.sha256)
     for part in () if keep_archive else parts:
         part.archive.unlink(missing_ok=True)
     return found.place
@@ -336,3 +336,44 @@ def _known(name: str) -> CatalogueEntry:
             raise SequenceError(f"'{name}' needs no fetching", "rendered sequences appear when they are first read")
         raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, catalogue()))
     return entry
+
+
+# Checksums that no publisher states: taken when an archive first came to a data root, compared ever after.
+
+
+def compare(root: Path, address: str, archive: Path, sha256: str) -> None:
+    """Refuse an archive that is not what its address gave before; it is deleted then.
+
+    Args:
+        root: The data root.
+        address: Where the archive came from.
+        archive: The archive.
+        sha256: Its checksum.
+
+    Raises:
+        SequenceError: It is another one.
+    """
+    path = _file(root, address)
+    if not path.is_file():
+        return
+    first = read_text(path, kind=SequenceError).split()[0:1]
+    if first != [sha256]:
+        archive.unlink(missing_ok=True)  # the next call fetches it anew
+        raise SequenceError(
+            f"{without_passwords(address)} has the checksum {sha256}, but gave {first[0] if first else 'none'} before",
+            f"somebody has changed it; --no-checksum takes it all the same, and {path} says what came first",
+        )
+
+
+def remember(root: Path, address: str, sha256: str) -> None:
+    """Keep the checksum of an archive whose sequence could be opened.
+
+    Raises:
+        DynslamError: It cannot be written.
+    """
+    write_atomic(_file(root, address), f"{sha256}  {without_passwords(address)}\n")
+
+
+def _file(root: Path, address: str) -> Path:
+    """One file an address, so that several processes may fetch at a time."""
+    return root / ".downloads" / f"{hashlib.sha256(without_passwords(address).encode()).hexdigest()[:16]}.sha256"

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
-
-from .settings import PreprocessingSettings
+from dynslam_bench.sequences.settings import PreprocessingSettings
 
 Image = NDArray[np.integer | np.floating]
 

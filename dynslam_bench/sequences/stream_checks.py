@@ -1,13 +1,9 @@
-"""Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
-
-Contours of depth are contours in the colour image, too, at the same place and time. Their correlation over shifts,
-mirrorings and delays says whether the depth is registered, which way up the images are, and whether the two streams
-are synchronous.
-"""
+"""What a check of a recording found."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,7 +11,29 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame
 
-from .finding import Finding
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check of a recording found.
+
+    Attributes:
+        id: Stable name, for example ``truth-time-shift``.
+        severity: ``fault``: results on the recording are wrong until it is mended; ``note``: good to know.
+        value: The measured number; None where nothing is measured.
+        unit: Its unit, for example ``s``; empty for a ratio or where nothing is measured.
+        text: One line that says what was measured.
+        cure: What to change, and in which file.
+    """
+
+    id: str
+    severity: Literal["fault", "note"]
+    value: float | None
+    unit: str
+    text: str
+    cure: str
+
+
+# Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
 
 Map = NDArray[np.float32]
 

@@ -1,4 +1,4 @@
-"""Loop closing, the last row of the paper's Figure 2: recognise a place, verify it, correct the map, fuse it.
+"""Loop closing, the last row of the paper's Figure 2: verify_place a place, verify it, correct the map, fuse it.
 
 1. *Detect*: keyframes that share few points with the newest one, and are old, are ranked by how much they look like
    it (`places`: nothing is trained or downloaded). Those that do so no less than its neighbours do, the best few of
@@ -16,29 +16,34 @@ Lengths are metres; without depth they are in units of the first map's median de
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
-
-from .bundle.pose_graph import Edge, inherited, optimise_poses, rescaled, spread_scale, within
-from .corrections import Correction, Loop
-from .localisation.first_pose import FirstPose
-from .localisation.lookalikes import Sight, ambiguous
-from .localisation.observation import Observations
-from .localisation.recognition import Recognised, around, imprecision, points_around, recognise
-from .localisation.relocalisation import match_keyframe, ransac_pose
-from .localisation.surroundings import not_held
-from .localisation.tracking import Matches
-from .mapping.islands import Islands
-from .mapping.local_mapping import LocalMapper
-from .mapping.map import Map
-from .mapping.map_kernels import distinct
-from .places import likeness
-from .settings import BackendSettings
+from dynslam_bench.slam.atlas import Atlas
+from dynslam_bench.slam.local_mapping import LocalMapper
+from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map_kernels import distinct
+from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.place_recognition import (
+    PlaceHypothesis,
+    PlaceMatch,
+    ambiguous,
+    around,
+    match_keyframe,
+    points_around,
+    pose_uncertainty,
+    ransac_pose,
+    recognition_scores,
+    verify_place,
+)
+from dynslam_bench.slam.pose_graph import Edge, inherited, optimise_poses, rescaled, spread_scale, within
+from dynslam_bench.slam.relocalisation import InitialPose
+from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.tracking import Matches, weakly_connected
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
@@ -60,7 +65,7 @@ MOST_SCALE = 3.0
 FIRM = 100.0
 """Weight of a loop's tie, where neighbours' ties weigh 1: what it leaves open between two visits bends both."""
 PATIENCE = 5
-"""Frames after which a camera leaves an island for the first map, if that could not be joined by then."""
+"""Frames after which a camera leaves an submap for the first map, if that could not be joined by then."""
 FIRMLY = 0.4
 """So imprecise, at most, is a pose by which maps are joined (`localisation.recognition`)."""
 SCALE_POINTS = 20
@@ -73,7 +78,7 @@ class LoopCloser:
     Args:
         world: The map.
         mapper: Fuses and adjusts.
-        islands: Where parts of the map may lie that are connected with the first one by nothing.
+        submaps: Where parts of the map may lie that are connected with the first one by nothing.
         settings: Of the back end.
         seed: Founds RANSAC's draws.
         scale_is_known: Whether lengths are metres everywhere, as with depth.
@@ -83,7 +88,7 @@ class LoopCloser:
         self,
         world: Map,
         mapper: LocalMapper,
-        islands: Islands,
+        submaps: Atlas,
         settings: BackendSettings,
         seed: int,
         *,
@@ -91,15 +96,15 @@ class LoopCloser:
     ) -> None:
         self.world = world
         self.mapper = mapper
-        self.islands = islands
+        self.submaps = submaps
         self.settings = settings
         self.closed: list[Loop] = []
         """All loops that were closed."""
         self.rescaled: dict[int, float] = {}
         """By what the last call of `close` rescaled the surroundings of keyframes, by their slots; with depth by 1, and
         of those alone that it moved to another map."""
-        self.at_home = self.leaves = False
-        """Whether an island's camera was in the first map by the last call of `close`, and is to go on there."""
+        self.in_root_map = self.leaves = False
+        """Whether an submap's camera was in the first map by the last call of `close`, and is to go on there."""
         self._seed = seed
         self._scale_is_known = scale_is_known
         self._way: dict[int, float] = {}
@@ -110,24 +115,24 @@ class LoopCloser:
         self._met: int | None = None
         self._ties: list[Edge] = []
 
-    def close(self, slot: int, seen: Observations, home: FirstPose | None = None) -> bool:
+    def close(self, slot: int, seen: Observations, home: InitialPose | None = None) -> bool:
         """Look for a loop at a new keyframe; correct and fuse the map if enough keyframes in a row agree on one.
 
         Args:
             slot: The keyframe.
             seen: Its features.
-            home: Its pose in the first map, if the camera is on an island and was found there.
+            home: Its pose in the first map, if the camera is on an submap and was found there.
 
         Returns:
             Whether a loop was closed; every pose and point may have changed then.
         """
-        self.rescaled, self.at_home, self.leaves = {}, False, False
+        self.rescaled, self.in_root_map, self.leaves = {}, False, False
         self._note_way(slot)
         for dropped, heir, relative in self.mapper.dropped if self._ties else ():
             gone, stands = (int(self.world.kf_id[each]) for each in (dropped, heir))
             self._ties = inherited(self._ties, gone, stands, relative)
-        loop = self._verified(slot, seen) if home is None else self._at_home(slot, seen, home)
-        self._met = self._met if self.at_home else None
+        loop = self._verified(slot, seen) if home is None else self._in_root_map(slot, seen, home)
+        self._met = self._met if self.in_root_map else None
         if loop is None:
             self._row.clear()
             return False
@@ -140,7 +145,7 @@ class LoopCloser:
         loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
         self._row.clear()
         if not loop.fits:
-            self.leaves = self.at_home = home is not None
+            self.leaves = self.in_root_map = home is not None
             return False
         if loop.joins and home is None and self._ambiguous(slot, seen, loop):
             return False
@@ -158,7 +163,7 @@ class LoopCloser:
 
     def _note_way(self, slot: int) -> None:
         pose, number = self.world.kf_pose[slot].copy(), int(self.world.kf_id[slot])
-        for begun in range(next(reversed(self._way), number - 1) + 1, number):  # the first two views of an island
+        for begun in range(next(reversed(self._way), number - 1) + 1, number):  # the first two views of an submap
             self._way[begun] = self._walked
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
@@ -169,8 +174,8 @@ class LoopCloser:
 
     def _verified(self, slot: int, seen: Observations) -> Loop | None:
         s = self.settings.loop_closing
-        elsewhere = not_held(self.world, slot, s.away)
-        there, here = self.world.kf_island[elsewhere], self.world.kf_island[slot]
+        elsewhere = weakly_connected(self.world, slot, s.away)
+        there, here = self.world.kf_map[elsewhere], self.world.kf_map[slot]
         elsewhere = elsewhere[(there == here) | (there == 0) | (here == 0)]
         if not len(elsewhere):
             return None
@@ -186,7 +191,7 @@ class LoopCloser:
 
     def _as_alike_as_neighbours(self, slot: int, elsewhere: Slots, seen: Observations) -> list[int]:
         near = np.setdiff1d(around(self.world, slot)[1:], elsewhere)  # what is to be recognised is no measure of it
-        score = likeness(self.world, np.concatenate([near, elsewhere]), seen)
+        score = recognition_scores(self.world, np.concatenate([near, elsewhere]), seen)
         least = score[: len(near)].min(initial=np.inf)
         there = score[len(near) :]
         best = np.argsort(-there, kind="stable")[: self.settings.loop_closing.candidates]
@@ -203,29 +208,29 @@ class LoopCloser:
         if found is None or np.count_nonzero(found[1]) < s.min_matches // 2:
             return None
         pose, inliers = found
-        place = recognise(world, candidate, seen, matches.select(inliers), pose, self.settings.tracking)
+        place = verify_place(world, candidate, seen, matches.select(inliers), pose, self.settings.tracking)
         if len(place.matches) < s.min_inliers or place.share < s.min_share:
             return None
         loop = self._loop(slot, candidate, place)
-        if loop is None or (loop.joins and imprecision(world, seen, place, rng) > FIRMLY):
+        if loop is None or (loop.joins and pose_uncertainty(world, seen, place, rng) > FIRMLY):
             return None
         return loop if self._believable(slot, loop) else None
 
-    def _at_home(self, slot: int, seen: Observations, home: FirstPose) -> Loop | None:
-        """The place in the first map where an island's camera was found, if it tells well enough how the two lie."""
+    def _in_root_map(self, slot: int, seen: Observations, home: InitialPose) -> Loop | None:
+        """The place in the first map where an submap's camera was found, if it tells well enough how the two lie."""
         s, world, frame = self.settings.loop_closing, self.world, int(self.world.kf_frame[slot])
-        loop = self._loop(slot, home.keyframe, Recognised(home.T_cam_world, home.matches, home.share))
+        loop = self._loop(slot, home.keyframe, PlaceMatch(home.T_cam_world, home.matches, home.share))
         if loop is None or not world.kf_alive[home.keyframe]:
             return None
         if (loop.fits or self._scale_is_known) and self._ambiguous(slot, seen, loop):
             return None
-        well = loop.inliers >= s.min_inliers and loop.share >= s.join_share and home.imprecision <= FIRMLY
-        self.at_home = loop.fits
+        well = loop.inliers >= s.min_inliers and loop.share >= s.merge_share and home.pose_uncertainty <= FIRMLY
+        self.in_root_map = loop.fits
         self._met = frame if self._met is None else self._met
-        self.leaves = self.at_home and not well and frame - self._met >= PATIENCE
+        self.leaves = self.in_root_map and not well and frame - self._met >= PATIENCE
         return loop if well else None
 
-    def _loop(self, slot: int, candidate: int, place: Recognised) -> Loop | None:
+    def _loop(self, slot: int, candidate: int, place: PlaceMatch) -> Loop | None:
         """What a place asks for; None where too little tells the scale."""
         world = self.world
         scale = 1.0 if self._scale_is_known else self._scale(slot, place)
@@ -234,11 +239,11 @@ class LoopCloser:
         T_cam_world = place.T_cam_world
         moved = float(np.linalg.norm(se3.inverse(T_cam_world)[:3, 3] - world.kf_centre[slot]))
         turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
-        back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
+        back, joins = int(world.kf_frame[candidate]), bool(world.kf_map[candidate] != world.kf_map[slot])
         loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned, scale)
         return replace(loop, fits=self._fits(slot, loop)) if joins else loop
 
-    def _scale(self, slot: int, place: Recognised) -> float | None:
+    def _scale(self, slot: int, place: PlaceMatch) -> float | None:
         """How many times as deep points lie by the first visit as by this one; None where too few tell."""
         world, theirs = self.world, place.matches
         own = world.kf_point[slot, theirs.feature].astype(np.int64)
@@ -251,33 +256,33 @@ class LoopCloser:
         return float(np.exp(np.median(np.log(then[ahead] / now[ahead])))) if ahead.sum() >= SCALE_POINTS else None
 
     def _believable(self, slot: int, loop: Loop) -> bool:
-        """Whether drift explains the correction; where islands meet, whether the camera can have got from one there."""
+        """Whether drift explains the correction; where submaps meet, whether the camera can have got from one there."""
         s = self.settings.loop_closing
-        if loop.joins and (loop.inliers < s.join_inliers or loop.share < s.join_share):
+        if loop.joins and (loop.inliers < s.merge_inliers or loop.share < s.merge_share):
             return False
         if loop.joins:
-            here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
-            return loop.fits and bool(np.radians(loop.turned_deg) <= self.islands.slack(here, there))
+            here, there = (int(self.world.kf_map[each]) for each in (slot, loop.keyframe))
+            return loop.fits and bool(np.radians(loop.turned_deg) <= self.submaps.slack(here, there))
         way = self._way_to(loop.keyframe)
         if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
             return False
         return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
 
     def _fits(self, slot: int, loop: Loop) -> bool:
-        """Whether the younger of two islands can have begun where the older one would have it."""
+        """Whether the younger of two submaps can have begun where the older one would have it."""
         younger, _, move = self._moves(slot, loop)
         share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
-        return self.islands.may_lie(younger, move.moved, share * self._way_around(slot, loop))
+        return self.submaps.admits_start(younger, move.moved, share * self._way_around(slot, loop))
 
     def _ambiguous(self, slot: int, seen: Observations, loop: Loop) -> bool:
-        """Whether the keyframe looks like two places: nothing but what is seen tells how islands lie together."""
+        """Whether the keyframe looks like two places: nothing but what is seen tells how submaps lie together."""
         world = self.world
-        here, there = (int(world.kf_island[each]) for each in (slot, loop.keyframe))
+        here, there = (int(world.kf_map[each]) for each in (slot, loop.keyframe))
         own = world.kf_point[slot, world.kf_point[slot] >= 0]
         depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[own])[:, 2]))
-        known = {here: Sight(world.kf_pose[slot], loop.share, depth)}
-        known[there] = Sight(loop.T_cam_world, loop.share, depth * loop.scale)
-        elsewhere = not_held(world, slot, self.settings.loop_closing.away)
+        known = {here: PlaceHypothesis(world.kf_pose[slot], loop.share, depth)}
+        known[there] = PlaceHypothesis(loop.T_cam_world, loop.share, depth * loop.scale)
+        elsewhere = weakly_connected(world, slot, self.settings.loop_closing.away)
         return ambiguous(world, seen, known, elsewhere, self.settings, self._seed)
 
     def _way_to(self, slot: int) -> float:
@@ -287,10 +292,10 @@ class LoopCloser:
         return min(way, float(np.sqrt(STRETCH * way)))
 
     def _way_around(self, slot: int, loop: Loop) -> float:
-        """The way from where one island meets another back to where it left it, in the older one's unit of length."""
+        """The way from where one submap meets another back to where it left it, in the older one's unit of length."""
         younger, _, move = self._moves(slot, loop)
-        left = self._way_at(int(self.world.island(younger)[0]))
-        ends = (slot, loop.keyframe) if self.world.kf_island[slot] == younger else (loop.keyframe, slot)
+        left = self._way_at(int(self.world.submap(younger)[0]))
+        ends = (slot, loop.keyframe) if self.world.kf_map[slot] == younger else (loop.keyframe, slot)
         on_younger, on_older = (abs(self._way_at(each) - left) for each in ends)
         return move.scale * on_younger + on_older
 
@@ -309,7 +314,7 @@ class LoopCloser:
         small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG
         if small and abs(np.log(loop.scale)) < NEGLIGIBLE_SCALE:
             return
-        slots = world.island(int(world.kf_island[slot]))
+        slots = world.submap(int(world.kf_map[slot]))
         before, ids = world.kf_pose.copy(), world.kf_id[slots]
         edges, scales = self._edges(slots), np.ones(world.kf_alive.size)
         if not self._scale_is_known:
@@ -319,7 +324,7 @@ class LoopCloser:
         after = optimise_poses(ids, before[slots], [*edges, *within(ids, self._ties)])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
-        self.islands.carried(int(world.kf_island[slot]), before[slots], after, scales[slots])
+        self.submaps.carried(int(world.kf_map[slot]), before[slots], after, scales[slots])
         points = distinct(world.kf_point[slots], world.alive.size)
         reference = world.obs_kf[world.obs_at[points]]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
@@ -329,17 +334,17 @@ class LoopCloser:
         world.refresh(points)
 
     def _moves(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
-        """The younger of two islands that meet, the older one, and how the younger is to be moved."""
-        here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
+        """The younger of two submaps that meet, the older one, and how the younger is to be moved."""
+        here, there = (int(self.world.kf_map[each]) for each in (slot, loop.keyframe))
         move = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
         return (here, there, move) if here > there else (there, here, move.inverse)
 
     def _join(self, slot: int, loop: Loop) -> None:
-        """Move the younger of two islands as a whole to where the older one has the place."""
+        """Move the younger of two submaps as a whole to where the older one has the place."""
         world = self.world
         younger, older, move = self._moves(slot, loop)
-        slots = world.island(younger)
-        world.move_island(younger, move.T_now_before, older, move.scale)
+        slots = world.submap(younger)
+        world.move_submap(younger, move.T_now_before, older, move.scale)
         self._note_scales(slots, np.full(len(slots), move.scale))
         self._ties.append(replace(self._edge(loop.keyframe, slot, world.kf_pose[slot]), weight=FIRM))
 
@@ -373,3 +378,78 @@ class LoopCloser:
         self.world.refresh(theirs[self.world.alive[theirs]])
         if self.settings.bundle_adjustment.enabled:
             self.mapper.adjust(slot)
+
+
+# What a keyframe that sees a place again asks for: to be elsewhere, and without depth of another size.
+
+
+AGREE_M, AGREE_DEG, AGREE_SCALE = 0.1, 2.0, 0.1
+"""So far the corrections of keyframes in a row may differ; of a scale, its logarithm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What a keyframe asks for.
+
+    Attributes:
+        T_cam_before: Its pose ``[4, 4]`` as the map has it, world to camera.
+        T_cam_now: Its pose by the place that it sees again.
+        scale: What lengths around it are to be multiplied by.
+    """
+
+    T_cam_before: Array
+    T_cam_now: Array
+    scale: float
+
+    @property
+    def T_now_before(self) -> Array:
+        """From the keyframe's world, once its lengths are multiplied, to that of the place, ``[4, 4]``."""
+        before = self.T_cam_before.copy()
+        before[:3, 3] *= self.scale
+        return se3.inverse(self.T_cam_now) @ before
+
+    @property
+    def inverse(self) -> Correction:
+        """What the place asks for where it is the keyframe that stays."""
+        return Correction(self.T_cam_now, self.T_cam_before, 1 / self.scale)
+
+    def moved(self, at: Array) -> Array:
+        """Where a place ``[3]`` near the keyframe belongs, ``[3]``."""
+        local = self.scale * se3.transform(self.T_cam_before, at[None])
+        return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])
+
+    def agrees(self, other: Correction, at: Array) -> bool:
+        """Whether another correction moves a place nearly as this one does."""
+        apart = np.linalg.norm(self.moved(at) - other.moved(at))
+        turned = se3.rotation_angle(self.T_now_before @ se3.inverse(other.T_now_before))
+        scaled = abs(np.log(self.scale / other.scale))
+        return bool(apart < AGREE_M and np.degrees(turned) < AGREE_DEG and scaled < AGREE_SCALE)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A place that was recognised.
+
+    Attributes:
+        keyframe: Slot, at that time, of the keyframe that was seen again.
+        frame: Index of that keyframe's frame.
+        T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
+        inliers: Points that fit it.
+        share: How many of the keyframe's own points in view are among them, of one.
+        joins: Whether the place lies on another submap of the map.
+        moved_m: How far the newest keyframe is from where it was believed to be.
+        turned_deg: By how much it is turned, degrees.
+        scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
+        fits: Whether the submap could come to lie so; without depth its lengths may have drifted apart on the way.
+    """
+
+    keyframe: int
+    frame: int
+    T_cam_world: Array
+    inliers: int
+    share: float
+    joins: bool
+    moved_m: float
+    turned_deg: float
+    scale: float
+    fits: bool = True

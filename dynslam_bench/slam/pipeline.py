@@ -18,26 +18,20 @@ from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
-from dynslam_bench.contracts.map_outputs import MapOutputs
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
-from dynslam_bench.core.settings import Settings
-from dynslam_bench.core.steering import Steerable, Steering
+from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
+from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.guard import GuardSettings
-from dynslam_bench.culling.tools.ego_motion import refine_prediction
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.segmentation.masks.postprocess import dynamic_mask
+from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .backend import RgbdBackend
-from .culled import Culled, settled
-from .flow_to_previous import flow_to_previous
-from .localisation.localised import Localised
-from .stage_clock import CachedStage, StageClock
+from dynslam_bench.slam.backend import BackendResult, RgbdBackend
+from dynslam_bench.slam.stages import CachedStage, CullingResult, StageClock, combine_verdicts, flow_to_previous
 
 KEYFRAMES_SHOWN = 20
 """How many of the latest keyframes filters may look at (DynaSLAM's window)."""
@@ -58,7 +52,7 @@ class MaskStage(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Remembered:
+class PreviousFrame:
     """What the next frame is told of this one.
 
     Attributes:
@@ -113,7 +107,7 @@ class SlamPipeline:
         self._backend = backend
         self._guard: GuardSettings = getattr(settings, "guard", GuardSettings())
         self._objects: SegmentationSettings | None = getattr(settings, "segmentation", None)
-        self._steering = Steering(settings, self._takers(settings))
+        self._steering = OnlineSettings(settings, self._takers(settings))
         self._cached = dict(cached or {})
         self._camera: Camera | None = None
 
@@ -126,7 +120,7 @@ class SlamPipeline:
         for each in (*self._filters, self._masks):
             if each is not None and hasattr(each, "reset"):
                 each.reset(camera)
-        self._previous: Remembered | None = None
+        self._previous: PreviousFrame | None = None
         self._keyframe_due = True
 
     # ------------------------------------------------------------------ one frame
@@ -146,13 +140,13 @@ class SlamPipeline:
         self._backend.mapper.resume()  # filters see the map as it was before a `finalize`
         seen = self._see(frame, camera, clock)
         culled = self._cull(seen, self._known(seen, camera), clock)
-        located = self._backend.track(seen, culled.keep, culled.weight)
-        self._remember(seen, culled, located)
+        pnp_poses = self._backend.track(seen, culled.keep, culled.weight)
+        self._remember(seen, culled, pnp_poses)
         return TrackResult(
-            located.T_world_cam,
-            located.state,
-            self._stats(seen, culled, located),
-            clock.seconds | dict(located.timings),
+            pnp_poses.T_world_cam,
+            pnp_poses.state,
+            self._stats(seen, culled, pnp_poses),
+            clock.seconds | dict(pnp_poses.timings),
             culled.mask,
             seen.keypoints.xy,
             culled.keep,
@@ -178,7 +172,7 @@ class SlamPipeline:
     def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
         if mask is None or self._objects is None or not isinstance(self._extractor, MaskedExtractor):
             return self._extractor.extract(gray)
-        return self._extractor.extract_beside(gray, mask, self._objects.outside_share)
+        return self._extractor.extract_masked(gray, mask, self._objects.outside_share)
 
     def _known(self, seen: FrameBundle, camera: Camera) -> FilterState:
         """What the filters may know beside the frame: the past, the prediction and the map."""
@@ -196,7 +190,7 @@ class SlamPipeline:
             seed=int(stream(self._seed, "frame", seen.index).integers(2**63)),
         )
 
-    def _cull(self, seen: FrameBundle, state: FilterState, clock: StageClock) -> Culled:
+    def _cull(self, seen: FrameBundle, state: FilterState, clock: StageClock) -> CullingResult:
         """The filters' verdicts in order; the flow is found for what is left when the first filter needs it."""
         image: Any = None
         verdicts = []
@@ -207,7 +201,7 @@ class SlamPipeline:
                 verdict = each.apply(seen, state)
             state.keep = state.keep & verdict.keep
             verdicts.append((each.name, verdict))
-        return settled(state, verdicts, image, self._guard)
+        return combine_verdicts(state, verdicts, image, self._guard)
 
     def _find_flow(self, seen: FrameBundle, state: FilterState, clock: StageClock) -> Any:
         """Put the flow to the previous image, and the pose that it predicts, into `state`; the prepared image."""
@@ -221,27 +215,27 @@ class SlamPipeline:
             state.T_world_pred = refine_prediction(seen, state)
         return image
 
-    def _remember(self, seen: FrameBundle, culled: Culled, located: Localised) -> None:
-        tracked = located.state == "ok"
-        known = tracked and self._backend.state == "ok"  # on an island what is predicted is of another world
-        self._previous = Remembered(seen, culled.keep, culled.image, located.T_world_cam if known else None)
-        self._keyframe_due = not tracked or located.keyframe
+    def _remember(self, seen: FrameBundle, culled: CullingResult, pnp_poses: BackendResult) -> None:
+        tracked = pnp_poses.state == "ok"
+        known = tracked and self._backend.state == "ok"  # on an submap what is predicted is of another world
+        self._previous = PreviousFrame(seen, culled.keep, culled.image, pnp_poses.T_world_cam if known else None)
+        self._keyframe_due = not tracked or pnp_poses.keyframe
 
-    def _stats(self, seen: FrameBundle, culled: Culled, located: Localised) -> dict[str, float]:
+    def _stats(self, seen: FrameBundle, culled: CullingResult, pnp_poses: BackendResult) -> dict[str, float]:
         """The frame's diagnostics, the same keys on every frame."""
         stats = {
             "keypoints": float(len(seen)),
             "culled": float(np.count_nonzero(~culled.keep)),
-            "matches": float(located.matches),
-            "inliers": float(located.inliers),
-            "map_points": float(located.map_points),
-            "keyframes": float(located.keyframes),
-            "keyframe": float(located.keyframe),
-            "maps": float(located.maps),
-            "loops": float(located.loops),
-            "residual_px": located.residual_px,
+            "matches": float(pnp_poses.matches),
+            "inliers": float(pnp_poses.inliers),
+            "map_points": float(pnp_poses.map_points),
+            "keyframes": float(pnp_poses.keyframes),
+            "keyframe": float(pnp_poses.keyframe),
+            "maps": float(pnp_poses.maps),
+            "loops": float(pnp_poses.loops),
+            "residual_px": pnp_poses.residual_px,
             "mask_fraction": 0.0 if culled.mask is None else float(culled.mask.mean()),
-            "relocalised": float(located.relocalised),
+            "relocalised": float(pnp_poses.relocalised),
             **culled.stats,
             "guard_undone": float(culled.undone),
         }
@@ -306,7 +300,7 @@ class SlamPipeline:
             ("backend", self._backend),
         ]
         for group, part in parts:
-            if isinstance(part, Steerable) and hasattr(settings, group):
+            if isinstance(part, Reconfigurable) and hasattr(settings, group):
                 yield group, part.configure
         if hasattr(settings, "guard"):
             yield "guard", self._use_guard

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from .suite import Suite, Variant, load_suite, suite_names
+from dynslam_bench.suites.suite import Suite, Variant, load_suite, suite_names
 
 __all__ = ["Suite", "Variant", "load_suite", "suite_names"]

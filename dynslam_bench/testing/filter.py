@@ -24,9 +24,8 @@ from dynslam_bench.contracts import (
     Provenance,
 )
 from dynslam_bench.geometry import se3
-
-from .report import ConformanceReport, require
-from .scenes import CornerSequence
+from dynslam_bench.testing.report import ConformanceReport, require
+from dynslam_bench.testing.scenes import CornerSequence
 
 NEEDS: frozenset[str] = frozenset(get_args(Need))
 

@@ -10,9 +10,7 @@ from importlib import metadata
 from dynslam_bench.core.folders import find_data_root, is_writable, stage_cache_folder, weights_folder
 from dynslam_bench.core.version import install_hint, version
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
-from dynslam_bench.sequences.listing import summaries
-
-from .doctor import diagnose
+from dynslam_bench.sequences.catalogue import summaries
 
 DISTRIBUTION = "dynslam-bench"
 FOR_DEVELOPERS = ("test", "lint")
@@ -109,3 +107,39 @@ def torch_device() -> Finding:
     cuda = torch.cuda.is_available()
     name = torch.cuda.get_device_name(0) if cuda else f"{torch.get_num_threads()} processor threads"
     return Finding("device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}")
+
+
+# Why a plug-in is not available.
+
+
+@dataclass(frozen=True)
+class Ailment:
+    """A plug-in that cannot be used.
+
+    Attributes:
+        kind: ``trackers``, ``segmenters``, ``features``, ``flow`` or ``sequences``.
+        name: Its id, or where it should have come from.
+        reason: What went wrong, or what to install.
+    """
+
+    kind: str
+    name: str
+    reason: str
+
+
+def diagnose() -> list[Ailment]:
+    """All plug-ins of all kinds that failed to load, and trackers that lack a package."""
+    from dynslam_bench.features.registry import FEATURES
+    from dynslam_bench.flow.registry import FLOWS
+    from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
+    from dynslam_bench.sequences.catalogue import DATASETS
+    from dynslam_bench.trackers.registry import TRACKERS
+
+    found = [
+        Ailment(registry.kind, failure.source, failure.reason)
+        for registry in (TRACKERS, SEGMENTERS, FEATURES, FLOWS, DATASETS)
+        for failure in registry.failures()
+    ]
+    for tracker in TRACKERS.all():
+        found += [Ailment("trackers", tracker.spec.id, f"needs {hint}") for hint in tracker.spec.missing()]
+    return found

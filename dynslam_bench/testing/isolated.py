@@ -13,15 +13,12 @@ from typing import Any
 
 from dynslam_bench.core import errors
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.temporary import TemporaryFolder
+from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.runs.process.child import LOG_FILE
-from dynslam_bench.runs.process.handle import start_child
-from dynslam_bench.runs.process.job import make_job
-from dynslam_bench.runs.process.log_file import LogFile
-from dynslam_bench.runs.process.supervise import Verdict, supervise
+from dynslam_bench.runs.process.fork_server import make_job, start_child
+from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
 from dynslam_bench.runs.spec import Limits
-
-from .report import OBSERVER, Check, ConformanceReport
+from dynslam_bench.testing.report import OBSERVER, Check, ConformanceReport
 
 FRAME_S = 60.0
 START_S = 300.0
@@ -160,7 +157,7 @@ class _Teller:
 
 def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
     """What the child does: the checks whose outcome is not known yet."""
-    from .tracker import tracker_report
+    from dynslam_bench.testing.tracker import tracker_report
 
     known = [Check(**check) for check in job["known"]]
     token = OBSERVER.set(_Teller(known, send))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from .report import Check, ConformanceReport
+    from dynslam_bench.testing.report import Check, ConformanceReport
 
 OPTIONS = {
     "tracker": "a tracker: id, module:Attr or file.py:Attr of a TrackerSpec; runs in a process of its own",
@@ -107,9 +107,8 @@ def _sequence(subject: str) -> ConformanceReport:
     from dynslam_bench.core.errors import PluginError
     from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.plugins import load_object
-    from dynslam_bench.sequences.published.datasets import DATASETS
-
-    from . import sequence_report
+    from dynslam_bench.sequences.catalogue import DATASETS
+    from dynslam_bench.testing import sequence_report
 
     head, _, attribute = subject.rpartition(":")
     if not attribute.isidentifier() or not (head.endswith(".py") or head.replace(".", "").isidentifier()):
@@ -122,11 +121,9 @@ def _sequence(subject: str) -> ConformanceReport:
 
 
 def _segmenter(subject: str) -> ConformanceReport:
-    from dynslam_bench.segmentation.build_segmenter import build_segmenter
-    from dynslam_bench.segmentation.registry import SEGMENTERS
+    from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, build_segmenter
     from dynslam_bench.segmentation.settings import SegmentationSettings
-
-    from . import CornerSequence, segmenter_report
+    from dynslam_bench.testing import CornerSequence, segmenter_report
 
     SEGMENTERS.get(subject)  # unknown ones are no failed check
     scene, settings = CornerSequence(2), SegmentationSettings(source=f"plugin:{subject}")
@@ -138,11 +135,9 @@ def _segmenter(subject: str) -> ConformanceReport:
 
 
 def _flow(subject: str) -> ConformanceReport:
-    from dynslam_bench.flow.build_flow import build_flow
-    from dynslam_bench.flow.registry import FLOWS
+    from dynslam_bench.flow.registry import FLOWS, build_flow
     from dynslam_bench.flow.settings import FlowSettings
-
-    from . import flow_report
+    from dynslam_bench.testing import flow_report
 
     FLOWS.get(subject)  # unknown ones are no failed check
     settings = FlowSettings(plugin=subject)
@@ -150,11 +145,9 @@ def _flow(subject: str) -> ConformanceReport:
 
 
 def _features(subject: str) -> ConformanceReport:
-    from dynslam_bench.features.build_extractor import build_extractor
-    from dynslam_bench.features.registry import FEATURES
+    from dynslam_bench.features.registry import FEATURES, build_extractor
     from dynslam_bench.features.settings import FeatureSettings
-
-    from . import features_report
+    from dynslam_bench.testing import features_report
 
     spec, settings = FEATURES.get(subject), FeatureSettings(extractor=subject)
     return features_report(lambda: build_extractor(settings), descriptor_bytes=spec.descriptor_bytes)

@@ -11,8 +11,7 @@ from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-
-from .report import ConformanceReport, NotApplicable, require
+from dynslam_bench.testing.report import ConformanceReport, NotApplicable, require
 
 
 def check_sequence(sequence: Sequence | str | Path, *, frames: int = 3) -> None:

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from hashlib import sha256
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
+from dynslam_bench.trackers.adapters.specs import adapter_specs
+from dynslam_bench.trackers.systems import chen_slam, dynaslam, emfoa_oft, emfoa_oft_mono
 
 
 def _builtin() -> Iterable[TrackerSpec]:
-    from . import specs
 
-    return specs.all_specs()
+    return all_specs()
 
 
 class TrackerRegistry(Registry[TrackerSpec]):
@@ -113,3 +115,18 @@ def _takes_context(factory: Any) -> bool:
         return "context" in inspect.signature(factory).parameters
     except (TypeError, ValueError):
         return False
+
+
+# The specs of all built-in trackers; importing this loads neither torch nor OpenCV.
+
+_SYSTEMS = (
+    "blitz_slam", "cfp_slam", "dai_slam", "detect_slam", "dgs_slam", "di_slam", "ds_slam", "dynatm_slam",
+    "huai_slam", "mask_rcnn", "mor_slam", "ngd_slam", "opf_slam", "orb_slam2", "orb_slam2_mono", "seg_slam", "sgc_slam",
+    "sof_slam", "yolo_slam",
+)  # fmt: skip
+_SINGLE = [import_module(f".systems.{name}", __package__).SPEC for name in _SYSTEMS]
+
+
+def all_specs() -> list[TrackerSpec]:
+    """Every built-in tracker's spec."""
+    return [*emfoa_oft.SPECS, emfoa_oft_mono.SPEC, *dynaslam.SPECS, *chen_slam.SPECS, *_SINGLE, *adapter_specs()]

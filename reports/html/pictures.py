@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.records import write_atomic
-from dynslam_bench.runs.exchange.stored_sequence import open_stored
-from dynslam_bench.runs.snapshots import Snapshot, read_snapshots, spread
-
-from ..figures.style import significant
-from ..model.rows import LoadedRun
-from .run_frames import RunFrames
-from .side_files import write_side
+from dynslam_bench.reports.figures import significant
+from dynslam_bench.reports.html.page import write_side
+from dynslam_bench.reports.html.run_page import RunFrames
+from dynslam_bench.reports.model.load import LoadedRun
+from dynslam_bench.runs.artifacts import Snapshot, read_snapshots, spread
+from dynslam_bench.runs.exchange.export import open_stored
 
 FOLDER = "frames"
 EVEN, WORST = 16, 4

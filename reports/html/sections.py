@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from dynslam_bench.evaluation.protocol import Protocol
-
-from ..figures import leaderboard as figures
-from ..figures.style import colours, safe
-from ..model.board import Board
-from ..model.common import common_errors, representatives
-from ..model.crew import Crew
-from ..model.missing import missing_commands, missing_note
-from ..model.published import is_excerpt, least_length_s, reported_for
-from ..model.records import records_for
-from ..model.rows import Loaded, trial_words, without_scale_words
-from ..model.statistics import FEWEST, power_note
-from ..tables import fairness as fairness_tables
-from ..tables import leaderboard as tables
-from ..tables import runs as run_tables
-from ..tables import sequences as sequence_tables
-from ..tables.formats import significant_text
-from ..tables.metric import metric_table
-from .draft import Draft
-from .explore import Explored
-from .page import Block, Section
+from dynslam_bench.reports import figures
+from dynslam_bench.reports.figures import FIGURES, bar_figure, colours, safe
+from dynslam_bench.reports.html.explore import Explored
+from dynslam_bench.reports.html.page import Block, Draft, Section
+from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.common_frames import common_errors, representatives
+from dynslam_bench.reports.model.load import Crew, Loaded, trial_words, without_scale_words
+from dynslam_bench.reports.model.missing import missing_commands, missing_note
+from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
+from dynslam_bench.reports.model.statistics import FEWEST, power_note
+from dynslam_bench.reports.tables import errors as sequence_tables
+from dynslam_bench.reports.tables import leaderboard as fairness_tables
+from dynslam_bench.reports.tables import leaderboard as tables
+from dynslam_bench.reports.tables import runs as run_tables
+from dynslam_bench.reports.tables.errors import metric_table
+from dynslam_bench.reports.tables.paper import (
+    LOST_MARK,
+    LOST_NOTE,
+    STATISTICS,
+    absolute_table,
+    relative_table,
+    time_table,
+)
+from dynslam_bench.reports.tables.table import significant_text
 
 _MOST_NOTES = 60
 _MOST_COMMANDS = 200
@@ -238,3 +242,23 @@ def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> No
 def first_of(entries: list[str], most: int, others: str) -> list[str]:
     """The first entries; how many others there are stands behind them."""
     return entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]
+
+
+# The section that shows our runs in the tables and figures of the implemented paper.
+
+
+def add_paper(draft: Draft, board: Board, protocol: Protocol) -> None:
+    """Tables 1 to 3 and Figures 9 to 12, as the paper lays them out."""
+    section = Section("paper", "As in the paper: four statistics of the errors, and time", "As in the paper")
+    for table in (absolute_table(board, protocol), relative_table(board, protocol), time_table(board)):
+        section.blocks += draft.titled(table)
+    for statistic, number in FIGURES.items():
+        figure = bar_figure(board, statistic)
+        if figure is not None:
+            lost = any(LOST_MARK in trace["text"] for trace in figure["data"])
+            caption = (
+                f"As the paper's Figure {number}: {STATISTICS[statistic]} of the absolute pose error, median over the "
+                "runs that succeeded; pale bars are not ranked." + f" {LOST_NOTE}" * lost
+            )
+            section.blocks.append(draft.figure(f"paper-{statistic}", figure, caption))
+    draft.add(section)

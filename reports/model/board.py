@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
 from statistics import geometric_mean, median
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from dynslam_bench.core.errors import ReportError
-
-from .cell import Cell, make_cell
-from .columns import name_columns, shortened
-from .frame import rows_frame
-from .labels import make_labels
-from .row import RunRow
-from .rows import check_one_protocol, check_reference
-from .statistics import FLOOR_M, Standing, standings
+from dynslam_bench.core.toml import assignments
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.reports.model.load import check_one_protocol, check_reference, load_runs, open_stores
+from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
+from dynslam_bench.runs.store import RunStore
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NEVER_MOVE = "static camera (from ground truth)"
+
+STATIC_CAMERA = "static camera (from ground truth)"
 DEFAULT_REFERENCE = "orb-slam2"
 On = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
@@ -49,7 +53,7 @@ class Board:
         groups: Sequence to the name of its group.
         unscored: Names of the sequences without ground truth.
         cells: Variant key to sequence to its runs.
-        never_move: Sequence to the error of a static camera.
+        static_camera: Sequence to the error of a static camera.
         reference: Variant key of the reference; None if ratios are to a static camera.
         reference_name: How to call the reference in captions.
         asked_reference: The tracker id that was asked for as the reference; empty for none.
@@ -74,9 +78,9 @@ class Board:
     groups: dict[str, str] = field(default_factory=dict)
     unscored: list[str] = field(default_factory=list)
     cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
-    never_move: dict[str, float] = field(default_factory=dict)
+    static_camera: dict[str, float] = field(default_factory=dict)
     reference: str | None = None
-    reference_name: str = NEVER_MOVE
+    reference_name: str = STATIC_CAMERA
     asked_reference: str = ""
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
@@ -103,19 +107,19 @@ class Board:
         """Any row of a tracker, for what all its rows share."""
         return self._by_key[key][0]
 
-    def no_better_than_still(self, key: str, sequence: str) -> bool:
+    def no_better_than_static(self, key: str, sequence: str) -> bool:
         """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
 
         Controls make no claim: never.
         """
-        cell, still = self.cells[key].get(sequence), self.never_move.get(sequence)
+        cell, still = self.cells[key].get(sequence), self.static_camera.get(sequence)
         if cell is None or still is None or not cell.succeeded or self.first(key).provenance == "control":
             return False
         return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * still
 
     def static_ratio(self, key: str) -> float:
         """Geometric mean over the common sequences of a tracker's median error over that of a static camera."""
-        pairs = [(self.cells[key][name].median or 0.0, self.never_move[name]) for name in self.common]
+        pairs = [(self.cells[key][name].median or 0.0, self.static_camera[name]) for name in self.common]
         return geometric_mean([max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs])
 
     def ranked_order(self) -> list[str]:
@@ -137,13 +141,13 @@ class Board:
     def reference_scores(self) -> dict[str, list[float]]:
         """The reference's errors on the common sequences."""
         if self.reference is None:
-            return {name: [self.never_move[name]] for name in self.common}
+            return {name: [self.static_camera[name]] for name in self.common}
         return {name: list(self.cells[self.reference][name].scores) for name in self.common}
 
     def reference_median(self, sequence: str) -> float | None:
         """The reference's median error on a sequence; None where it was not run."""
         if self.reference is None:
-            return self.never_move[sequence]
+            return self.static_camera[sequence]
         cell = self.cells[self.reference].get(sequence)
         return None if cell is None else cell.median
 
@@ -238,14 +242,14 @@ def _order_sequences(board: Board) -> None:
     for name, found in rows.items():
         still = [row.static_camera_ate_rmse_m for row in found if row.static_camera_ate_rmse_m is not None]
         if still:
-            board.never_move[name] = median(still)
+            board.static_camera[name] = median(still)
         else:
             board.unscored.append(name)
         board.groups[name] = _group(found[0])
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
     order = {name: position for position, (_, name) in enumerate(_GROUPS)}
-    board.sequences = sorted(board.never_move, key=lambda key: (order.get(board.groups[key], 9), key))
+    board.sequences = sorted(board.static_camera, key=lambda key: (order.get(board.groups[key], 9), key))
     board.short = shortened(board.sequences)
 
 
@@ -309,3 +313,213 @@ def _group(row: RunRow) -> str:
         if part in row.sequence:
             return name
     return _OTHER
+
+
+# All runs of one tracker on one sequence, and what they say together.
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All runs of one tracker on one sequence.
+
+    Attributes:
+        rows: The runs, ordered by repeat.
+        kept: Those that count: of runs that differ in their seed only and have equal results, one.
+    """
+
+    rows: tuple[RunRow, ...]
+    kept: tuple[RunRow, ...]
+
+    @cached_property
+    def scores(self) -> tuple[float, ...]:
+        """Errors in metres of the runs that count, failures imputed."""
+        return tuple(score for row in self.kept if (score := row.score_m) is not None)
+
+    @cached_property
+    def succeeded(self) -> tuple[RunRow, ...]:
+        """The runs that count, ended and have an error."""
+        return tuple(row for row in self.kept if not row.failed and row.score_m is not None)
+
+    @cached_property
+    def median(self) -> float | None:
+        """Median error in metres; None without ground truth."""
+        return median(self.scores) if self.scores else None
+
+    @cached_property
+    def failed(self) -> int:
+        """Runs that failed."""
+        return sum(row.failed for row in self.rows)
+
+    @property
+    def success(self) -> int:
+        """Runs that ended and could be evaluated."""
+        return len(self.rows) - self.failed
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether several seeds gave one result to the last digit."""
+        return len(self.kept) == 1 < len(self.rows)
+
+    @cached_property
+    def typical(self) -> RunRow:
+        """The run that stands for the cell: the successful one with the (lower) median error, else its first."""
+        ordered = sorted(self.succeeded, key=lambda row: row.score_m or 0.0)
+        return ordered[(len(ordered) - 1) // 2] if ordered else self.rows[0]
+
+    @cached_property
+    def seen(self) -> bool:
+        """Whether masks of it come from a network that was trained on the scene."""
+        return any(row.seen_in_training for row in self.rows)
+
+    @cached_property
+    def ending(self) -> str:
+        """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
+        endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
+        return endings[0] if len(endings) == 1 else f"{self.failed} failed: {'; '.join(endings)}" if endings else ""
+
+    @property
+    def epipolar_skipped(self) -> float | None:
+        """Mean share of the tracked frames on which the fundamental matrix was not used; None without such a test."""
+        return mean_skipped(self.rows)
+
+
+def make_cell(rows: Sequence[RunRow]) -> Cell:
+    """Order the runs of a cell and find the copies among them."""
+    ordered = sorted(rows, key=lambda row: row.repeat_key)
+    groups: dict[object, list[RunRow]] = {}
+    for row in ordered:
+        groups.setdefault((row.offset, row.noise, row.imported), []).append(row)
+    kept: list[RunRow] = []
+    for group in groups.values():
+        results = {_result(row) for row in group}
+        kept += group[:1] if len(results) == 1 else group
+    return Cell(tuple(ordered), tuple(kept))
+
+
+def mean_skipped(rows: Sequence[RunRow]) -> float | None:
+    """Mean over runs of the share of frames on which the fundamental matrix was not used; None if none has it."""
+    shares = [row.epipolar_skipped for row in rows if row.epipolar_skipped is not None]
+    return sum(shares) / len(shares) if shares else None
+
+
+def _result(row: RunRow) -> object:
+    """Everything that two copies have in common."""
+    return row.status, row.n_processed, row.coverage, row.score_m, row.final_ate_m, tuple(sorted(row.metrics.items()))
+
+
+# All rows as one pandas frame: what CSV is written from, and what own analyses start with.
+
+_TEXT = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
+_TEXT += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
+_WHOLE = ["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"]
+_FLAGS = ["ranked", "failed", "cached", "seen_in_training"]
+_NUMBERS = ["coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"]
+_NUMBERS += ["real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
+_OWN = ("label", "sequence", "settings")
+
+
+def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
+    """Rows as a frame.
+
+    Args:
+        rows: One a run.
+        columns: Column id to the name of its sequence, see `name_columns`.
+        labels: Variant key to the name of the tracker in tables, see `make_labels`.
+
+    Returns:
+        One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
+        run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
+        ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
+        status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest, trajectory
+        (``online``, ``final``: whose errors they are), segmentation.
+        ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked. ``boolean``:
+        ranked, failed, cached (whether stage times come from the stage cache), seen_in_training (whether the masks
+        come from a network that was trained on the scene). ``Float64``: coverage and
+        epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
+        failures as a static camera or worse), hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m (metres), frame_ms
+        (median, milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
+        rotation_uncertainty_deg (standard error in degrees of the alignment's rotation; above 10 the metrics
+        ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under
+        its own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
+    """
+    import pandas as pd
+
+    ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
+    metrics = sorted({name for row in rows for name in row.metrics} - set(_NUMBERS))
+    kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
+    kinds |= dict.fromkeys(_FLAGS, "boolean") | dict.fromkeys((*_NUMBERS, *metrics), "Float64")
+    plain = [name for name in kinds if name not in {*_OWN, *metrics}]
+    of_row = attrgetter(*plain)
+    lines = [  # row by row: a hundred thousand of them lie far apart in memory
+        (*_own(row, columns, labels), *map(row.metrics.get, metrics), *of_row(row)) for row in ordered
+    ]
+    values: Iterable[Sequence[Any]] = zip(*lines, strict=True) if lines else [()] * len(kinds)
+    found = dict(zip([*_OWN, *metrics, *plain], values, strict=True))
+    return pd.DataFrame({name: _array(found[name], kind) for name, kind in kinds.items()})
+
+
+def _own(row: RunRow, columns: Mapping[str, str], labels: Mapping[str, str]) -> tuple[str, str, str]:
+    """What a row alone does not know, under the names `_OWN`."""
+    settings = "; ".join(assignments(row.variant))
+    return labels[row.variant_key], columns[row.column_id], settings
+
+
+def _array(values: Sequence[Any], kind: str) -> Any:
+    """A column of a kind; numbers by way of numpy, which takes a tenth of the time."""
+    import pandas as pd
+
+    listed: Any = np.array(values, dtype=np.float64) if kind == "Float64" else list(values)
+    return pd.Series(listed, dtype=kind).array
+
+
+# From results folders to a frame or a board, in one call.
+
+
+def load_frame(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    trials: bool = False,
+) -> pd.DataFrame:
+    """All runs of some results folders, scored under one protocol, one row a run.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+        trials: As in `build_report`.
+
+    Returns:
+        The frame that `rows_frame` describes.
+
+    Raises:
+        ReportError: There are no runs.
+    """
+    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol), trials=trials).runs]
+    return rows_frame(rows, name_columns(rows), make_labels(rows))
+
+
+def load_board(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    reference: str | None = None,
+    on: On = "common",
+    rank_seen: bool = False,
+    trials: bool = False,
+) -> Board:
+    """The board of some results folders: all runs, ordered and ranked as in a report.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+        reference: As in `make_board`.
+        on: As in `make_board`.
+        rank_seen: As in `make_board`.
+        trials: As in `build_report`.
+
+    Raises:
+        ReportError: As `make_board`.
+    """
+    loaded = load_runs(open_stores(results), get_protocol(protocol), reference=reference, trials=trials)
+    rows = [run.row for run in loaded.runs]
+    return make_board(rows, reference, on, rank_seen=rank_seen)

@@ -6,9 +6,8 @@ import shlex
 from collections.abc import Iterable
 
 from dynslam_bench.core.toml import setting_text
-
-from .board import Board
-from .row import RunRow
+from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.row import RunRow
 
 _MOST = 8
 

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import json
+import shlex
 from functools import cached_property
-from typing import Any, Literal
+from itertools import chain
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from dynslam_bench.core.records import Record
-from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import write_lines
+from dynslam_bench.core.reading import TABLE_BYTES
+from dynslam_bench.core.records import Record, digest, schema
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG
+from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
+from dynslam_bench.evaluation.evaluate import Evaluation
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord, Status
+from dynslam_bench.runs.run_index import part_words
+from dynslam_bench.runs.store import RunStore, score
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
 Kind = Literal["run here", "imported"]
 Which = Literal["online", "final"]
@@ -62,7 +75,7 @@ class RunRow(Record):
         final_metrics: All errors of the final trajectory; empty if there is none, or in reports of older versions.
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
-        held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
+        hold_last_pose_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
         static_camera_ate_rmse_m: What a static camera scores there; None without ground truth.
         n_frames: Input frames.
         n_processed: Frames that the tracker saw before it ended.
@@ -124,7 +137,7 @@ class RunRow(Record):
     final_ate_m: float | None = None
     final_metrics: dict[str, float] = Field(default_factory=dict)
     rotation_uncertainty_deg: float | None = None
-    held_ate_m: float | None = None
+    hold_last_pose_ate_m: float | None = None
     static_camera_ate_rmse_m: float | None = None
     n_frames: int = 0
     n_processed: int = 0
@@ -188,8 +201,8 @@ class RunRow(Record):
         """
         if self.failed:
             static_m = self.static_camera_ate_rmse_m
-            return None if static_m is None else max(static_m, self.held_ate_m or 0.0)
-        return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
+            return None if static_m is None else max(static_m, self.hold_last_pose_ate_m or 0.0)
+        return self.hold_last_pose_ate_m if self.hold_last_pose_ate_m is not None else self.metrics.get("ate_rmse_m")
 
     @property
     def rotation_reliable(self) -> bool:
@@ -204,3 +217,260 @@ class RunRow(Record):
         if self.status == "lost":
             return f"lost, {self.n_tracked}/{self.n_frames} tracked"
         return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
+
+
+# What a report was made of, as it lies beside it: `report.json`.
+
+REPORT_FILE = "report.json"
+SCHEMA_VERSION = 1
+
+
+class ReportData(Record):
+    """What a report was made of; `compare` reads it back.
+
+    Attributes:
+        schema_version: Of this record.
+        title: Title of the report.
+        protocol: Description of the protocol.
+        reference: Tracker that errors are divided by.
+        version: Version of the package.
+        rows: One a run.
+    """
+
+    most_bytes: ClassVar[int] = TABLE_BYTES
+
+    schema_version: int = schema(SCHEMA_VERSION)
+    title: str
+    protocol: str
+    reference: str
+    version: str
+    rows: list[RunRow] = Field(default_factory=list)
+
+    def write(self, path: Path) -> None:
+        """Write it with a line for every row; it is never one text, since there may be a hundred thousand rows.
+
+        Raises:
+            DynslamError: The folder cannot be written.
+        """
+        head = self.model_copy(update={"rows": []}).to_line().removesuffix("]}")
+        last = len(self.rows) - 1
+        rows = (row.to_line() + "," * (at < last) for at, row in enumerate(self.rows))
+        write_lines(path, chain([head], rows, ["]}"]))
+
+
+# The row of one stored run: its record, its errors under a protocol, and what follows from its trajectories.
+
+
+def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
+    """The row of one stored run."""
+    scored = score(store, record, protocol)
+    which, status, failed, reason = _judge(record, scored, protocol)
+    evaluation = scored.online if protocol.trajectory == "online" else scored.final
+    alignment = None if evaluation is None else evaluation.alignment
+    tracker, sequence = record.tracker, record.sequence
+    still = static_camera_error(store, record, protocol, evaluation)
+    return RunRow(
+        run_id=record.run_id,
+        kind="run here" if record.kind == "run" else "imported",
+        tracker=tracker.id,
+        given=tracker.given,
+        label=tracker.label or tracker.id,
+        variant=variant_of(record),
+        program=record.program,
+        deterministic=tracker.deterministic and not record.realtime,
+        provenance=tracker.provenance,
+        ranked=tracker.ranked and record.start_map is None,
+        monocular=tracker.sensors == "rgb",
+        sequence=sequence.id,
+        frames=part_words(record),
+        part_options=part_options(record),
+        block=column_of(record),
+        content=sequence.content,
+        camera=camera_words(record),
+        map_file="" if record.start_map is None else record.start_map.file,
+        place=record.place,
+        duration_s=sequence.duration_s,
+        tags=sequence.tags,
+        split=sequence.split,
+        seed=record.seed,
+        offset=record.offset,
+        noise=sequence.noise,
+        status=status,
+        reason=reason,
+        failed=failed,
+        protocol_id=scored.protocol_id,
+        protocol_digest=scored.protocol_digest,
+        trajectory=which,
+        metrics={} if evaluation is None else dict(evaluation.metrics),
+        final_ate_m=None if scored.final is None else scored.final.metrics.get("ate_rmse_m"),
+        final_metrics={} if scored.final is None else dict(scored.final.metrics),
+        rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
+        hold_last_pose_ate_m=hold_last_pose_error(store, record, protocol, evaluation, still),
+        static_camera_ate_rmse_m=still,
+        **_counts(record, scored.final if which == "final" and record.kind == "run" else None),
+        epipolar_skipped=record.epipolar_skipped,
+        cached=bool(record.identity.get("cache")),
+        frame_ms=None if record.frame_time_s is None else 1000 * record.frame_time_s,
+        real_time_factor=record.real_time_factor,
+        peak_memory_mb=record.peak_memory_mb,
+        mask_iou=record.mask_iou,
+        segmentation=record.segmentation,
+        seen_in_training=seen_in_training(record.segmentation, sequence.id),
+        study=record.trial_of,
+        started=record.started,
+        log=log_of(store, record.run_id),
+        command=command_line(record.command),
+        machine=machine_words(record),
+        **_remarks(record, evaluation, scored.hints),
+    )
+
+
+def _judge(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> tuple[Which, Status, bool, str]:
+    """Whose errors a row holds, how the run ended, whether it counts as a failure, and why it is not ``ok``."""
+    only_final = record.kind == "imported" and scored.online is None and scored.final is not None
+    which: Which = "final" if only_final else protocol.trajectory
+    evaluation = scored.online if protocol.trajectory == "online" else scored.final
+    failed = record.failed or record.status == "lost"
+    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
+        return which, record.status, True, record.reason or scored.reasons.get(which, "it cannot be evaluated")
+    due = record.n_frames - record.n_dropped
+    if record.kind == "run" and which == "final" and not record.failed and evaluation and evaluation.n_tracked:
+        if evaluation.n_tracked < LOST_COVERAGE * due:
+            return which, "lost", True, f"the final trajectory has poses of {evaluation.n_tracked} of {due} frames"
+        if evaluation.n_tracked >= due:  # frames that were lost when they came were found later
+            return which, "ok", False, ""
+    return which, record.status, failed, record.reason
+
+
+def _counts(record: RunRecord, final: Evaluation | None) -> dict[str, Any]:
+    """A row's numbers of frames; where the final trajectory is scored, those that it has poses of."""
+    counts = {name: getattr(record, name) for name in ("n_frames", "n_processed", "n_tracked", "coverage")}
+    if final is not None and final.n_tracked is not None and final.coverage is not None:
+        counts |= {"n_tracked": final.n_tracked, "coverage": final.coverage}
+    return counts
+
+
+def _remarks(record: RunRecord, evaluation: Evaluation | None, hints: list[str]) -> dict[str, list[str]]:
+    """What a reader should know of a run: hints, whose trial it is, its own remarks, those of its evaluation."""
+    trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
+    lines = [*trial, *record.notes, *(evaluation.diagnostics if evaluation is not None else [])]
+    return {"notes": [*(f"hint: {hint}" for hint in hints), *lines], "hints": hints}
+
+
+def log_of(store: RunStore, run_id: str) -> str:
+    """Where the log of a run lies."""
+    return str(store.folder(run_id) / "log.txt")
+
+
+# What a row takes out of a run's record and its stored trajectories.
+
+
+def column_of(record: RunRecord) -> str:
+    """What one column of a table is: content, camera, frames and stride.
+
+    Records of older versions have no block; for them it is content and frames with the camera, if they name one.
+    """
+    camera = record.identity.get("camera")
+    old = record.sequence.part + (f"-{digest(camera, 8)}" if camera else "")
+    return record.sequence.block or old
+
+
+def camera_words(record: RunRecord) -> str:
+    """The camera in a few words, empty if the record does not name it."""
+    camera = record.identity.get("camera")
+    if not isinstance(camera, dict) or not {"width", "height", "fx", "fy"} <= camera.keys():
+        return ""
+    return "camera {width}x{height}, f {fx} {fy}".format(**{key: _short(value) for key, value in camera.items()})
+
+
+def _short(value: object) -> str:
+    """A number, or whatever else a record of somebody else's holds in its place."""
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def static_camera_error(
+    store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
+) -> float | None:
+    """What a static camera scores under the protocol's alignment; None without ground truth."""
+    if evaluation is not None and "static_camera_ate_rmse_m" in evaluation.metrics:
+        return evaluation.metrics["static_camera_ate_rmse_m"]
+    try:
+        truth = store.ground_truth(record.sequence.part)
+        if truth is None:
+            return None
+        errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
+    except DynslamError:
+        return None
+    return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+
+
+def hold_last_pose_error(
+    store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None, still: float | None
+) -> float | None:
+    """The ATE with every lost frame counted as not having moved since the last tracked one; None without evaluation.
+
+    Where the poses cannot be held, since they belong to no input frames, a trajectory with lost frames counts at least
+    as a static camera (`still`).
+    """
+    if evaluation is None:
+        return None
+    error = evaluation.metrics["ate_rmse_m"]
+    if evaluation.coverage == 1.0:
+        return error
+    unheld = error if record.coverage >= 1.0 else max(error, still or 0.0)
+    try:
+        trajectory, truth = (
+            store.trajectory(record.run_id, protocol.trajectory),
+            store.ground_truth(record.sequence.part),
+        )
+        if trajectory is None or truth is None:
+            return unheld
+        stamps = store.timestamps(record.sequence.part)
+        return ate_rmse_m(trajectory, truth, protocol, held_at=stamps)
+    except DynslamError:
+        return unheld
+
+
+def variant_of(record: RunRecord) -> dict[str, Any]:
+    """What sets runs of one tracker apart besides sequence and repeat."""
+    variant: dict[str, Any] = dict(sorted(record.asked.items()))
+    if record.kind == "run":
+        variant |= {"device": record.device, "threads": record.threads}
+    if record.realtime:
+        machine = record.machine
+        variant["realtime"] = f"{machine.cpu}, {machine.cores} cores" if machine is not None else True
+    if record.drop_share:
+        variant["drop_share"] = record.drop_share
+    variant |= {f"degrade.{name}": value for name, value in sorted(record.degrade.items())}
+    return variant
+
+
+def part_options(record: RunRecord) -> list[str]:
+    """The same as options of the command line."""
+    options = []
+    if record.frames is not None:
+        start, stop = record.frames
+        options += ["--frames", f"{start}:{'' if stop is None else stop}"]
+    return options + (["--stride", str(record.stride)] if record.stride != 1 else [])
+
+
+def command_line(command: list[str]) -> str:
+    """The command line as one would type it."""
+    if not command:
+        return ""
+    head = Path(command[0]).name
+    return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *command[1:]])
+
+
+def machine_words(record: RunRecord) -> str:
+    """Computer and versions in words."""
+    parts = []
+    if record.machine is not None:
+        machine = record.machine
+        parts.append(f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}")
+        if machine.gpu:
+            parts.append(machine.gpu)
+    parts += [f"{name} {version}" for name, version in record.versions.items()]
+    if record.git is not None:
+        parts.append(f"git {record.git.revision[:10]}{' (changed)' if record.git.dirty else ''}")
+    return "; ".join(parts)

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from dynslam_bench.evaluation.protocol import Protocol
-
-from ..model.board import Board
-from ..model.cell import Cell
-from ..model.row import SEEN, RunRow
-from .formats import mm
-from .metric import Value, column_marks, median_of
-from .table import Column, Emphasis, Table, TableCell
+from dynslam_bench.reports.model.board import Board, Cell
+from dynslam_bench.reports.model.row import SEEN, RunRow
+from dynslam_bench.reports.tables.errors import Value, column_marks, median_of
+from dynslam_bench.reports.tables.table import Column, Emphasis, Table, TableCell, mm
 
 SUBJECT = "emfoa-oft"
 """Tracker whose improvement over the others is shown, where it was run."""
@@ -82,7 +79,7 @@ def time_table(board: Board) -> Table | None:
 def _share(row: RunRow) -> float | None:
     """A run's error in percent of that of a static camera."""
     static_m = row.static_camera_ate_rmse_m
-    return None if not static_m or row.held_ate_m is None else 100 * row.held_ate_m / static_m
+    return None if not static_m or row.hold_last_pose_ate_m is None else 100 * row.hold_last_pose_ate_m / static_m
 
 
 def _statistics_table(

@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Iterable
 from statistics import median
 
-from ..model.board import Board
-from ..model.row import RunRow
-from ..model.statistics import FLOOR_M
-from .table import Column, Table, TableCell, number, texts
+from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.reports.model.statistics import FLOOR_M
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, texts
 
 
 def run_link(row: RunRow) -> str:

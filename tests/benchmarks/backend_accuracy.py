@@ -29,7 +29,7 @@ import numpy as np  # noqa: E402
 
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides, parse_assignments  # noqa: E402
-from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
+from dynslam_bench.features.registry import build_extractor  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402

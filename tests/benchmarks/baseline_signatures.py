@@ -38,10 +38,10 @@ import numpy as np
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.reports.model.load import LoadedRun, load_runs, open_stores
 from dynslam_bench.reports.model.published import published
-from dynslam_bench.reports.model.rows import LoadedRun, load_runs, open_stores
-from dynslam_bench.runs.frame_row import read_csv
-from dynslam_bench.runs.storage.scoring import DEFAULT_PROTOCOL
+from dynslam_bench.runs.frames import read_csv
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
 
@@ -62,7 +62,7 @@ class Cell:
     standstills: list[float] = field(default_factory=list)
 
     @property
-    def never_move(self) -> float | None:
+    def static_camera(self) -> float | None:
         """Median ATE in metres of a camera that never moves; None where no run says it."""
         return float(np.median(self.standstills)) if self.standstills else None
 
@@ -84,10 +84,16 @@ class Cell:
 
 
 def classify(
-    ate: float, coverage: float, never_move: float, yardstick: float, broken: bool = False, *, fails_first: bool = False
+    ate: float,
+    coverage: float,
+    static_camera: float,
+    yardstick: float,
+    broken: bool = False,
+    *,
+    fails_first: bool = False,
 ) -> str:
     """The measured class of a cell; where both hold it survives, unless `fails_first`."""
-    fails = broken or not np.isfinite(ate) or coverage < 0.8 or ate >= 0.5 * never_move
+    fails = broken or not np.isfinite(ate) or coverage < 0.8 or ate >= 0.5 * static_camera
     survives = np.isfinite(ate) and ate <= 3 * yardstick and coverage >= 0.8 and not broken
     if fails and survives:
         return FAILS if fails_first else SURVIVES
@@ -275,7 +281,7 @@ def report(folder: Path, instances: range | None = None) -> str:
 
 def standstill_of(twin: str, cells: dict[tuple[str, str], Cell], yardstick: dict[str, Cell]) -> float:
     """ATE of a camera that never moves on a twin, metres; NaN where no run says it."""
-    known = yardstick[twin].never_move
+    known = yardstick[twin].static_camera
     return cells["never-move", twin].ate if known is None and ("never-move", twin) in cells else known or float("nan")
 
 

@@ -25,7 +25,7 @@ sys.path.insert(0, str(ROOT))
 
 import optuna  # noqa: E402
 
-from dynslam_bench.tuning.database import open_database  # noqa: E402
+from dynslam_bench.tuning.storage import open_database  # noqa: E402
 
 
 def begin(url: str, barrier: Any, outcomes: Any) -> None:

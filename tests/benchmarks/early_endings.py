@@ -2,9 +2,9 @@
 
     python tests/benchmarks/early_endings.py [STUDIES]
 
-Simulated: trials with a true log ATE ratio and a true log time ratio, seen on each block through chaos (0.3 and 0.03,
-as measured). Every rule sees the same trials on the same blocks, in the same order. A value is told falsely if it is
-told as complete and is not the mean over all blocks.
+Simulated: trials with a true log ATE ratio and a true log time ratio, seen on each instance through chaos (0.3 and 0.03,
+as measured). Every rule sees the same trials on the same instances, in the same order. A value is told falsely if it is
+told as complete and is not the mean over all instances.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
 
-from dynslam_bench.tuning.race import FIRST_STEP, is_dropped, steps
+from dynslam_bench.tuning.pruning import FIRST_STEP, is_dropped, steps
 
 BLOCKS, TRIALS, CHAOS = 12, 40, (0.3, 0.03)
 Values = NDArray[np.float64]
@@ -81,7 +81,7 @@ RULES: dict[str, Rule | None] = {
 
 
 def draw(rng: np.random.Generator) -> tuple[Values, Values]:
-    """True values ``[TRIALS, 2]``, and what is seen of them on each block ``[TRIALS, BLOCKS, 2]``."""
+    """True values ``[TRIALS, 2]``, and what is seen of them on each instance ``[TRIALS, BLOCKS, 2]``."""
     truth = rng.multivariate_normal([0.2, 0.0], [[0.16, -0.05], [-0.05, 0.09]], TRIALS)
     return truth, truth[:, None] + rng.normal(0, CHAOS, (TRIALS, BLOCKS, 2))
 
@@ -161,7 +161,7 @@ def compare(studies: int, seed: int = 0) -> dict[str, Result]:
 
 
 if __name__ == "__main__":
-    print(f"| {TRIALS} trials, {BLOCKS} blocks | runs | front lost | hypervolume lost | told falsely |")
+    print(f"| {TRIALS} trials, {BLOCKS} instances | runs | front lost | hypervolume lost | told falsely |")
     print("| --- | --- | --- | --- | --- |")
     for name, result in compare(int(sys.argv[1]) if sys.argv[1:] else 30).items():
         share = " | ".join(f"{100 * value:.1f} %" for value in (result.runs, result.lost, result.regret))

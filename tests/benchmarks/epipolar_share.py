@@ -25,8 +25,10 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from dynslam_bench.envs.slam_env import SlamEnv  # noqa: E402
-from dynslam_bench.runs.frame_row import FrameRow  # noqa: E402
-from dynslam_bench.runs.storage.frames import FrameLog  # noqa: E402
+from dynslam_bench.runs.frames import (
+    FrameLog,
+    FrameRow,
+)
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
 TRACKERS_WITH_F = (

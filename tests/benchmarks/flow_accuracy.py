@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from flow_data import Pair, kitti, real, synthetic
 
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.dense.labels import DenseDaisyFlow
-from dynslam_bench.flow.dis import DisFlow
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow
+from dynslam_bench.flow.opencv import DisFlow
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 
 KINDS = ("translation", "scale", "rotation", "similarity", "homography", "foreground")

@@ -22,8 +22,8 @@ from flow_accuracy import SEARCHES
 from flow_data import Pair, corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.dense.labels import DenseDaisyFlow
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 
 

@@ -45,17 +45,17 @@ from faults import Injector  # noqa: E402
 from test_runs_infrastructure import STRAYS  # noqa: E402
 
 from dynslam_bench.cli import main as main_of_the_command_line  # noqa: E402
-from dynslam_bench.core.temporary import SHARED_MEMORY  # noqa: E402
-from dynslam_bench.runs.process.family import children, family  # noqa: E402
-from dynslam_bench.runs.process.server import SERVER  # noqa: E402
+from dynslam_bench.core.files import SHARED_MEMORY  # noqa: E402
+from dynslam_bench.runs.process.fork_server import SERVER  # noqa: E402
+from dynslam_bench.runs.process.tree import children, family  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
 STUDY = (
     'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\nseeds = [0]\noffsets = [0]\nallow_overlap = true\n'
 )
 LIGHT_SERVER = """#!/bin/sh
-exec {python} -c "import sys; import dynslam_bench.runs.process.server as server
-server.PRELOADED = ('numpy', 'cv2', 'gymnasium', 'dynslam_bench.envs', 'dynslam_bench.runs.process.keeper')
+exec {python} -c "import sys; import dynslam_bench.runs.process.fork_server as server
+server.PRELOADED = ('numpy', 'cv2', 'gymnasium', 'dynslam_bench.envs', 'dynslam_bench.runs.process.child')
 server.serve(int(sys.argv[-1]))" "$@"
 """
 """A fork server that has imported what the toys need, which is a third of what systems need."""

@@ -30,15 +30,19 @@ from synthetic_judge import SideBySide, error, trajectory  # noqa: E402
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
 from dynslam_bench.evaluation.alignment import align  # noqa: E402
-from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
+from dynslam_bench.features.registry import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
 from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
 from dynslam_bench.sequences import open_sequence  # noqa: E402
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence  # noqa: E402
-from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
-from dynslam_bench.slam.monocular import MonocularBackend  # noqa: E402
-from dynslam_bench.slam.monocular_settings import MonocularBackendSettings  # noqa: E402
-from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
+from dynslam_bench.slam.backend import (
+    MonocularBackend,
+    RgbdBackend,
+)
+from dynslam_bench.slam.settings import (
+    BackendSettings,
+    MonocularBackendSettings,
+)
 
 SETTINGS = {
     "off": {},

@@ -33,7 +33,7 @@ import numpy as np  # noqa: E402
 from dynslam_bench.contracts.features import Keypoints  # noqa: E402
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides, parse_assignments  # noqa: E402
-from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
+from dynslam_bench.features.registry import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
 from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.geometry.camera import Camera  # noqa: E402
@@ -103,7 +103,7 @@ def rendered(source: str, count: int) -> Room:
         people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
         mask = cv2.dilate(people.astype(np.uint8), kernel) > 0
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints = extractor.extract_beside(gray, mask, SegmentationSettings().outside_share)
+        keypoints = extractor.extract_masked(gray, mask, SegmentationSettings().outside_share)
         column, row = np.rint(keypoints.xy).astype(int).T
         at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
         mine = np.flatnonzero(~mask[at])

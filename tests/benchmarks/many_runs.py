@@ -22,7 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "envs")]
 from envs_toys import write_folder  # noqa: E402
 
 from dynslam_bench.runs import RunSpec, RunStore, run_many  # noqa: E402
-from dynslam_bench.runs.process.family import family  # noqa: E402
+from dynslam_bench.runs.process.tree import family  # noqa: E402
 
 
 def held() -> dict[str, float]:

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout tha
 
 from compare_trackers import compare
 
-from dynslam_bench.evaluation.never_move import never_move
+from dynslam_bench.evaluation.ape import static_camera
 from dynslam_bench.evaluation.protocol import MONOCULAR
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -80,7 +80,7 @@ def part(case: Case, number: int) -> dict:
         a=case.a, b=case.b, set_a=[], set_b=[], device="cpu", threads=1, repeats=1, protocol=MONOCULAR
     )
     found = compare(sequence, frames, start, settings)
-    still = never_move(sequence.ground_truth, sequence.timestamps, 0.02)["constant_rmse_m"]
+    still = static_camera(sequence.ground_truth, sequence.timestamps, 0.02)["constant_rmse_m"]
     return found | {"static_camera_ate_rmse_m": float(still)}
 
 

@@ -26,7 +26,7 @@ from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import SpaceSpec, StudySpec, Tuner, finish
 from dynslam_bench.tuning.evaluate import evaluate
 from dynslam_bench.tuning.objectives import SPEED
-from dynslam_bench.tuning.ratio import compared
+from dynslam_bench.tuning.summary import compared
 
 UNMASKED = ("features.n_features", "motion.enabled", "motion.threshold_px", "motion.min_share",
             "epipolar.threshold_px", "backend.keyframes.max_gap")  # fmt: skip

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/relocalisation.py [--keyframes 600] [--searched 3 10 100000] [--sequence ID_OR_FOLDER]
 
-Every frame but each fifth becomes a keyframe; of the others, `--queries` are located without any prediction. Without
+Every frame but each fifth becomes a keyframe; of the others, `--queries` are pnp_poses without any prediction. Without
 `--sequence` the frames are those of a simulated room with known features, in which the camera looks about; with one,
 they are its own. A frame is found if its pose has the inliers that tracking after a loss needs, and right if it is
 within 5 cm of the pose that tracking through the frame would give (the truth in the simulated room).
@@ -27,13 +27,15 @@ import numpy as np  # noqa: E402
 from point_world import PointWorld  # noqa: E402
 
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
-from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
+from dynslam_bench.features.registry import build_extractor  # noqa: E402
 from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
-from dynslam_bench.slam.localisation.observation import observe  # noqa: E402
-from dynslam_bench.slam.localisation.relocalisation import located  # noqa: E402
-from dynslam_bench.slam.places import most_alike  # noqa: E402
+from dynslam_bench.slam.observation import observe  # noqa: E402
+from dynslam_bench.slam.place_recognition import (
+    pnp_poses,
+    top_candidates,
+)
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
 DENSE = {
@@ -100,10 +102,10 @@ def main() -> int:
             seen = observe(frames[index], np.ones(len(frames[index]), bool), np.ones(len(frames[index]), np.float32),
                            mapped.camera, mapped._scales, settings.tracking)  # fmt: skip
             start = time.process_time()
-            chosen = most_alike(world, world.keyframes, seen, searched)
+            chosen = top_candidates(world, world.keyframes, seen, searched)
             rng = np.random.default_rng(index)
             least = settings.relocalisation.min_inliers
-            pose = next(located(world, chosen, seen, settings.relocalisation, rng, least), None)
+            pose = next(pnp_poses(world, chosen, seen, settings.relocalisation, rng, least), None)
             times.append(time.process_time() - start)
             if pose is None or pose.estimate.count < settings.relocalisation.min_inliers or len(times) == 1:
                 continue

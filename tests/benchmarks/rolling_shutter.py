@@ -20,11 +20,11 @@ import numpy as np
 
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore
-from dynslam_bench.sequences.published.cameras import find_camera, write_camera
+from dynslam_bench.sequences.cameras import find_camera, write_camera
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning.blocks import Block, parse_blocks
 from dynslam_bench.tuning.evaluate import Outcome, evaluate
-from dynslam_bench.tuning.ratio import compared
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
+from dynslam_bench.tuning.summary import compared
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"
@@ -38,14 +38,14 @@ FAST = tuple(f"synthetic/fast_{kind}?scene={{instances}}&frames=120" for kind in
 OFF = {"backend.tracking.rolling_shutter": False}
 
 
-def blocks_of(part: str, starts: int) -> list[Block]:
+def blocks_of(part: str, starts: int) -> list[ProblemInstance]:
     """Starts 0, 1, 2 ... of a recording; instances 100, 101 ... of the fast sequences."""
     texts = (
         [text.format(instances=f"100-{99 + starts}") for text in FAST]
         if part == "fast"
         else [f"{FOLDERS[part]}?offsets=0-{starts - 1}"]
     )
-    return [block for text in texts for block in parse_blocks(text)]
+    return [instance for text in texts for instance in parse_instances(text)]
 
 
 def own_masks(tracker: str, part: str) -> dict[str, str]:
@@ -57,12 +57,12 @@ def own_masks(tracker: str, part: str) -> dict[str, str]:
 def worth(tracker: str, part: str, options: argparse.Namespace) -> str:
     """One line: with it beside without it."""
     source, store = own_masks(tracker, part), RunStore(options.results)
-    found: list[dict[Block, Outcome]] = [{}, {}, {}]
-    for block in blocks_of(part, options.starts):
+    found: list[dict[ProblemInstance, Outcome]] = [{}, {}, {}]
+    for instance in blocks_of(part, options.starts):
         for each, settings in zip(found, (source, source | OFF), strict=False):
-            each |= evaluate(tracker, settings, [block], results=store)
+            each |= evaluate(tracker, settings, [instance], results=store)
         if options.rival:
-            found[2] |= evaluate("orbslam3", {"vocabulary": str(VOCABULARY)}, [block], results=store)
+            found[2] |= evaluate("orbslam3", {"vocabulary": str(VOCABULARY)}, [instance], results=store)
     names = ("with", "without", "ORB-SLAM3")
     medians = [
         f"{name} {1e3 * np.median([each.ate_m for each in outcomes.values()]):.1f} mm"
@@ -84,9 +84,9 @@ def readouts(part: str, options: argparse.Namespace) -> str:
             for each in FOLDERS[part].iterdir():
                 (folder / each.name).symlink_to(each)
             write_camera(folder / "camera.toml", type(camera)(**{**vars(camera), "readout_s": seconds}), fps=fps)
-            blocks = parse_blocks(f"{folder}?offsets=0-{options.starts - 1}")
+            instances = parse_instances(f"{folder}?offsets=0-{options.starts - 1}")
             source = own_masks(options.trackers[0], part)
-            runs = evaluate(options.trackers[0], source, blocks, results=RunStore(Path(scratch) / "runs"))
+            runs = evaluate(options.trackers[0], source, instances, results=RunStore(Path(scratch) / "runs"))
         told.append(f"{1e3 * seconds:g} ms: {1e3 * np.median([run.ate_m for run in runs.values()]):.1f} mm")
     return f"{options.trackers[0]}, {part}, by readout: {', '.join(told)}"
 

@@ -21,7 +21,7 @@ import numpy as np  # noqa: E402
 from steering_scene import FRAMES, STRIDE, SmallScene, construct, play  # noqa: E402
 
 from dynslam_bench.core.errors import DynslamError  # noqa: E402
-from dynslam_bench.core.steering import steerable_parameters  # noqa: E402
+from dynslam_bench.core.settings import online_parameters  # noqa: E402
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
 
@@ -50,7 +50,7 @@ def main() -> int:
     for name in options.trackers:
         spec = TRACKERS.get(name)
         base = play(construct(spec, scene), scene, options.frames)
-        for parameter in steerable_parameters(spec.settings()):
+        for parameter in online_parameters(spec.settings()):
             if not parameter.name.startswith(options.prefix):
                 continue
             cells, tracked = [], []

@@ -4,8 +4,8 @@
 
 Whole studies (race, choice, held-out check) over runs from a noise model with the measured spread between starts: every
 setting is as good as the default, up to a share of 0.15 in log that differs from scene to scene. `best trial` is what a
-study without the choice on unseen blocks would go by: the best trial's own value. The second table races settings of
-which the best is known; a run is one of a configuration on one block.
+study without the choice on unseen instances would go by: the best trial's own value. The second table races settings of
+which the best is known; a run is one of a configuration on one instance.
 """
 
 from __future__ import annotations

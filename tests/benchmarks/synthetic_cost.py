@@ -13,8 +13,7 @@ import time
 import numpy as np
 
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic
-from dynslam_bench.sequences.synthetic.frame_cache import encode_png
-from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
+from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence, encode_png
 
 TWIN = "synthetic/walking_xyz"
 

@@ -25,10 +25,10 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, TWIN_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import REPLICA_IDS, SYNTHETIC_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
-from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
+from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 
 VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
 CONTROLS = ("moving", "none", "frozen", "masked", "persons")
@@ -165,7 +165,7 @@ def table(rows: list[dict]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ids", nargs="*", default=list(TWIN_IDS))
+    parser.add_argument("ids", nargs="*", default=list(REPLICA_IDS))
     parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_judge")

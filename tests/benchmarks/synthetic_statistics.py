@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.sequences.synthetic import TWIN_IDS, open_synthetic
+from dynslam_bench.sequences.synthetic import REPLICA_IDS, open_synthetic
+from dynslam_bench.sequences.synthetic.renderer import view_of
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.sequences.synthetic.settings import FPS
-from dynslam_bench.sequences.synthetic.views import view_of
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 EXCERPTS = {
@@ -131,7 +131,7 @@ def row(name: str, sequence: Sequence, every: int) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     others = [f"synthetic/walking_xyz?scene={scene}" for scene in (1, 100)]
-    parser.add_argument("ids", nargs="*", default=[*TWIN_IDS, *others])
+    parser.add_argument("ids", nargs="*", default=[*REPLICA_IDS, *others])
     parser.add_argument("--every", type=int, default=15)
     parser.add_argument("--cache", type=Path, help="folder of rendered frames; default none are kept")
     parser.add_argument("--rendered", action="store_true", help="leave out the excerpts")

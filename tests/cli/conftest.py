@@ -28,8 +28,8 @@ def walk(tmp_path_factory):
     """The conformance scene as a folder in TUM layout."""
     import cv2
 
-    from dynslam_bench.geometry.tum_file import write_tum
-    from dynslam_bench.sequences.published.cameras import write_camera
+    from dynslam_bench.geometry.trajectory_files import write_tum
+    from dynslam_bench.sequences.cameras import write_camera
 
     scene, folder = CornerSequence(4), tmp_path_factory.mktemp("data") / "walk"
     lists = {"rgb": [], "depth": []}

@@ -11,8 +11,7 @@ import pytest
 from cli_errors import one_line
 
 from dynslam_bench.cli.app import expand_lists
-from dynslam_bench.geometry.kitti_file import write_kitti
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum, write_kitti
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.catalogue import catalogue
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS

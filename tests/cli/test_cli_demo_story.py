@@ -6,15 +6,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from dynslam_bench.cli import demo_story
-from dynslam_bench.cli.demo_story import PROBE_FRAMES, PROBE_S, estimate, measure, tell
+from dynslam_bench.cli import demo as demo_story
+from dynslam_bench.cli.demo import PROBE_FRAMES, PROBE_S, estimate, measure, tell
 from dynslam_bench.reports.model.row import RunRow
 
 
 def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100") -> RunRow:
     return RunRow(
         run_id=f"{tracker}{sequence}", kind="run here", tracker=tracker, label=tracker, sequence=sequence,
-        protocol_id="p", protocol_digest="d", held_ate_m=ate_m,
+        protocol_id="p", protocol_digest="d", hold_last_pose_ate_m=ate_m,
     )  # fmt: skip
 
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from dynslam_bench.cli.kernels import compile_flow, compile_tracking, compiled_ahead
-from dynslam_bench.flow.daisy.refinement import similarity_lucas_kanade
-from dynslam_bench.flow.searches.propagation import motions_of
-from dynslam_bench.slam.bundle.schur import adjust_bundle
-from dynslam_bench.slam.mapping.map_kernels import refresh
+from dynslam_bench.cli.demo import compile_flow, compile_tracking, compiled_ahead
+from dynslam_bench.flow.propagation import motions_of
+from dynslam_bench.flow.refinement import similarity_lucas_kanade
+from dynslam_bench.slam.bundle_adjustment import adjust_bundle
+from dynslam_bench.slam.map_kernels import refresh
 
 
 def program(folder: Path, text: str) -> str:
@@ -27,7 +27,7 @@ def program(folder: Path, text: str) -> str:
 NOTHING_IS_LEFT = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from dynslam_bench.cli.kernels import compile_flow, compile_tracking
+from dynslam_bench.cli.demo import compile_flow, compile_tracking
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.testing import CornerSequence
 
@@ -59,7 +59,7 @@ def test_it_uses_the_kernels_of_flow_and_of_the_map(monkeypatch: pytest.MonkeyPa
         adjusted.append(given)
         return adjust_bundle(*given)
 
-    monkeypatch.setattr("dynslam_bench.slam.mapping.local_mapping.adjust_bundle", noted)
+    monkeypatch.setattr("dynslam_bench.slam.local_mapping.adjust_bundle", noted)
     compile_flow()
     compile_tracking()
     for kernel in (similarity_lucas_kanade, motions_of, refresh):

@@ -15,10 +15,11 @@ from pathlib import Path
 import pytest
 from cli_errors import one_line
 
-from dynslam_bench.cli import output, run_rows, running
+from dynslam_bench.cli import output, running
+from dynslam_bench.cli import runs as run_rows
 from dynslam_bench.cli.output import progress
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.segmentation import build_segmenter
 from dynslam_bench.segmentation.networks import checkpoints
 

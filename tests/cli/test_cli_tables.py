@@ -5,7 +5,8 @@ import json
 import pytest
 from cli_errors import one_line
 
-from dynslam_bench.cli import output, run_rows
+from dynslam_bench.cli import output
+from dynslam_bench.cli import runs as run_rows
 from dynslam_bench.cli.output import fitted, write_table
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
 

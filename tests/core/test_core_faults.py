@@ -15,10 +15,17 @@ from faults import survey, tree
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.files import atomic_folder, replace_folder, sweep_temporary, write_atomic
-from dynslam_bench.core.locks import claimed, is_abandoned
+from dynslam_bench.core.files import (
+    TemporaryFolder,
+    atomic_folder,
+    claimed,
+    is_abandoned,
+    replace_folder,
+    sweep,
+    sweep_temporary,
+    write_atomic,
+)
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.core.temporary import TemporaryFolder, sweep
 
 BODY = bytes(range(256)) * 40
 

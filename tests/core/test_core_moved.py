@@ -22,9 +22,9 @@ DOCUMENTED = {
 STILL_THERE = {
     "dynslam_bench.features.registry": ("FeatureSpec",),
     "dynslam_bench.flow.registry": ("FlowSpec",),
-    "dynslam_bench.segmentation.registry": ("SegmenterContext", "SegmenterSpec"),
+    "dynslam_bench.segmentation.build_segmenter": ("SegmenterContext", "SegmenterSpec"),
     "dynslam_bench.sequences": ("DatasetSpec", "Frame", "FrameMasks", "MaskSource", "Sequence"),
-    "dynslam_bench.slam.outputs": ("KeyframeRecord", "MapOutputs"),
+    "dynslam_bench.slam.map_files": ("KeyframeRecord", "MapOutputs"),
     "dynslam_bench.trackers": ("Tracker", "TrackerContext", "TrackerSpec"),
 }
 

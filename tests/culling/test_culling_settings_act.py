@@ -24,25 +24,27 @@ from scenes import (
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, KeyframeView
 from dynslam_bench.core.settings import Settings, parameters
-from dynslam_bench.culling.blocks.box_depth import BoxDepthFilter
-from dynslam_bench.culling.blocks.box_depth_settings import BoxDepthSettings
-from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
-from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
-from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
-from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
-from dynslam_bench.culling.blocks.depth_ransac import person_set
-from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
-from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
-from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
-from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
-from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
-from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
-from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
+from dynslam_bench.culling.box_depth import BoxDepthFilter
+from dynslam_bench.culling.class_rule import ClassRuleFilter
+from dynslam_bench.culling.correlation_graph import CorrelationFilter
+from dynslam_bench.culling.depth_ransac import person_set
+from dynslam_bench.culling.epipolar import EpipolarFilter
+from dynslam_bench.culling.free_space import FreeSpaceFilter
 from dynslam_bench.culling.guard import GuardSettings, restore_starved
+from dynslam_bench.culling.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.multiview_depth import MultiViewFilter
+from dynslam_bench.culling.rigid_motion import RigidMotionFilter
+from dynslam_bench.culling.settings import (
+    BoxDepthSettings,
+    ClassRuleSettings,
+    CorrelationSettings,
+    DepthRansacSettings,
+    EpipolarSettings,
+    FreeSpaceSettings,
+    MovingVoteSettings,
+    MultiViewSettings,
+    RigidMotionSettings,
+)
 
 Verdict = Callable[[Any], Any]
 

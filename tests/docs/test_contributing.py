@@ -10,15 +10,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 CONTENT = {
-    "dynslam_bench/flow/searches/moth_flame.py": r"Eq\. 13",
-    "dynslam_bench/culling/blocks/epipolar.py": r"Eq\. 25|Eq\. 23",
-    "dynslam_bench/runs/storage/store.py": r"run\.json",
+    "dynslam_bench/flow/moth_flame.py": r"Eq\. 13",
+    "dynslam_bench/culling/epipolar.py": r"Eq\. 25|Eq\. 23",
+    "dynslam_bench/runs/store.py": r"run\.json",
     "reports/tables/": r"Table\(",
     "dynslam_bench/slam/pipeline.py": r"def track\(",
     "dynslam_bench/contracts/tracker.py": r"class Tracker\(Protocol\)",
     "dynslam_bench/trackers/systems/dynaslam.py": r"compose\(",
     "dynslam_bench/evaluation/protocol.py": r"class Protocol",
-    "dynslam_bench/slam/mapping/keyframes.py": r"def ",
+    "dynslam_bench/slam/keyframes.py": r"def ",
     "dynslam_bench/sequences/synthetic/people/": r"skeleton",
 }
 """What must be found behind each answer for it to be one."""

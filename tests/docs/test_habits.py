@@ -52,7 +52,7 @@ PRIVATE = {
 }
 """Private names that a test may use, each file with its reason."""
 CLOCK = {
-    "core/digests.py": "ages of files, which are stamped by that clock",
+    "core/fingerprint.py": "ages of files, which are stamped by that clock",
     "core/files.py": "ages of files, which are stamped by that clock",
 }
 """Where the clock of the wall decides anything: it may jump, the monotonic one may not."""

@@ -14,7 +14,7 @@ OPEN = {"dynslam_bench.contracts", "dynslam_bench.core.settings", "dynslam_bench
 COMPOSING = "dynslam_bench.trackers.systems.composition"
 """Puts filters on our back end: the one thing that a plug-in may take from us that is no contract."""
 
-RULES = "dynslam_bench.culling.blocks.semantic"
+RULES = "dynslam_bench.culling.semantic"
 """The filter that an own one is put beside."""
 
 

@@ -10,7 +10,7 @@ from documented_names import PAGES, ROOT
 
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.core.toml import parse_toml
-from dynslam_bench.sequences.published.cameras import read_camera
+from dynslam_bench.sequences.cameras import read_camera
 from dynslam_bench.suites import load_suite
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import read_study
@@ -106,7 +106,7 @@ def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(text)
     spec = read_study(tmp_path / "study.toml")
     settings = flatten(TRACKERS.get(spec.tracker).settings())
-    assert spec.blocks(*spec.tune) and spec.blocks(*spec.held_out) and spec.space.include
+    assert spec.instances(*spec.tune) and spec.instances(*spec.held_out) and spec.space.include
     for pattern in (*spec.space.include, *spec.space.fixed):
         assert any(name.startswith(pattern.rstrip("*")) for name in settings), pattern
 

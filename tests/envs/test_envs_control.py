@@ -10,10 +10,9 @@ import pytest
 from envs_toys import TARGET, ToySequence
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.core.steering import steerable_parameters
+from dynslam_bench.core.settings import Settings, online_parameters, tunable
 from dynslam_bench.envs import ActionMap, SlamEnv
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 
 
 class Group(Settings):
@@ -78,7 +77,7 @@ def test_the_neutral_action_is_the_settings_bit_for_bit() -> None:
 def test_every_neutral_action_of_every_tracker_is_its_default() -> None:
     count = 0
     for spec in all_specs():
-        names = [parameter.name for parameter in steerable_parameters(spec.settings())]
+        names = [parameter.name for parameter in online_parameters(spec.settings())]
         actions = ActionMap(spec.settings(), names)
         assert actions.settings(actions.neutral) == spec.settings() if names else not actions.parameters
         count += len(names)

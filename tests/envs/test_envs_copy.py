@@ -15,7 +15,7 @@ from envs_toys import TARGET, ToySequence
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.envs import DegradeFrames, SlamEnv
 from dynslam_bench.testing import CornerSequence
-from dynslam_bench.trackers.adapters.opencv_odometry import unavailable
+from dynslam_bench.trackers.adapters.odometry import unavailable
 
 STILL = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
 PROGRAM = f"""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynslam_bench.envs.reward import reward_named
+from dynslam_bench.envs.spaces import reward_named
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory

@@ -12,7 +12,7 @@ from envs_toys import TARGET, ToySequence
 import dynslam_bench.envs  # noqa: F401
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.envs import SlamEnv, SmallImages
-from dynslam_bench.envs.observation import MAX_DEPTH_M
+from dynslam_bench.envs.spaces import MAX_DEPTH_M
 
 
 def test_they_show_the_same_smaller() -> None:

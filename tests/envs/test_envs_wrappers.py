@@ -20,7 +20,7 @@ from dynslam_bench.envs import (
     SequenceSampler,
     SlamEnv,
 )
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 
 
 def play(env) -> list[tuple]:

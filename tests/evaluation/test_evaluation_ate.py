@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dynslam_bench.core.errors import EvaluationError
-from dynslam_bench.evaluation.ate import ate_rmse_m
+from dynslam_bench.evaluation.ape import ate_rmse_m
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry import se3

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG, align
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -8,7 +8,6 @@ from evaluation_walks import noisy, turned, walk
 
 from dynslam_bench.core.errors import EvaluationError, TrajectoryError
 from dynslam_bench.evaluation import PROTOCOLS, RPESpec, compare_protocols, evaluate, evaluate_files, get_protocol
-from dynslam_bench.geometry.kitti_file import write_kitti
 from dynslam_bench.geometry.rigs import (
     BONN_R_BODY_CAM,
     BONN_T_M,
@@ -19,7 +18,7 @@ from dynslam_bench.geometry.rigs import (
     nearest_rotation,
 )
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.trajectory_files import write_kitti, write_tum
 
 R_M = nearest_rotation(BONN_T_M[:3, :3])
 SCALE = float(np.cbrt(np.linalg.det(BONN_T_M[:3, :3])))

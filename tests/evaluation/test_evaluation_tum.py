@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate
-from dynslam_bench.evaluation.pairs import closest, random_pairs
+from dynslam_bench.evaluation.rpe import closest, random_pairs
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 EXPECTED_PAIRS = [[1107, 2782], [1047, 2715], [384, 2384]]

@@ -7,11 +7,10 @@ import pytest
 from dynslam_bench.contracts.features import FeatureExtractor, MaskedExtractor
 from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
-from dynslam_bench.features.build_extractor import build_extractor
 from dynslam_bench.features.orb import OrbExtractor, level_quotas, spread
-from dynslam_bench.features.registry import FEATURES
+from dynslam_bench.features.registry import FEATURES, build_extractor
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry.pixels import inside
+from dynslam_bench.geometry.camera import inside
 
 
 def texture(height=480, width=640, seed=0):
@@ -102,14 +101,14 @@ def test_what_lies_on_a_mask_takes_no_place_of_what_lies_outside():
     mask = np.zeros(image.shape, bool)
     mask[:, :576] = True  # nine tenths
     extractor = OrbExtractor(FeatureSettings(n_features=500))
-    plain, beside = extractor.extract(image), extractor.extract_beside(image, mask, share=0.3)
+    plain, beside = extractor.extract(image), extractor.extract_masked(image, mask, share=0.3)
     assert isinstance(extractor, MaskedExtractor)
     assert np.count_nonzero(~inside(mask, plain.xy)) < 100 < 400 < np.count_nonzero(~inside(mask, beside.xy)) <= 500
     on = inside(mask, plain.xy)
     assert np.array_equal(plain.xy[on], beside.xy[inside(mask, beside.xy)])
     assert np.all(np.diff(beside.octave) >= 0)
     assert len(np.unique(np.c_[beside.xy, beside.octave], axis=0)) == len(beside)
-    enough = extractor.extract_beside(image, mask, share=0.02)
+    enough = extractor.extract_masked(image, mask, share=0.02)
     assert np.array_equal(enough.xy, plain.xy) and np.array_equal(enough.descriptors, plain.descriptors)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.flow.searches.moth_flame import EMFOA, MothFlameRules, landed, opposites
+from dynslam_bench.flow.moth_flame import EMFOA, MothFlameRules, opposites, population_positions
 
 Floats = NDArray[np.float64]
 CAUCHY_SHARE = 0.01
@@ -117,7 +117,7 @@ def emfoa_minimise(
         moths = flames.copy()  # the best N of X and its opposites
     iterations = -(-(budget - spent) // population)
     for iteration in range(1, iterations + 1):
-        position = landed(np, moths, flames, iteration, iterations, rules, scale, rng.random)
+        position = population_positions(np, moths, flames, iteration, iterations, rules, scale, rng.random)
         moths = np.clip(position, low, high)
         evaluate(moths)
     return Minimum(flames[:, 0], values[:, 0], spent, np.asarray(history))

@@ -9,9 +9,9 @@ import torch
 from daisy_reference import describe, gaussian_weights
 from scipy import ndimage
 
-from dynslam_bench.flow.daisy import cost as matching
-from dynslam_bench.flow.daisy import layout
-from dynslam_bench.flow.daisy.maps import orientation_maps
+from dynslam_bench.flow import layout
+from dynslam_bench.flow import matching_cost as matching
+from dynslam_bench.flow.orientation_maps import orientation_maps
 from dynslam_bench.flow.settings import FlowSettings
 
 

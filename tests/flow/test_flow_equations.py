@@ -10,14 +10,13 @@ import pytest
 import torch
 from moth_flame_minimiser import emfoa_minimise
 
-from dynslam_bench.flow.daisy.cost import tables_for
-from dynslam_bench.flow.daisy.sparse import Pair, SparseDaisyFlow
-from dynslam_bench.flow.daisy.torch_sparse import TorchSparseFlow
-from dynslam_bench.flow.searches import moth_flame as rules
-from dynslam_bench.flow.searches.common import advance, scrambled
-from dynslam_bench.flow.searches.moth_flame_kernel import fly
+from dynslam_bench.flow import moth_flame as rules
+from dynslam_bench.flow.matching_cost import tables_for
+from dynslam_bench.flow.search_kernels import advance, fly, scrambled
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
+from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
+from dynslam_bench.flow.torch_flow import TorchSparseFlow
+from dynslam_bench.tuning.samplers import EmfoaSampler
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
 POPULATION, ITERATIONS = 6, 10
@@ -34,7 +33,7 @@ def picture(seed=0, shape=(144, 192)):
 
 def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
     """Eq. 8-18 for one population, a number at a time; flames best first."""
-    landed, progress = np.empty_like(moths), iteration / ITERATIONS
+    population_positions, progress = np.empty_like(moths), iteration / ITERATIONS
     left = rules.flame_counts(POPULATION, ITERATIONS, family)[iteration - 1]
     for i in range(POPULATION):
         for j in range(4):
@@ -44,10 +43,10 @@ def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
             if family.best_flame and iteration > ITERATIONS / 2:
                 a = 0.6 - 0.4 * progress
                 goal = (a * goal + (1 - a) * flames[0, j]) / (2 if family.half else 1)
-            landed[i, j] = abs(flames[i, j] - moths[i, j]) * np.exp(t) * np.cos(2 * np.pi * t) + goal
+            population_positions[i, j] = abs(flames[i, j] - moths[i, j]) * np.exp(t) * np.cos(2 * np.pi * t) + goal
             if family.cauchy and iteration <= ITERATIONS / 2:
-                landed[i, j] += np.tan(np.pi * (jumps[i, j] - 0.5)) * scale[j]
-    return landed
+                population_positions[i, j] += np.tan(np.pi * (jumps[i, j] - 0.5)) * scale[j]
+    return population_positions
 
 
 def drawn(seed, stepping):
@@ -76,7 +75,7 @@ def test_numpy_torch_and_the_kernel_fly_as_the_equations_say(family, iteration):
     for xp, cast in ((np, np.float64), (torch, torch.tensor)):
         numbers = iter((uniform, jumps))
         args = [cast(each) for each in (moths, flames, around, flames[:1])]
-        found = rules.flown(xp, *args, now, cast(scale), lambda _: cast(next(numbers)))  # noqa: B023
+        found = rules.moth_positions(xp, *args, now, cast(scale), lambda _: cast(next(numbers)))  # noqa: B023
         np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-5, atol=1e-4)
     table = rules.flight_table(POPULATION, ITERATIONS, family)
     box = np.full(4, 1e9, np.float32)

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.flow.dense.guided_filter import filter_patch
-from dynslam_bench.flow.dense.labels import DenseDaisyFlow, consistent
-from dynslam_bench.flow.dense.superpixels import superpixels
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow, consistent
+from dynslam_bench.flow.dense_kernels import filter_patch, superpixels
 from dynslam_bench.flow.settings import FlowSettings
 
 

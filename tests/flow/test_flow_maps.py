@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.daisy import layout
-from dynslam_bench.flow.daisy.maps import framed, half_image, orientation_maps
-from dynslam_bench.flow.daisy.torch_maps import _binomial
-from dynslam_bench.flow.kernels.buffers import BufferPool
+from dynslam_bench.flow import layout
+from dynslam_bench.flow.orientation_maps import framed, half_image, orientation_maps
+from dynslam_bench.flow.registry import build_flow
+from dynslam_bench.flow.torch_flow import _binomial
+from dynslam_bench.flow.workers import BufferPool
 
 
 def noise(shape, seed=0):

@@ -7,7 +7,7 @@ import pytest
 from moth_flame_minimiser import emfoa_minimise
 from scipy.optimize import differential_evolution
 
-from dynslam_bench.flow.searches.moth_flame import EMFOA, EMFOA_LITERAL, MFO, flame_counts
+from dynslam_bench.flow.moth_flame import EMFOA, EMFOA_LITERAL, MFO, flame_counts
 
 SHIFT = np.array([1.3, -0.7, 2.1, -1.9])
 

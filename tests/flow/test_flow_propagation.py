@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynslam_bench.flow.searches.propagation import better_half
+from dynslam_bench.flow.propagation import better_half
 
 
 @pytest.mark.parametrize("count", [4, 5, 9, 60])

@@ -10,7 +10,7 @@ import pytest
 
 from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.core.settings import Parameter, parameters
-from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 
 FLAVOURS = {

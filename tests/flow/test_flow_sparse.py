@@ -11,14 +11,13 @@ import pytest
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.core.errors import PluginError, SettingsError
 from dynslam_bench.core.settings import apply_overrides, parameters
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.daisy.cost import tables_for
-from dynslam_bench.flow.daisy.sparse import Pair, SparseDaisyFlow
-from dynslam_bench.flow.registry import FLOWS
-from dynslam_bench.flow.searches.common import new_state
-from dynslam_bench.flow.searches.propagation import common_motions
-from dynslam_bench.flow.searches.schedule import make_plan
+from dynslam_bench.flow.label_search import make_plan
+from dynslam_bench.flow.matching_cost import tables_for
+from dynslam_bench.flow.propagation import common_motions
+from dynslam_bench.flow.registry import FLOWS, build_flow
+from dynslam_bench.flow.search_kernels import new_state
 from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SEARCHES = [
@@ -383,7 +382,7 @@ def test_plugins(tmp_path):
     path = tmp_path / "my_flow.py"
     path.write_text(
         "from dynslam_bench.flow.registry import FlowSpec\n"
-        "from dynslam_bench.flow.lucas_kanade import LucasKanadeFlow\n"
+        "from dynslam_bench.flow.opencv import LucasKanadeFlow\n"
         f"SPEC = FlowSpec('mine', {str(path)!r} + ':make')\n"
         f"BROKEN = FlowSpec('broken', {str(path)!r} + ':boom')\n"
         f"WRONG = FlowSpec('wrong', {str(path)!r} + ':wrong')\n"

@@ -8,14 +8,18 @@ import pytest
 import torch
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.daisy import cost as matching
-from dynslam_bench.flow.daisy.maps import orientation_maps
-from dynslam_bench.flow.daisy.torch_maps import quantised_maps
-from dynslam_bench.flow.daisy.torch_sparse import TorchSparseFlow
-from dynslam_bench.flow.searches.schedule import STRATEGIES
-from dynslam_bench.flow.searches.torch_search import label_costs, rotated_descriptors, torch_tables
+from dynslam_bench.flow import matching_cost as matching
+from dynslam_bench.flow.label_search import STRATEGIES
+from dynslam_bench.flow.orientation_maps import orientation_maps
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.torch_flow import (
+    TorchSparseFlow,
+    label_costs,
+    quantised_maps,
+    rotated_descriptors,
+    torch_tables,
+)
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 

@@ -20,16 +20,16 @@ import torch
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core import image_header, images
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.masks import recorded
-from dynslam_bench.segmentation.networks.mask_rcnn import loading
-from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig
-from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
-from dynslam_bench.segmentation.networks.onnx import header as onnx
+from dynslam_bench.segmentation import recorded
+from dynslam_bench.segmentation.networks import loading
+from dynslam_bench.segmentation.networks import onnx_header as onnx
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig
+from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.training.prepared import PreparedImages
-from dynslam_bench.sequences.published import archives
+from dynslam_bench.sequences import archives
 from dynslam_bench.sequences.readers import images as reader
-from dynslam_bench.sequences.synthetic.frame_cache import FrameStore, encode_png, is_intact_png
-from dynslam_bench.trackers.adapters import vocabulary
+from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png, is_intact_png
+from dynslam_bench.trackers.adapters import orbslam3 as vocabulary
 
 from .mutate import mutate, mutate_png
 from .target import Target, at

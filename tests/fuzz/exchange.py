@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.contracts.map_outputs import MapOutputs
-from dynslam_bench.runs.exchange import colmap, pose_tables, provenance, reading
-from dynslam_bench.runs.exchange.provenance import PROVENANCE_FILE, Provenance
-from dynslam_bench.slam.outputs import map_files
+from dynslam_bench.contracts.tracker import MapOutputs
+from dynslam_bench.runs.exchange import export as provenance
+from dynslam_bench.runs.exchange import formats as colmap
+from dynslam_bench.runs.exchange import formats as pose_tables
+from dynslam_bench.runs.exchange import formats as reading
+from dynslam_bench.runs.exchange.export import PROVENANCE_FILE, Provenance
+from dynslam_bench.slam import map_files
 
 from .target import Target, at
 

@@ -12,18 +12,18 @@ import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.readers import (
-    arrays,
-    bodies,
     eth3d,
     euroc,
     icl_nuim,
-    nanoseconds,
     openloris,
     seven_scenes,
     tartanair_shibuya,
     vslam_lab,
-    yaml_numbers,
 )
+from dynslam_bench.sequences.readers import images as arrays
+from dynslam_bench.sequences.readers import tables as bodies
+from dynslam_bench.sequences.readers import tables as nanoseconds
+from dynslam_bench.sequences.readers import tables as yaml_numbers
 from dynslam_bench.sequences.readers.layouts import layout_of
 from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
 

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.mapping import map_store, saved_map, saved_map_faults
-from dynslam_bench.slam.mapping.saved_map import HEADER, MapFeatures, MapHeader, described
+from dynslam_bench.slam import atlas as map_store
+from dynslam_bench.slam import map_files as saved_map
+from dynslam_bench.slam import map_files as saved_map_faults
+from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 
 from .records import rezipped
 from .target import Target, at
@@ -26,7 +28,7 @@ def _sound() -> dict[str, Any]:
     )
     return {
         HEADER: np.frombuffer(header.to_json().encode(), np.uint8),
-        "kf_id": np.array([0, 2]), "kf_island": np.array([0, 1]), "kf_pose": np.tile(np.eye(4), (2, 1, 1)),
+        "kf_id": np.array([0, 2]), "kf_map": np.array([0, 1]), "kf_pose": np.tile(np.eye(4), (2, 1, 1)),
         "kf_count": np.array([3, 2]), "kf_raw": np.full((5, 2), 4.0, np.float32), "kf_response": np.ones(5, np.float32),
         "kf_xy": np.full((5, 2), 4.0), "kf_right": np.array([1.0, np.nan, 1.0, 1.0, 1.0]),
         "kf_z": np.array([1, 0, 1, 1, 1], np.float32), "kf_octave": np.array([0, 1, 2, 7, 0], np.int8),
@@ -36,8 +38,8 @@ def _sound() -> dict[str, Any]:
         "far": np.ones(2), "words": np.zeros((2, 4), np.uint64), "rgb": np.zeros((2, 3), np.uint8),
         "visible": np.ones(2, np.int32), "found": np.ones(2, np.int32), "born": np.array([0, 1]),
         "n_obs": np.array([2, 2], np.int32), "obs_kf": np.array([0, 1, 0, 1], np.int32),
-        "obs_ft": np.array([2, 0, 0, 1], np.int32), "island_start": np.zeros((1, 3)),
-        "island_anchor": np.zeros((1, 3)), "island_reach": np.array([np.inf]),
+        "obs_ft": np.array([2, 0, 0, 1], np.int32), "submap_start": np.zeros((1, 3)),
+        "submap_anchor": np.zeros((1, 3)), "submap_reach": np.array([np.inf]),
     }  # fmt: skip
 
 
@@ -63,12 +65,12 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 def _read(data: bytes | None, folder: Path) -> None:
     """What is read is worked on as a run does, whose compiled loops check no index."""
-    world, islands = map_store.begin_map(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    world, submaps = map_store.begin_map(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
     world.refresh(world.points)
     for slot in world.keyframes.tolist():
         world.covisible(slot)
         world.project(world.kf_pose[slot], world.points)
-    map_store.packed(world, islands)
+    map_store.packed(world, submaps)
     world.remove_keyframe(int(world.keyframes[0]))
 
 
@@ -77,7 +79,7 @@ TARGETS = [
         "map of a run",
         _read,
         _seeds,
-        (saved_map.read_map, saved_map_faults, map_store.restored, map_store._table, map_store._islands),
+        (saved_map.read_map, saved_map_faults, map_store.restored, map_store._table, map_store._submaps),
         rezipped,
     )
 ]

@@ -19,17 +19,20 @@ from dynslam_bench.core import array_files, reading
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the cache reads
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports.model import known_rows
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs import RunRecord, RunStore, snapshots
-from dynslam_bench.runs import frame_row as rows
-from dynslam_bench.runs.storage import line_file, packing, run_index, run_list
-from dynslam_bench.runs.storage.evaluating import evaluate_run
-from dynslam_bench.runs.storage.frame_table import load_frames
-from dynslam_bench.runs.storage.frames import FrameLog
+from dynslam_bench.reports.model import load as known_rows
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.runs import RunRecord, RunStore, run_index, run_list
+from dynslam_bench.runs import artifacts as snapshots
+from dynslam_bench.runs import frames as rows
+from dynslam_bench.runs import many as packing
+from dynslam_bench.runs import run_index as line_file
+from dynslam_bench.runs.frames import FrameLog, load_frames
+from dynslam_bench.runs.scoring import evaluate_run
 from dynslam_bench.sequences.fetch import Receipt
-from dynslam_bench.tuning import Study, StudySummary, cmaes_state, python_study
-from dynslam_bench.tuning import frame as study_frame
+from dynslam_bench.tuning import Study, StudySummary
+from dynslam_bench.tuning import storage as cmaes_state
+from dynslam_bench.tuning import study as python_study
+from dynslam_bench.tuning import trials as study_frame
 
 from .mutate import mutate, mutate_json, mutate_lines
 from .target import Target, at
@@ -95,7 +98,7 @@ def _read_known_rows(data: bytes | None, folder: Path) -> None:
     at(store.root / "metrics" / protocol.digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
     for file in store.root.rglob("*.*"):
         os.utime(file, (1, 1))  # lines that were made of another copy hold
-    path = known_rows.KnownRows(store, protocol)._path  # only it knows the name
+    path = known_rows.RowCache(store, protocol)._path  # only it knows the name
     at(path.parent, path.name, data)
     loaded = load_runs([store], protocol)
     assert [run.row.run_id for run in loaded.runs] == [RUN] and not loaded.unreadable
@@ -301,7 +304,7 @@ TARGETS = [
         "known rows of a report",
         _read_known_rows,
         lambda: [_known_rows()],
-        (known_rows.KnownRows.read, known_rows.KnownRows._holds, known_rows.KnownRow.of, *_LINE_FILE),
+        (known_rows.RowCache.read, known_rows.RowCache._holds, known_rows.CachedRow.of, *_LINE_FILE),
         mutate_lines,
     ),
     Target(

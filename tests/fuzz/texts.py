@@ -10,15 +10,17 @@ import cv2
 import numpy as np
 
 from dynslam_bench.cli.output import _text  # how a cell of a table is written
-from dynslam_bench.core import address, harmless, reading, toml
+from dynslam_bench.core import download as address
+from dynslam_bench.core import reading, toml
+from dynslam_bench.core import sanitise as harmless
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.geometry import kitti_file, tum_file
+from dynslam_bench.geometry import trajectory_files as kitti_file
+from dynslam_bench.geometry import trajectory_files as tum_file
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.masks import recorded
-from dynslam_bench.segmentation.training import labelled_files as labels
-from dynslam_bench.sequences import catalogue, fetch
-from dynslam_bench.sequences.published import cameras
+from dynslam_bench.segmentation import recorded
+from dynslam_bench.segmentation.training import labelled_images as labels
+from dynslam_bench.sequences import cameras, catalogue, fetch
 from dynslam_bench.sequences.readers import lists, tum
 from dynslam_bench.sequences.readers import recorded as recorded_sequence
 from dynslam_bench.sequences.readers.recorded import Description
@@ -26,7 +28,8 @@ from dynslam_bench.sequences.synthetic import ids as synthetic
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.slam.settings import TrackingSettings
 from dynslam_bench.suites import suite
-from dynslam_bench.trackers.adapters import answers, program
+from dynslam_bench.trackers.adapters import program
+from dynslam_bench.trackers.adapters import subprocess_tracker as answers
 from dynslam_bench.tuning import study_file
 
 from .mutate import mutate_json

@@ -7,9 +7,8 @@ import pytest
 
 from dynslam_bench.core.errors import DynslamError, TrajectoryError
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.kitti_file import read_kitti, write_kitti
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import format_tum, load_tum, read_tum, write_tum
+from dynslam_bench.geometry.trajectory_files import format_tum, load_tum, read_kitti, read_tum, write_kitti, write_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -16,7 +16,7 @@ def rows_of(path):
 def row(tracker="a", sequence="s", error=0.1, **changes):
     base = dict(
         run_id="r", kind="run here", tracker=tracker, label=tracker.upper(), sequence=sequence, protocol_id="p",
-        protocol_digest="d", metrics={"ate_rmse_m": error, "rpe_1s_trans_rmse_m": error / 2}, held_ate_m=error,
+        protocol_digest="d", metrics={"ate_rmse_m": error, "rpe_1s_trans_rmse_m": error / 2}, hold_last_pose_ate_m=error,
         static_camera_ate_rmse_m=0.3, coverage=1.0, n_frames=60, n_processed=60, n_tracked=60,
     )  # fmt: skip
     return RunRow(**(base | changes))

@@ -9,8 +9,16 @@ from dynslam_bench.evaluation.protocol import PROTOCOLS, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports import audit as audit_module
 from dynslam_bench.reports.audit import CHECKS, OURS, audit_paper
-from dynslam_bench.reports.model.published import Claimed, claimed, published, reported_for
-from dynslam_bench.reports.model.records import HOW, KINDS, records, records_for
+from dynslam_bench.reports.model.published import (
+    HOW,
+    KINDS,
+    Claimed,
+    claimed,
+    published,
+    records,
+    records_for,
+    reported_for,
+)
 
 
 @pytest.fixture(scope="module")

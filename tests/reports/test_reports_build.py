@@ -15,13 +15,13 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
-from dynslam_bench.reports.figures.sequence import broken
+from dynslam_bench.reports.figures import broken
 from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.load import check_one_protocol, load_runs
 from dynslam_bench.reports.model.row import RunRow
-from dynslam_bench.reports.model.rows import check_one_protocol, load_runs
+from dynslam_bench.reports.tables.errors import per_sequence
 from dynslam_bench.reports.tables.leaderboard import leaderboard
-from dynslam_bench.reports.tables.sequences import per_sequence
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.runs.store import RunStore
 
 
 class Page(HTMLParser):

@@ -9,8 +9,8 @@ from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.runs.store import RunStore
 
 
 @pytest.fixture

@@ -5,11 +5,10 @@ from reports_rows import PROTOCOL, row, rows_of
 
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.columns import name_columns, shortened
-from dynslam_bench.reports.model.labels import make_labels
+from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.missing import missing_commands, run_command
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.runs.store import RunStore
 
 
 def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):

@@ -12,10 +12,10 @@ from reports_rows import row
 from dynslam_bench.core.errors import InfrastructureError, ReportError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.model import crew
-from dynslam_bench.reports.model.rows import LoadedRun
-from dynslam_bench.runs.process.server import child_environment
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model import load as crew
+from dynslam_bench.reports.model.load import LoadedRun
+from dynslam_bench.runs.process.fork_server import child_environment
+from dynslam_bench.runs.store import RunStore
 
 
 def contents(folder):

@@ -10,14 +10,12 @@ from reports_rows import PROTOCOL, crashed, row, rows_of
 from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.figures.leaderboard import mask_figure, repeat_figure
-from dynslam_bench.reports.figures.style import log_axis
-from dynslam_bench.reports.html.run_frames import exact_shares, read_tables
+from dynslam_bench.reports.figures import log_axis, mask_figure, repeat_figure
+from dynslam_bench.reports.html.run_page import exact_shares, read_tables
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables.runs import repeatability
-from dynslam_bench.runs.storage.scoring import score
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.runs.store import RunStore, score
 
 BEFORE_REBUILD = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
 HEAD = b"index,timestamp,state,frame_error_trans_m,dynamic_share\n"

@@ -10,9 +10,9 @@ from reports_fake_store import add_run
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report, load_board
 from dynslam_bench.reports.model.board import Board
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs.storage.record import IDENTITY_SCHEME
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.runs.record import IDENTITY_SCHEME
+from dynslam_bench.runs.store import RunStore
 
 SEQUENCES = ("synthetic/walking_xyz", "synthetic/walking_static")
 

@@ -10,9 +10,8 @@ from reports_fake_store import add_run, fill, truth_of
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import format_tum
-from dynslam_bench.reports.model.known_rows import KnownRows
-from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.geometry.trajectory_files import format_tum
+from dynslam_bench.reports.model.load import RowCache, load_runs
 from dynslam_bench.runs import RunStore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
@@ -240,5 +239,5 @@ def test_a_reference_is_looked_for_among_known_and_new_rows(store, reads):
 def test_nothing_is_made_where_no_run_is(tmp_path):
     with pytest.raises(ReportError, match="no runs"):
         load_runs([RunStore(tmp_path / "nowhere")], PROTOCOL)
-    assert KnownRows(RunStore(tmp_path / "nowhere"), PROTOCOL).take_all([], print) == ([], [])
+    assert RowCache(RunStore(tmp_path / "nowhere"), PROTOCOL).take_all([], print) == ([], [])
     assert list(tmp_path.iterdir()) == []

@@ -9,13 +9,13 @@ from reports_rows import row
 
 from dynslam_bench.core import reading
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import ReportData, build_report
-from dynslam_bench.reports.figures import leaderboard as figures
-from dynslam_bench.reports.html import explore_data, sections
+from dynslam_bench.reports import ReportData, build_report, figures
+from dynslam_bench.reports.html import explore as explore_data
+from dynslam_bench.reports.html import sections
 from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
-from dynslam_bench.reports.model import common
+from dynslam_bench.reports.model import common_frames as common
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.rows import Loaded, LoadedRun, load_runs
+from dynslam_bench.reports.model.load import Loaded, LoadedRun, load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
 from dynslam_bench.runs import RunStore

@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 from reports_fake_store import add_run
 
-from dynslam_bench.cli.run_rows import seen_note
+from dynslam_bench.cli.runs import seen_note
 from dynslam_bench.reports import build_report, compare, load_board
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s
-from dynslam_bench.runs.storage.store import RunStore
-from dynslam_bench.segmentation.training_set import seen_in_training
+from dynslam_bench.runs.store import RunStore
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.trackers import TRACKERS
 
 OLD, NEW = "synthetic/walking_xyz?scene=3", "synthetic/walking_xyz?scene=103"

@@ -7,7 +7,7 @@ from reports_fake_store import add_run
 
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
-from dynslam_bench.reports.model.rows import load_runs
+from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs import RunStore, score
 
 

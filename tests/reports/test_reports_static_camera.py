@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reports_rows import PROTOCOL, crashed, row
 
-from dynslam_bench.cli.presentation import show_top
+from dynslam_bench.cli.reports import show_top
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 

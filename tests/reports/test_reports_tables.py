@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dynslam_bench.reports.tables.latex import to_latex
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_markdown
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown
 
 
 def test_best_and_second_share_their_marks():

@@ -10,15 +10,15 @@ from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
 from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
-from dynslam_bench.reports.html.explore_data import FrameSums, summarise
+from dynslam_bench.reports.html.explore import FrameSums, summarise
 from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.reports.tables.formats import mm, percent
+from dynslam_bench.reports.tables.errors import per_sequence, relative_errors
 from dynslam_bench.reports.tables.leaderboard import leaderboard
-from dynslam_bench.reports.tables.sequences import per_sequence, relative_errors
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.tables.table import mm, percent
+from dynslam_bench.runs.store import RunStore
 
 # -- what ranks
 
@@ -32,7 +32,7 @@ def test_losing_frames_is_not_free(tmp_path):
     board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
     assert [board.labels[key] for key in board.trackers] == ["steady", "loser"]
     loser = next(r for r in board.rows if r.tracker == "loser")
-    assert loser.score_m == loser.held_ate_m > 5 * loser.metrics["ate_rmse_m"]
+    assert loser.score_m == loser.hold_last_pose_ate_m > 5 * loser.metrics["ate_rmse_m"]
     paths = build_report(store, tmp_path / "report")
     shown = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv["per_sequence"])}
     excluded = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv["lost_frames_excluded"])}
@@ -46,8 +46,8 @@ def test_losing_frames_is_not_free(tmp_path):
 
 def test_a_failure_never_scores_better_than_not_moving():
     assert crashed().score_m == 0.3
-    assert crashed(held_ate_m=0.7).score_m == 0.7
-    assert crashed(held_ate_m=None, metrics={}).score_m == 0.3
+    assert crashed(hold_last_pose_ate_m=0.7).score_m == 0.7
+    assert crashed(hold_last_pose_ate_m=None, metrics={}).score_m == 0.3
     assert crashed(static_camera_ate_rmse_m=None).score_m is None
 
 

@@ -14,13 +14,12 @@ from dynslam_bench.core.errors import DynslamError, ReportError, RunError
 from dynslam_bench.core.records import Record
 from dynslam_bench.evaluation.evaluate import SCHEMA_VERSION as EVALUATION
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.model.report_data import SCHEMA_VERSION as REPORT
-from dynslam_bench.reports.model.report_data import ReportData
+from dynslam_bench.reports.model.row import SCHEMA_VERSION as REPORT
+from dynslam_bench.reports.model.row import ReportData
 from dynslam_bench.runs import RunRecord, RunStore, score
-from dynslam_bench.runs.frame_row import read_csv, read_log
-from dynslam_bench.runs.storage.frames import FrameLog
-from dynslam_bench.runs.storage.packing import pack, unpack
-from dynslam_bench.runs.storage.record import METRIC_SCHEMA, RUN_SCHEMA, MetricRecord
+from dynslam_bench.runs.frames import FrameLog, read_csv, read_log
+from dynslam_bench.runs.many import pack, unpack
+from dynslam_bench.runs.record import METRIC_SCHEMA, RUN_SCHEMA, MetricRecord
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore
 from dynslam_bench.sequences.fetch import Receipt
 
@@ -117,7 +116,7 @@ def test_a_store_that_can_only_be_read_is_scored(store: RunStore, monkeypatch: p
     def refuse(*_: object) -> None:
         raise DynslamError("cannot write: Read-only file system")
 
-    monkeypatch.setattr("dynslam_bench.runs.storage.store.write_atomic", refuse)  # root may write anywhere
+    monkeypatch.setattr("dynslam_bench.runs.store.write_atomic", refuse)  # root may write anywhere
     assert score(store, store.read(BAD), "evo-default").metrics["ate_rmse_m"] > 0
     assert len(store.frame("evo-default")) == 2
 

@@ -11,16 +11,16 @@ import pytest
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
-from dynslam_bench.contracts.map_outputs import MapOutputs
+from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core.errors import DynslamError, RunError, TrajectoryError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.runs import RunRecord, RunStore, export_run, import_trajectory, read_trajectory
-from dynslam_bench.runs.exchange.colmap import read_colmap, write_colmap
-from dynslam_bench.runs.exchange.provenance import Provenance, stated_provenance
-from dynslam_bench.slam.outputs.map_files import read_ply, write_ply
+from dynslam_bench.runs.exchange.export import Provenance, stated_provenance
+from dynslam_bench.runs.exchange.formats import read_colmap, write_colmap
+from dynslam_bench.slam.map_files import read_ply, write_ply
 
 TOLERANCE = 1e-6
 FILES = {

@@ -11,7 +11,7 @@ from faults import survey, tree
 
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs import MetricRecord, RunRecord, RunStore
-from dynslam_bench.runs.storage.store import RUN_FILE
+from dynslam_bench.runs.store import RUN_FILE
 
 DATA = Path(__file__).parent / "data"
 RECORD = RunRecord.read(DATA / "run_v1.json")

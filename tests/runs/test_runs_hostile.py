@@ -11,7 +11,7 @@ import hostile
 import pytest
 
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_one
-from dynslam_bench.runs.process import memory as memory_module
+from dynslam_bench.runs.process import tree as memory_module
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 

@@ -16,12 +16,10 @@ import hostile
 import pytest
 
 from dynslam_bench.core.errors import InfrastructureError
-from dynslam_bench.core.temporary import SHARED_MEMORY
+from dynslam_bench.core.files import SHARED_MEMORY
 from dynslam_bench.runs import Limits, RunSpec, RunStore, run_many, run_one
-from dynslam_bench.runs.process.handle import Child, ForkedChild
-from dynslam_bench.runs.process.job import make_job
-from dynslam_bench.runs.process.server import SERVER
-from dynslam_bench.runs.process.supervise import supervise
+from dynslam_bench.runs.process.fork_server import SERVER, Child, ForkedChild, make_job
+from dynslam_bench.runs.process.supervisor import supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 

@@ -13,12 +13,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 from reports_fake_store import add_run
 
 from dynslam_bench.core.errors import DynslamError, RunError, StudyError
-from dynslam_bench.core.locks import claimed
+from dynslam_bench.core.files import claimed
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunStore
-from dynslam_bench.runs.storage.run_index import index_file
-from dynslam_bench.runs.storage.run_list import list_runs
-from dynslam_bench.tuning.journal_file import WholeLines
+from dynslam_bench.runs.run_index import index_file
+from dynslam_bench.runs.run_list import list_runs
+from dynslam_bench.tuning.storage import JournalFile
 
 SECRET = "the user's own words"
 
@@ -101,5 +101,5 @@ def test_nothing_is_written_through_links(filled: tuple[RunStore, str], outside:
     journal = tmp_path / "journal.log"
     journal.symlink_to(outside)
     with pytest.raises(StudyError, match="is a link"):
-        WholeLines(journal)
+        JournalFile(journal)
     assert outside.read_text() == SECRET

@@ -13,10 +13,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 from reports_fake_store import add_run
 
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.runs import RunStore
-from dynslam_bench.runs.storage import run_index, run_list
-from dynslam_bench.runs.storage.run_index import FIELDS, run_row
-from dynslam_bench.runs.storage.run_list import list_runs
+from dynslam_bench.runs import RunStore, run_index, run_list
+from dynslam_bench.runs.run_index import FIELDS, run_row
+from dynslam_bench.runs.run_list import list_runs
 
 
 @pytest.fixture
@@ -143,7 +142,7 @@ def test_an_index_of_another_version_goes(filled, monkeypatch):
     store, _ = filled
     rows, _ = list_runs(store)
     first = index_of(store)
-    monkeypatch.setattr("dynslam_bench.runs.storage.run_index.package_digest", lambda packages: "another")
+    monkeypatch.setattr("dynslam_bench.runs.run_index.package_digest", lambda packages: "another")
     assert list_runs(store) == (rows, [])
     assert index_of(store) != first
 

@@ -14,9 +14,9 @@ from envs_toys import TARGET, truth
 
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_tum, write_tum
+from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
-from dynslam_bench.runs.storage.packing import pack, unpack
+from dynslam_bench.runs.many import pack, unpack
 
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:

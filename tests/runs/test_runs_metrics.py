@@ -9,8 +9,8 @@ from envs_toys import TARGET
 
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunRecord, RunSpec, RunStore, run_one, score
-from dynslam_bench.runs.storage.run_list import list_runs
-from dynslam_bench.runs.storage.scoring import rescore
+from dynslam_bench.runs.run_list import list_runs
+from dynslam_bench.runs.store import rescore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 
@@ -59,7 +59,7 @@ def test_errors_of_other_evaluation_code_are_computed_again(
     wrong = stored.online.model_copy(update={"metrics": doubled})
     store.add_metrics(stored.model_copy(update={"online": wrong, "code": "of an older version"}))
     assert score(store, record).metrics == stored.metrics
-    monkeypatch.setattr("dynslam_bench.runs.storage.store.evaluation_code", lambda: "newer")
+    monkeypatch.setattr("dynslam_bench.runs.store.evaluation_code", lambda: "newer")
     assert store.metrics(record, PROTOCOL) is None
     assert score(store, record).code == "newer"
 

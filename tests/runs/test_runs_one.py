@@ -15,10 +15,9 @@ from envs_toys import TARGET, truth, write_folder
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.evaluate import evaluate
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, resolve, run_one, score
-from dynslam_bench.runs.frame_row import FrameRow, read_csv
-from dynslam_bench.runs.storage.frames import FrameLog
+from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
 
 
 def leftovers(store: RunStore) -> list[str]:

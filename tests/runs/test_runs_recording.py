@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from envs_toys import CAMERA, TARGET, write_folder
 
-from dynslam_bench.contracts.map_outputs import MapOutputs
+from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core.errors import RunError
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.runs import RunSpec, RunStore, export_run, run_one
+from dynslam_bench.runs.artifacts import read_snapshots
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, RecordingWriter, check_rerun
-from dynslam_bench.runs.snapshots import read_snapshots
-from dynslam_bench.slam.outputs.map_files import write_ply
+from dynslam_bench.slam.map_files import write_ply
 
 try:
     from rerun import chunk

@@ -14,7 +14,7 @@ from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
 from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.recorded import RecordedSegmenter
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 from dynslam_bench.tuning import StudySpec, Tuner
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
-from dynslam_bench.runs.frame_row import FIXED, FrameRow, read_csv, read_log, write_csv
-from dynslam_bench.runs.snapshots import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
+from dynslam_bench.runs.artifacts import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
+from dynslam_bench.runs.frames import FIXED, FrameRow, read_csv, read_log, write_csv
 
 SHAPE = (48, 65, 3)
 

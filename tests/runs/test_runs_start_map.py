@@ -8,22 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
+from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import RunError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.labels import make_labels
-from dynslam_bench.reports.model.make_row import make_row
 from dynslam_bench.reports.model.missing import run_command
-from dynslam_bench.reports.model.row_values import variant_of
+from dynslam_bench.reports.model.names import make_labels
+from dynslam_bench.reports.model.row import make_row, variant_of
 from dynslam_bench.runs import RunSpec, RunStore, run_many
-from dynslam_bench.runs.identity import resolve
-from dynslam_bench.runs.kept_map import keep_map
-from dynslam_bench.runs.start_map import check_unchanged, start_map_of
-from dynslam_bench.runs.storage.run_index import run_row
-from dynslam_bench.runs.storage.run_table import runs_frame
-from dynslam_bench.slam.mapping.saved_map import MAP_FILE, SavedMap, read_map, write_map
+from dynslam_bench.runs.artifacts import keep_map
+from dynslam_bench.runs.identity import check_unchanged, resolve, start_map_of
+from dynslam_bench.runs.run_index import run_row, runs_frame
+from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 
 SEQUENCE = "synthetic/walking_xyz"

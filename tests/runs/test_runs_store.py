@@ -15,7 +15,7 @@ import pytest
 from envs_toys import TARGET
 
 from dynslam_bench.core.errors import DynslamError, RunError
-from dynslam_bench.core.machine import versions
+from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.runs import MetricRecord, RunRecord, RunSpec, RunStore, identity, resolve, run_one, score
 
 HERE = Path(__file__).parent
@@ -94,7 +94,7 @@ def test_an_edited_plug_in_that_a_setting_names_is_another_run(
     specs = {
         "features.extractor": "from dynslam_bench.features.registry import FeatureSpec as Spec",
         "flow.plugin": "from dynslam_bench.flow.registry import FlowSpec as Spec",
-        "segmentation.source": "from dynslam_bench.segmentation.registry import SegmenterSpec as Spec",
+        "segmentation.source": "from dynslam_bench.segmentation.build_segmenter import SegmenterSpec as Spec",
     }
     for name, text in specs.items():
         plugin = tmp_path / name / "mine.py"

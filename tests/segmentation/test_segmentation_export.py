@@ -11,15 +11,21 @@ import torch
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.networks import onnx_export as static
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig
+from dynslam_bench.segmentation.networks.boxes import box_iou, nms
 from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
-from dynslam_bench.segmentation.networks.mask_rcnn import static
-from dynslam_bench.segmentation.networks.mask_rcnn.box_ops import box_iou, nms
-from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig
-from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
-from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import MaskRCNNSegmenter
-from dynslam_bench.segmentation.networks.mask_rcnn.static import StaticMaskRCNN, overlap, unsuppressed
-from dynslam_bench.segmentation.networks.onnx.export import parse_size, weights_of, write_onnx
-from dynslam_bench.segmentation.networks.onnx.segmenter import OnnxSegmenter
+from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
+from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.networks.onnx_export import (
+    StaticMaskRCNN,
+    overlap,
+    parse_size,
+    unsuppressed,
+    weights_of,
+    write_onnx,
+)
+from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 

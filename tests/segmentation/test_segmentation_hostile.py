@@ -17,11 +17,11 @@ import torch
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
-from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig
-from dynslam_bench.segmentation.networks.mask_rcnn.loading import FORMAT, load_network, save_network
-from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
-from dynslam_bench.segmentation.training.labelled_files import CocoImages, YoloImages, decode_runs
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig
+from dynslam_bench.segmentation.networks.loading import FORMAT, load_network, save_network
+from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.training.labelled_images import CocoImages, YoloImages, decode_runs
 from dynslam_bench.segmentation.training.prepared import PreparedImages
 
 SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1, classes=("person",), box_hidden=1,

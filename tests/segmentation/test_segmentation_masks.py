@@ -7,14 +7,12 @@ import pytest
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.masks import carry
-from dynslam_bench.segmentation.masks.compensation import MissedDetections
-from dynslam_bench.segmentation.masks.postprocess import dilate, dynamic_mask, fill_holes, repair, select
-from dynslam_bench.segmentation.masks.schedule import MaskScheduler
-from dynslam_bench.segmentation.networks.images import boxes_of
+from dynslam_bench.segmentation import carry
+from dynslam_bench.segmentation.postprocess import boxes_of, dilate, dynamic_mask, fill_holes, repair, select
+from dynslam_bench.segmentation.schedule import MaskScheduler, MissedDetections
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.training.labelled import LabelledImage
-from dynslam_bench.segmentation.training.mask_metrics import MaskTally, average_precision, mask_iou
+from dynslam_bench.segmentation.training.evaluate_masks import MaskTally, average_precision, mask_iou
+from dynslam_bench.segmentation.training.labelled_images import LabelledImage
 
 H, W = 120, 160
 

@@ -11,12 +11,12 @@ import torch
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
-from dynslam_bench.segmentation.networks.mask_rcnn import box_ops
-from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig, embedded_config, resnet18_config
-from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network, save_network
-from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
-from dynslam_bench.segmentation.networks.mask_rcnn.roi_align import levels_of, roi_align
-from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import MaskRCNNSegmenter, paste
+from dynslam_bench.segmentation.networks import boxes as box_ops
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig, embedded_config, resnet18_config
+from dynslam_bench.segmentation.networks.loading import load_network, save_network
+from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter, paste
+from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.networks.roi_heads import levels_of, roi_align
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 SMALL = NetworkConfig(

@@ -10,11 +10,9 @@ import pytest
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
-from dynslam_bench.segmentation.networks.onnx.header import TensorInfo, read_header
-from dynslam_bench.segmentation.networks.onnx.heads import decode
-from dynslam_bench.segmentation.networks.onnx.layout import Layout, detect_layout
-from dynslam_bench.segmentation.networks.onnx.placement import Placement
-from dynslam_bench.segmentation.networks.onnx.segmenter import OnnxSegmenter, fit, opencv_threads
+from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
+from dynslam_bench.segmentation.networks.onnx_outputs import Layout, Placement, decode, detect_layout
+from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter, fit, opencv_threads
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -11,8 +11,7 @@ import pytest
 from dynslam_bench.cli.app import start
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
-from dynslam_bench.segmentation.masks.recording import LabelNumbers, record_masks
+from dynslam_bench.segmentation.recorded import LabelNumbers, RecordedSegmenter, record_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 

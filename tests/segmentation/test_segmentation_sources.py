@@ -20,14 +20,17 @@ from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsEr
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.core.settings import apply_overrides, build, parameters
 from dynslam_bench.segmentation import build_segmenter as building
-from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
-from dynslam_bench.segmentation.classes import COCO_IDS, COCO_NAMES, VOC_NAMES, expand_classes
-from dynslam_bench.segmentation.masks.oracle import OracleSegmenter
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.build_segmenter import (
+    SEGMENTERS,
+    SegmenterSpec,
+    build_segmenter,
+    resolve_source,
+    weights_digest,
+)
 from dynslam_bench.segmentation.networks import checkpoints
-from dynslam_bench.segmentation.networks.images import as_rgb
-from dynslam_bench.segmentation.registry import SEGMENTERS, SegmenterSpec
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.postprocess import as_rgb
+from dynslam_bench.segmentation.recorded import OracleSegmenter, RecordedSegmenter
+from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, VOC_NAMES, SegmentationSettings, expand_classes
 
 
 def frame(index=0, stamp=0.0, shape=(24, 32)):
@@ -51,7 +54,7 @@ class Masks:
 
 def test_settings_need_neither_torch_nor_opencv():
     code = (
-        "import sys; import dynslam_bench.segmentation.settings, dynslam_bench.segmentation.registry, "
+        "import sys; import dynslam_bench.segmentation.settings, dynslam_bench.segmentation.build_segmenter, "
         "dynslam_bench.segmentation.training.settings, dynslam_bench.segmentation.networks.checkpoints; "
         "print([m for m in ('torch', 'cv2') if m in sys.modules])"
     )

@@ -9,15 +9,19 @@ import pytest
 import torch
 
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.networks.mask_rcnn.assignment import IGNORED, NEGATIVE, match, sample
-from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network
-from dynslam_bench.segmentation.networks.mask_rcnn.roi_heads import crop_masks
+from dynslam_bench.segmentation.networks.boxes import IGNORED, NEGATIVE, match, sample
+from dynslam_bench.segmentation.networks.loading import load_network
+from dynslam_bench.segmentation.networks.roi_heads import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
-from dynslam_bench.segmentation.training.labelled import LabelledImage
-from dynslam_bench.segmentation.training.labelled_files import CocoImages, YoloImages, decode_runs
-from dynslam_bench.segmentation.training.labelled_sequences import RenderedFrames
-from dynslam_bench.segmentation.training.open_labelled import open_labelled
+from dynslam_bench.segmentation.training.labelled_images import (
+    CocoImages,
+    LabelledImage,
+    RenderedFrames,
+    YoloImages,
+    decode_runs,
+    open_labelled,
+)
 from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
 from dynslam_bench.segmentation.training.train import network_config, train

@@ -10,9 +10,9 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences import DATASETS, open_sequence, sequence_ids
+from dynslam_bench.sequences.cameras import CAMERAS, read_camera, write_camera
 from dynslam_bench.sequences.catalogue import catalogue, entry_of
 from dynslam_bench.sequences.fetch import fetch
-from dynslam_bench.sequences.published.cameras import CAMERAS, read_camera, write_camera
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 
 
@@ -185,7 +185,7 @@ def test_a_data_set_plugs_in(tmp_path, monkeypatch, vga):
     folder = vga("mine/one")
     plugin = tmp_path / "my_dataset.py"
     plugin.write_text(
-        "from dynslam_bench.sequences.published.datasets import DatasetSpec\n"
+        "from dynslam_bench.sequences.catalogue import DatasetSpec\n"
         "from dynslam_bench.sequences.catalogue import open_folder\n"
         f"SPEC = DatasetSpec('mine', r'{plugin}:load', ('mine/one',))\n"
         "def load(sequence_id, *, data_root):\n"

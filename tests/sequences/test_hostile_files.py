@@ -22,10 +22,9 @@ from sequence_folders import make_folder
 from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.core.image_header import image_size
 from dynslam_bench.core.images import read_image
-from dynslam_bench.geometry.tum_file import load_tum
-from dynslam_bench.sequences import open_sequence
+from dynslam_bench.geometry.trajectory_files import load_tum
+from dynslam_bench.sequences import archives, open_sequence
 from dynslam_bench.sequences.fetch import MANIFEST, verify
-from dynslam_bench.sequences.published import archives
 from dynslam_bench.sequences.readers.lists import read_image_list
 
 
@@ -175,7 +174,7 @@ def test_the_memory_of_hostile_files_is_bounded(tmp_path: Path) -> None:
         "import resource, sys, pathlib\n"
         "from dynslam_bench.core.errors import DynslamError\n"
         "from dynslam_bench.core.images import read_image\n"
-        "from dynslam_bench.sequences.published.archives import extract\n"
+        "from dynslam_bench.sequences.archives import extract\n"
         "folder = pathlib.Path(sys.argv[1]); (folder / 'out').mkdir()\n"
         "base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "for read in (lambda: read_image(folder / '1.png'), lambda: extract(folder / 'a.tgz', folder / 'out')):\n"

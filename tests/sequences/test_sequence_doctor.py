@@ -14,10 +14,9 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.doctor import Diagnosis, diagnose, examine, stretches
-from dynslam_bench.sequences.finding import Finding
-from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
+from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
+from dynslam_bench.sequences.stream_checks import Finding
 from dynslam_bench.sequences.truth_checks import truth_findings
-from dynslam_bench.sequences.truth_motion import READINGS, read_as
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 FRAMES = 80

@@ -11,8 +11,8 @@ from sequence_folders import make_folder
 
 from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.part import Part, part_of
 from dynslam_bench.sequences.synthetic import open_synthetic
+from dynslam_bench.sequences.view import Part, part_of
 
 WALK = "synthetic/walking_xyz"
 

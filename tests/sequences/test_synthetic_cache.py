@@ -15,11 +15,10 @@ import pytest
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.synthetic import open_synthetic, parse_synthetic_id, render_synthetic
-from dynslam_bench.sequences.synthetic.frame_cache import encode_png, is_intact_png
-from dynslam_bench.sequences.synthetic.people.bodies import draw_person
-from dynslam_bench.sequences.synthetic.people.script import write_script
-from dynslam_bench.sequences.synthetic.scenes.plan import plan_room
-from dynslam_bench.sequences.synthetic.scenes.scene import Scene
+from dynslam_bench.sequences.synthetic.people import draw_person, write_script
+from dynslam_bench.sequences.synthetic.rooms import plan_room
+from dynslam_bench.sequences.synthetic.scene import Scene
+from dynslam_bench.sequences.synthetic.sequence import encode_png, is_intact_png
 from dynslam_bench.sequences.synthetic.settings import RenderSettings
 
 HASHER = """

@@ -5,13 +5,12 @@ import pytest
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
-from dynslam_bench.sequences.synthetic import CAMERA, SYNTHETIC_IDS, TWIN_IDS, open_synthetic, parse_synthetic_id
-from dynslam_bench.sequences.synthetic.families.registry import FAMILIES
-from dynslam_bench.sequences.synthetic.renderer import Renderer
-from dynslam_bench.sequences.synthetic.views import View, view_of
+from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
+from dynslam_bench.sequences.synthetic.ids import FAMILIES
+from dynslam_bench.sequences.synthetic.renderer import Renderer, View, view_of
 
 V, U = np.mgrid[0:480, 0:640].astype(float)
-NEW = [name for name in SYNTHETIC_IDS if name not in TWIN_IDS]
+NEW = [name for name in SYNTHETIC_IDS if name not in REPLICA_IDS]
 EVENTFUL = {  # a frame in which the named instance moves and is seen
     "objects_balloon": (40, 1), "objects_box_obstructing": (150, 1), "objects_box_aside": (130, 1),
     "objects_placed": (90, 1), "objects_removed": (230, 1), "objects_kidnapped": (120, 1), "objects_trolley": (120, 1),

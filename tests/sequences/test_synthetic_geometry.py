@@ -5,9 +5,9 @@ import pytest
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
-from dynslam_bench.sequences.synthetic import CAMERA, TWIN_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic.renderer import view_of
 from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
-from dynslam_bench.sequences.synthetic.views import view_of
 
 CLEAN = RenderSettings(
     depth=DepthSensor(noise=False), color=ColorSensor(noise=False, shutter=0, exposure_drift=0, flicker=0)
@@ -136,7 +136,7 @@ def test_measured_depth_has_the_sensors_faults(walking) -> None:
     assert np.abs(disparity * 8 - np.rint(disparity * 8)).max() < 0.02
 
 
-@pytest.mark.parametrize("name", TWIN_IDS)
+@pytest.mark.parametrize("name", REPLICA_IDS)
 def test_every_twin_is_a_sequence_with_plausible_motion(name: str) -> None:
     sequence = open_synthetic(name, None)
     assert isinstance(sequence, Sequence)

@@ -5,8 +5,8 @@ import pytest
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic import open_synthetic, parse_synthetic_id
-from dynslam_bench.sequences.synthetic.families.loop import WALKS
-from dynslam_bench.sequences.synthetic.views import view_of
+from dynslam_bench.sequences.synthetic.loops import WALKS
+from dynslam_bench.sequences.synthetic.renderer import view_of
 
 
 def walk_of(name: str):

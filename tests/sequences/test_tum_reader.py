@@ -274,7 +274,7 @@ def test_grey_and_alpha_images_become_rgb(tmp_path):
     [("bonn/crowd", 200, "bonn"), ("tum/fr1/xyz", 95, "tum-fr1"), ("tum/fr1/rpy", 40, "tum-fr1")],
 )
 def test_real_excerpts(name, frames, camera):
-    from dynslam_bench.sequences.published.cameras import CAMERAS
+    from dynslam_bench.sequences.cameras import CAMERAS
 
     sequence = open_sequence(name, data_root=SHARED / "data")
     assert len(sequence) == frames == sequence.dropped.pairs
@@ -320,7 +320,7 @@ def test_few_missing_files_are_tolerated_and_counted(tmp_path):
 @needs_shared
 def test_bonn_poses_are_the_camera_s_and_positions_stay_those_of_the_file():
     from dynslam_bench.geometry import se3
-    from dynslam_bench.geometry.tum_file import read_tum
+    from dynslam_bench.geometry.trajectory_files import read_tum
     from dynslam_bench.sequences.catalogue import open_sequence
 
     folder = SHARED / "data" / "bonn" / "rgbd_bonn_crowd"

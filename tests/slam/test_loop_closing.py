@@ -10,15 +10,12 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam import loop_closing
-from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.bundle.pose_graph import SIGMAS, Edge, inherited, optimise_poses, spread_scale
-from dynslam_bench.slam.corrections import Correction
-from dynslam_bench.slam.localisation.surroundings import not_held
-from dynslam_bench.slam.loop_closing import FIRM
-from dynslam_bench.slam.mapping.history import History
-from dynslam_bench.slam.monocular import MonocularBackend
-from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
-from dynslam_bench.slam.settings import BackendSettings, LoopClosingSettings
+from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
+from dynslam_bench.slam.keyframes import TrajectoryHistory
+from dynslam_bench.slam.loop_closing import FIRM, Correction
+from dynslam_bench.slam.pose_graph import SIGMAS, Edge, inherited, optimise_poses, spread_scale
+from dynslam_bench.slam.settings import BackendSettings, LoopClosingSettings, MonocularBackendSettings
+from dynslam_bench.slam.tracking import weakly_connected
 
 NOISE = dict(noise_px=1.2, depth_noise=0.01, limit=500)
 STEP = 0.15
@@ -125,7 +122,7 @@ def test_keyframes_in_a_row_agree_on_a_similarity(scale, told, agree):
 
 def test_frames_of_a_rescaled_keyframe_move_with_it(lap_without_depth):
     _, _, backend, _ = lap_without_depth
-    world, history = backend.world, History(backend.world.space)
+    world, history = backend.world, TrajectoryHistory(backend.world.space)
     one, other = (int(slot) for slot in world.keyframes[:2])
     information = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0])
     for stamp, slot in ((0.0, one), (1.0, other), (2.0, one)):
@@ -159,7 +156,7 @@ def test_it_changes_nothing_where_no_place_is_seen_again():
     world = RingWorld()
     _, _, without = drive(world, 60, closing=False)
     backend, _, errors = drive(world, 60, closing=True)
-    asked = not_held(backend.world, int(backend.world.keyframes[-1]), LoopClosingSettings().away)
+    asked = weakly_connected(backend.world, int(backend.world.keyframes[-1]), LoopClosingSettings().away)
     assert len(asked) and (errors == without).all()
 
 

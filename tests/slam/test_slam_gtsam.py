@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.slam.bundle.with_gtsam import adjust_bundle_gtsam
+from dynslam_bench.slam.bundle_adjustment import adjust_bundle_gtsam
 
 
 def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch):

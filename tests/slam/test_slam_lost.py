@@ -11,15 +11,13 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam import loop_closing
-from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.localisation.lookalikes import Sight, ambiguous
-from dynslam_bench.slam.localisation.motion_model import MotionState
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.reach import Reach
-from dynslam_bench.slam.mapping.islands import Islands
-from dynslam_bench.slam.monocular import MonocularBackend
-from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
-from dynslam_bench.slam.settings import BackendSettings, MotionModelSettings
+from dynslam_bench.slam.atlas import Atlas
+from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
+from dynslam_bench.slam.motion_model import MotionState
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.place_recognition import PlaceHypothesis, ambiguous
+from dynslam_bench.slam.relocalisation import RelocalisationGate
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings, MotionModelSettings
 
 STEP = 0.15
 QUARTER = round((4.0 + np.pi / 2) / STEP)
@@ -74,7 +72,7 @@ def test_a_map_of_its_own_is_joined_when_the_camera_comes_round():
     assert errors[joined:].max() < 0.2
     final = backend.finalize()
     missing = len(way) - len(final)
-    assert 20 <= missing <= 20 + 11, "what was driven on the island is in the final trajectory"
+    assert 20 <= missing <= 20 + 11, "what was driven on the submap is in the final trajectory"
     lap_poses = world.lap(lap + 20, STEP)
     index = [way[round(stamp * 10)] for stamp in final.timestamps]
     true = se3.transform(se3.inverse(lap_poses[0]), lap_poses[index][:, :3, 3])
@@ -88,14 +86,14 @@ def test_an_island_that_is_not_joined_is_left_where_the_camera_is_in_the_first_m
         monkeypatch.setattr(loop_closing, "PATIENCE", 10**6)
     world, lap = RingWorld(), 4 * QUARTER
     way = [*range(25), *[None] * 20, *range(60, lap + 20)]
-    closing = {"loop_closing.enabled": True, "loop_closing.join_share": 1.0}
+    closing = {"loop_closing.enabled": True, "loop_closing.merge_share": 1.0}
     backend, states, errors = drive(world, way, **closing)
     back = 45 + int(np.flatnonzero(states[45:] == "ok")[0])
     assert way[back] == pytest.approx(lap, abs=15) and (states[back:] == "ok").all() and errors[back:].max() < 0.2
     assert not backend.loops.closed and backend.world.map_count == 2
     assert backend.outputs().keyframes[-1].map == (1 if patient else 0)
     final = backend.finalize()
-    assert len(final) == np.count_nonzero(states == "ok"), "nothing of the island's, where it lies is unknown"
+    assert len(final) == np.count_nonzero(states == "ok"), "nothing of the submap's, where it lies is unknown"
     poses = world.lap(lap + 20, STEP)[[way[round(stamp * 10)] for stamp in final.timestamps]]
     assert np.linalg.norm(final.positions - (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3], axis=1).max() < 0.3
 
@@ -134,18 +132,18 @@ def test_without_depth_a_map_of_its_own_is_joined_with_its_unit_of_length():
     (loop,) = backend.loops.closed
     assert loop.joins and loop.fits and loop.frame < 20 and abs(np.log(loop.scale)) > 0.05
     final = backend.finalize()
-    assert len(way) - len(final) <= 20 + 17, "what was driven on the island is in the final trajectory"
+    assert len(way) - len(final) <= 20 + 17, "what was driven on the submap is in the final trajectory"
     true = poses[[way[round(stamp * 30)] for stamp in final.timestamps]]
     aligned = align(final.T_world_cam, true, "sim3").apply(final.T_world_cam)
     assert np.linalg.norm(aligned[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.2
     went, was = (np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1) for each in (aligned, true))
     path = went / was
     before, after = (np.median(path[final.timestamps[1:] * 30 > at][:50]) for at in (0, 80))
-    assert after == pytest.approx(before, rel=0.1), "lengths on the island are those of the first map"
+    assert after == pytest.approx(before, rel=0.1), "lengths on the submap are those of the first map"
 
 
 def test_without_depth_an_island_that_would_not_fit_is_left_for_the_first_map(monkeypatch):
-    monkeypatch.setattr(Islands, "may_lie", lambda *_: False)  # as where its lengths have drifted apart
+    monkeypatch.setattr(Atlas, "admits_start", lambda *_: False)  # as where its lengths have drifted apart
     world, step = RingWorld(side=6.0, seed=3), 0.07
     way, lap = lap_with_a_gap(world, step)
     backend, _, found = drive_without_depth(world, way, step)
@@ -153,7 +151,7 @@ def test_without_depth_an_island_that_would_not_fit_is_left_for_the_first_map(mo
     back = 80 + int(np.flatnonzero(states[80:] == "ok")[0])
     assert way[back] == pytest.approx(lap, abs=20) and (states[back:] == "ok").all()
     assert not backend.loops.closed and found[-1].maps == 2
-    assert len(backend.finalize()) == np.count_nonzero(states == "ok"), "nothing of the island's"
+    assert len(backend.finalize()) == np.count_nonzero(states == "ok"), "nothing of the submap's"
     assert all(each.T_world_cam[:3, 3] @ each.T_world_cam[:3, 3] < 10.0**2 for each in found[back:])
 
 
@@ -163,7 +161,7 @@ def test_maps_that_never_meet_stay_apart():
     assert (states[25:] == "lost").all() and len(backend.finalize()) == 25
     outputs = backend.outputs()
     assert {record.map for record in outputs.keyframes} == {0, 1}
-    assert 0 < len(outputs.positions) < backend.world.point_count, "where those of the island lie is unknown"
+    assert 0 < len(outputs.positions) < backend.world.point_count, "where those of the submap lie is unknown"
     last = RingWorld().blind(99, stamp=99.0)
     assert backend.track(last, np.ones(0, bool), np.ones(0, np.float32)).maps == 2
     without, states, _ = drive(RingWorld(), way)
@@ -171,14 +169,14 @@ def test_maps_that_never_meet_stay_apart():
 
 
 def test_filters_see_the_map_that_the_camera_is_in_alone():
-    """A prediction on an island, of keyframes of the first map, would be of places that have nothing to do with it."""
+    """A prediction on an submap, of keyframes of the first map, would be of places that have nothing to do with it."""
     way = [*range(25), *[None] * 20, *range(60, 90)]
     backend, _, _ = drive(RingWorld(), way, **{"loop_closing.enabled": True})
     ids, _ = backend.map_points()
     views = backend.keyframe_views(100)
     assert views and all(view.timestamp > 2.4 for view in views), "those of the first map were made before"
     world = backend.world
-    held = world.kf_point[world.island(1)]
+    held = world.kf_point[world.submap(1)]
     assert set(ids.tolist()) == set(world.id[np.unique(held[held >= 0])].tolist())
     assert 0 < len(ids) < world.point_count and backend.predict(8.0) is not None
 
@@ -191,20 +189,20 @@ def test_a_lost_camera_predicts_nothing():
 
 
 def test_an_island_lies_where_the_camera_can_have_got():
-    islands, moved = Islands(), np.eye(4)
-    first = islands.begin(0, np.array([1.0, 0.0, 0.0]), 2.0)
-    second = islands.begin(first, np.array([1.0, 3.0, 0.0]), 1.0)
+    submaps, moved = Atlas(), np.eye(4)
+    first = submaps.begin(0, np.array([1.0, 0.0, 0.0]), 2.0)
+    second = submaps.begin(first, np.array([1.0, 3.0, 0.0]), 1.0)
     for number, reach in ((first, 2.0), (second, 2.0 + 3.0 + 1.0)):
         start = np.array([1.0, 0.0 if number == first else 3.0, 0.0])
         for way in (reach - 0.01, reach + 0.01):
             moved[:3, 3] = np.array([1.0, 0.0, way]) - start
-            assert islands.may_lie(number, partial(se3.transform, moved)) == (way < reach)
+            assert submaps.admits_start(number, partial(se3.transform, moved)) == (way < reach)
     here = np.zeros(3)
-    assert islands.within(0, 0, here, np.array([0.0, 0.0, 1.9]), 2.0)
-    assert not islands.within(0, 0, here, np.array([0.0, 0.0, 2.1]), 2.0)
-    assert not islands.within(0, first, here, here, 2.0), "nothing is known of the way to another island"
-    assert islands.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.4]), 0.5)
-    assert not islands.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.6]), 0.5)
+    assert submaps.within(0, 0, here, np.array([0.0, 0.0, 1.9]), 2.0)
+    assert not submaps.within(0, 0, here, np.array([0.0, 0.0, 2.1]), 2.0)
+    assert not submaps.within(0, first, here, here, 2.0), "nothing is known of the way to another submap"
+    assert submaps.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.4]), 0.5)
+    assert not submaps.within(first, 0, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 3.6]), 0.5)
 
 
 def test_the_camera_moves_on_as_it_felt_it_where_a_loop_turns_the_world():
@@ -242,18 +240,18 @@ def test_a_frame_is_ambiguous_where_its_features_are_found_in_two_places(alike, 
     lap = world.lap(2 * QUARTER, STEP)
     frame = world.see(lap[10], 999)
     seen = observe(frame, np.ones(len(frame), bool), np.ones(len(frame)), world.camera, np.ones(8), settings.tracking)
-    here = Sight(se3.inverse(lap[10]) @ lap[0], 1.0, 3.0)
+    here = PlaceHypothesis(se3.inverse(lap[10]) @ lap[0], 1.0, 3.0)
     everywhere = backend.world.keyframes
     assert ambiguous(backend.world, seen, {0: here}, everywhere, settings, 0) is twice
     assert not ambiguous(backend.world, seen, {0: here}, everywhere[:4], settings, 0), "nothing else is looked at"
-    near = lambda island, T_cam_world: not here.contradicts(Sight(T_cam_world, 1.0, 3.0))  # noqa: E731
+    near = lambda submap, T_cam_world: not here.contradicts(PlaceHypothesis(T_cam_world, 1.0, 3.0))  # noqa: E731
     assert not ambiguous(backend.world, seen, {0: here}, everywhere, settings, 0, near), "it cannot have got there"
 
 
 def test_every_frame_of_a_lost_camera_is_followed(monkeypatch):
     """Also where nothing at all is recognised: how far it has turned is known only from image to image."""
-    asked, since = [], Reach.since
-    monkeypatch.setattr(Reach, "since", lambda self, *known: (asked.append(known), since(self, *known))[1])
+    asked, since = [], RelocalisationGate.since
+    monkeypatch.setattr(RelocalisationGate, "since", lambda self, *known: (asked.append(known), since(self, *known))[1])
     _, states, _ = drive(RingWorld(), [*range(15), *range(60, 70)])
     assert (states[15:] == "lost").all() and len(asked) == 9, "of the tenth, the first, tracking knows itself"
 
@@ -270,22 +268,22 @@ def test_from_one_frame_to_the_next_two_places_that_look_alike_tell_nothing_eith
 
 def test_what_is_known_of_an_island_is_carried_along_when_its_surroundings_are():
     """The camera was lost near the second of two keyframes, which a loop moves, turns and rescales."""
-    islands, before = Islands(), np.tile(np.eye(4), (2, 1, 1))
+    submaps, before = Atlas(), np.tile(np.eye(4), (2, 1, 1))
     before[1, :3, 3] = [-5.0, 0.0, 0.0]  # a centre at x = 5
-    first = islands.begin(0, np.array([5.5, 0.0, 0.0]), 1.0, slack=0.1)
-    second = islands.begin(first, np.array([5.5, 0.0, 0.2]), 1.0, slack=0.1)
+    first = submaps.begin(0, np.array([5.5, 0.0, 0.0]), 1.0, slack=0.1)
+    second = submaps.begin(first, np.array([5.5, 0.0, 0.2]), 1.0, slack=0.1)
     turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
     after = before.copy()
     after[1] = turn @ before[1]
     after[1, :3, 3] += [0.0, 0.0, 3.0]
-    islands.carried(0, before, after, np.array([1.0, 2.0]))
+    submaps.carried(0, before, after, np.array([1.0, 2.0]))
     expected = se3.transform(se3.inverse(after[1]), np.array([1.0, 0.0, 0.0]))
-    known = islands.all()
+    known = submaps.all()
     assert np.allclose(known[0].anchor, expected) and known[0].reach_m == pytest.approx(2.0)
     assert np.array_equal(known[0].start, [5.5, 0.0, 0.0]), "its own world is what it was"
-    assert islands.slack(first, 0) == pytest.approx(0.4)
-    islands.carried(second, before, after, np.array([1.0, 1.0]))
-    assert np.array_equal(islands.all()[0].start, known[0].start), "a loop of another island moves nothing of it"
-    assert np.allclose(islands.all()[1].anchor, known[1].anchor) and not np.allclose(
-        islands.all()[1].start, known[1].start
+    assert submaps.slack(first, 0) == pytest.approx(0.4)
+    submaps.carried(second, before, after, np.array([1.0, 1.0]))
+    assert np.array_equal(submaps.all()[0].start, known[0].start), "a loop of another submap moves nothing of it"
+    assert np.allclose(submaps.all()[1].anchor, known[1].anchor) and not np.allclose(
+        submaps.all()[1].start, known[1].start
     )

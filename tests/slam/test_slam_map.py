@@ -7,10 +7,10 @@ import pytest
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.mapping.map import Map
-from dynslam_bench.slam.mapping.map_kernels import distinct
-from dynslam_bench.slam.mapping.triangulation import triangulate
+from dynslam_bench.slam.local_mapping import triangulate
+from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map_kernels import distinct
+from dynslam_bench.slam.observation import observe
 from dynslam_bench.slam.settings import MappingSettings, TrackingSettings
 
 

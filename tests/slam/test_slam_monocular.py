@@ -10,15 +10,23 @@ import pytest
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.features.build_extractor import build_extractor
+from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.two_views import VIEWS, Later, believed, match_views, possible_motions
-from dynslam_bench.slam.mapping.first_map import FEWEST, FirstViews, View
-from dynslam_bench.slam.monocular import MonocularBackend
-from dynslam_bench.slam.monocular_settings import MonocularBackendSettings, TwoViewSettings
+from dynslam_bench.slam.backend import MonocularBackend
+from dynslam_bench.slam.initialisation import (
+    FEWEST,
+    VIEWS,
+    LaterView,
+    TwoViewInitialiser,
+    View,
+    believed,
+    match_views,
+    possible_motions,
+)
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.settings import MonocularBackendSettings, TwoViewSettings
 
 FR1_XYZ = Path(__file__).resolve().parents[3] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
 SIDEWAYS = se3.exp(np.array([0.25, 0.05, 0.02, 0.0, 0.03, 0.01]))
@@ -57,7 +65,9 @@ def test_two_views_tell_the_motion_up_to_scale(room, flat):
     world = flattened(room) if flat else room
     first, second = views(world, np.eye(4), SIDEWAYS, wrong=60)
     pair = match_views(first, second, first.xy, 200.0)
-    found = believed(possible_motions(first, [Later(second, pair)], world.camera, TwoViewSettings()), TwoViewSettings())
+    found = believed(
+        possible_motions(first, [LaterView(second, pair)], world.camera, TwoViewSettings()), TwoViewSettings()
+    )
     assert found is not None
     true = se3.inverse(SIDEWAYS)
     assert np.degrees(se3.rotation_angle(found.T_second_first @ se3.inverse(true))) < 0.5
@@ -89,7 +99,7 @@ def test_a_motion_that_leaves_out_what_tells_against_it_is_not_believed(room, no
     """The homography's other motion fits the wall, and drops the things before it: it was believed, 72 degrees off."""
     off, settings = [], MonocularBackendSettings().tracking
     for seed in range(6):
-        first_views, begun = FirstViews(), None
+        first_views, begun = TwoViewInitialiser(), None
         for frame in before_a_wall(room, seed, noise_px):
             keep, weight = np.ones(len(frame), bool), np.ones(len(frame), np.float32)
             seen = observe(frame, keep, weight, room.camera, 1.2 ** np.arange(8), settings)
@@ -103,7 +113,7 @@ def test_a_motion_that_leaves_out_what_tells_against_it_is_not_believed(room, no
 def test_the_right_motion_is_carried_on_where_the_newest_view_does_not_tell_it(room, monkeypatch):
     steps = [np.zeros(6), *(np.array([0.006, 0.001, 0.0, 0.0, 0.0, 0.0]) * k for k in (1, 2, 3, 60))]
     frames = [without_depth(room.see(se3.exp(step), i, noise_px=0.1)) for i, step in enumerate(steps)]
-    settings, waiting, far = MonocularBackendSettings().tracking, FirstViews(), TwoViewSettings(radius_px=300.0)
+    settings, waiting, far = MonocularBackendSettings().tracking, TwoViewInitialiser(), TwoViewSettings(radius_px=300.0)
     upwards = np.array([[0.0], [1.0], [0.0]])
     for frame in frames:
         keep, weight = np.ones(len(frame), bool), np.ones(len(frame), np.float32)
@@ -119,7 +129,7 @@ def test_the_right_motion_is_carried_on_where_the_newest_view_does_not_tell_it(r
 
 
 def test_a_camera_that_waits_for_parallax_keeps_few_views(room):
-    waiting, kept = FirstViews(), []
+    waiting, kept = TwoViewInitialiser(), []
     frames = [without_depth(room.see(np.eye(4), i)) for i in range(40)]
     for frame, seen in zip(frames, views(room, *[np.eye(4)] * 40), strict=True):
         assert waiting.take(View(frame, seen), room.camera, TwoViewSettings()) is None
@@ -132,7 +142,7 @@ def test_a_camera_that_waits_for_parallax_keeps_few_views(room):
 def test_views_between_tell_a_step_from_a_turn(start):
     """From these frames on two views alone told a motion 40 to 52 degrees off, with a good fit, up to seven times."""
     sequence = open_sequence(str(FR1_XYZ), frames=(start, start + 10))
-    camera, extractor, first_views = sequence.camera, build_extractor(FeatureSettings()), FirstViews()
+    camera, extractor, first_views = sequence.camera, build_extractor(FeatureSettings()), TwoViewInitialiser()
     begun = None
     for index in range(len(sequence)):
         frame = sequence[index]

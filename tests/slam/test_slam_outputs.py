@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
+from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.slam.outputs.map_files import write_keyframes_csv, write_ply
-from dynslam_bench.slam.outputs.sheet_panels import draw_sheet, write_sheet
+from dynslam_bench.slam.map_files import write_keyframes_csv, write_ply
+from dynslam_bench.slam.sheet import draw_sheet, write_sheet
 
 
 def outputs(points=50, keyframes=4):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.mapping.map import Map
-from dynslam_bench.slam.mapping.piece_index import CHANGED, EVERY, PieceIndex
-from dynslam_bench.slam.places import likeness, most_alike
+from dynslam_bench.slam.descriptor_index import CHANGED, EVERY, DescriptorIndex
+from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.place_recognition import recognition_scores, top_candidates
 from dynslam_bench.slam.settings import TrackingSettings
 
 SCALES = np.ones(1)
@@ -35,25 +35,27 @@ def world(room):
 
 @pytest.mark.parametrize("place", [0, 5, 11])
 def test_the_keyframe_of_the_same_place_comes_first(room, world, place):
-    found = most_alike(world, world.keyframes, seen(room, TURNS[place] + 0.02, 100), 3)
+    found = top_candidates(world, world.keyframes, seen(room, TURNS[place] + 0.02, 100), 3)
     assert len(found) == 3 and world.kf_frame[found[0]] == place
 
 
 def test_neighbours_that_share_the_view_come_before_the_wall_behind(room, world):
-    order = [int(world.kf_frame[slot]) for slot in most_alike(world, world.keyframes, seen(room, TURNS[4], 100), 11)]
+    order = [
+        int(world.kf_frame[slot]) for slot in top_candidates(world, world.keyframes, seen(room, TURNS[4], 100), 11)
+    ]
     assert order[0] == 4 and set(order[1:3]) == {3, 5}
 
 
 def test_only_the_keyframes_given_are_chosen(room, world):
     given = world.keyframes[[1, 2, 8, 9]]
-    found = most_alike(world, given, seen(room, TURNS[5], 100), 2)
+    found = top_candidates(world, given, seen(room, TURNS[5], 100), 2)
     assert len(found) == 2 and set(found) <= set(given.tolist())
 
 
 def test_few_keyframes_are_taken_as_they_come(room, world):
     given = world.keyframes[[7, 0, 3]]
-    assert most_alike(world, given, seen(room, 0.0, 100), 3) == given.tolist()
-    assert most_alike(world, given, seen(room, 0.0, 100), 10) == given.tolist()
+    assert top_candidates(world, given, seen(room, 0.0, 100), 3) == given.tolist()
+    assert top_candidates(world, given, seen(room, 0.0, 100), 10) == given.tolist()
 
 
 def test_equal_scores_go_to_the_newer_keyframe(room, world):
@@ -65,12 +67,12 @@ def test_equal_scores_go_to_the_newer_keyframe(room, world):
     absent = np.setdiff1d(np.arange(1 << 16), used)[0]
     stranger.words.view(np.uint16)[:] = absent
     newest = world.keyframes[np.argsort(-world.kf_id[world.keyframes])]
-    assert most_alike(world, world.keyframes, stranger, 4) == newest[:4].tolist()
+    assert top_candidates(world, world.keyframes, stranger, 4) == newest[:4].tolist()
 
 
 def test_a_frame_without_features_names_the_first_given(room, world):
     blind = observe(room.blind(0), np.zeros(0, bool), np.zeros(0, np.float32), room.camera, SCALES, TrackingSettings())
-    assert most_alike(world, world.keyframes, blind, 2) == world.keyframes[:2].tolist()
+    assert top_candidates(world, world.keyframes, blind, 2) == world.keyframes[:2].tolist()
 
 
 def counted(world, keyframes, features):
@@ -106,7 +108,9 @@ def test_the_index_counts_what_is_there_after_keyframes_came_and_went(room, seed
         asked = world.keyframes[rng.random(world.keyframe_count) < 0.8]
         if number % 3 == 0 and len(asked):  # not each time: several come and go in between
             features, looked = seen(room, rng.uniform(0, 6), 1000 + number), looked + 1
-            np.testing.assert_allclose(likeness(world, asked, features), counted(world, asked, features), rtol=1e-9)
+            np.testing.assert_allclose(
+                recognition_scores(world, asked, features), counted(world, asked, features), rtol=1e-9
+            )
     assert looked > 8
 
 
@@ -116,7 +120,7 @@ def test_the_index_has_room_for_any_number_of_pieces(values):
     rng, slots, features = np.random.default_rng(0), 640, 2400
     pieces = rng.integers(0, values, (slots, features, 1)).astype(np.uint16)
     kf_point = np.where(rng.random((slots, features)) < 0.9, 7, -1).astype(np.int32)
-    index, ids, own = PieceIndex(), np.arange(slots), rng.integers(0, values, (500, 1)).astype(np.uint16)
+    index, ids, own = DescriptorIndex(), np.arange(slots), rng.integers(0, values, (500, 1)).astype(np.uint16)
     index.renew(np.ones(slots, bool), ids, kf_point, pieces)
     score, points = index.score(ids, own)
     np.testing.assert_array_equal(points, (kf_point >= 0).sum(axis=1))
@@ -130,7 +134,7 @@ def test_the_index_has_room_for_any_number_of_pieces(values):
 
 def test_a_keyframe_is_taken_up_anew_when_many_of_its_points_are_others():
     pieces, ids, alive = np.arange(100, dtype=np.uint16).reshape(1, 100, 1), np.zeros(1, np.int64), np.ones(1, bool)
-    index, kf_point = PieceIndex(), np.full((1, 100), 3, np.int32)
+    index, kf_point = DescriptorIndex(), np.full((1, 100), 3, np.int32)
     most = round(100 * CHANGED)
     for gone, counted in ((0, 100), (most, 100), (most + 1, 99 - most), (60, 40)):
         kf_point[0, :gone] = -1

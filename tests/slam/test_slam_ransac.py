@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.localisation.relocalisation import ransac_pose
+from dynslam_bench.slam.place_recognition import ransac_pose
 
 CAMERA = Camera(640, 480, 535.0, 539.0, 320.0, 247.0)
 

@@ -8,11 +8,10 @@ from point_world import PointWorld, track_all
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.recognition import Recognised, imprecision, recognise
-from dynslam_bench.slam.localisation.relocalisation import match_keyframe
-from dynslam_bench.slam.localisation.tracking import solve
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.place_recognition import PlaceMatch, match_keyframe, pose_uncertainty, verify_place
 from dynslam_bench.slam.settings import TrackingSettings
+from dynslam_bench.slam.tracking import solve
 
 FIRST = np.eye(4)
 
@@ -37,7 +36,7 @@ def recognised(backend, seen, patch, T_cam_world):
     every = match_keyframe(backend.world, 0, seen, 60)
     few = every.select(patch(seen.xy[every.feature]))
     assert 8 <= len(few) < len(every) / 4
-    return recognise(backend.world, 0, seen, few, T_cam_world, TrackingSettings())
+    return verify_place(backend.world, 0, seen, few, T_cam_world, TrackingSettings())
 
 
 def test_a_pose_grows_from_the_patch_that_tells_it():
@@ -79,9 +78,9 @@ def test_one_patch_does_not_tell_from_where_it_is_seen_nor_do_a_few_matches_besi
     patch, around = rng.permutation(np.flatnonzero(off < half)), rng.permutation(np.flatnonzero(off > 150))
     few = every.select(np.sort(np.concatenate([patch[: 80 - beside], around[:beside]])))
     found = solve(backend.world, seen, few, se3.inverse(pose))
-    place = Recognised(found.T_cam_world, few.select(found.inliers), 0.5)
+    place = PlaceMatch(found.T_cam_world, few.select(found.inliers), 0.5)
     assert len(place.matches) > 60
-    assert (imprecision(backend.world, seen, place, np.random.default_rng(0)) <= 1) == tells
+    assert (pose_uncertainty(backend.world, seen, place, np.random.default_rng(0)) <= 1) == tells
 
 
 @pytest.mark.parametrize("count", [0, 4, 6, 11])
@@ -90,4 +89,4 @@ def test_a_few_matches_tell_nothing(count):
     frame = room.see(FIRST, 1)
     seen = seen_in(backend, frame, np.ones(len(frame), bool))
     few = match_keyframe(backend.world, 0, seen, 60).select(np.arange(count))
-    assert imprecision(backend.world, seen, Recognised(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf
+    assert pose_uncertainty(backend.world, seen, PlaceMatch(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf

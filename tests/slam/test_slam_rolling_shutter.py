@@ -8,8 +8,8 @@ import pytest
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.rolling_shutter import Speeds, as_seen_at_once
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.rolling_shutter import CameraVelocity, compensate_rolling_shutter
 from dynslam_bench.slam.settings import BackendSettings, TrackingSettings
 
 READOUT_S = 0.026
@@ -75,8 +75,8 @@ def shaken_frames():
 def test_a_constant_motion_is_undone_to_a_tenth_of_a_pixel(room):
     moved, at_once = rolling(room, steady, 6)
     camera = replace(room.camera, readout_s=READOUT_S)
-    speeds = Speeds.between(*(se3.inverse(steady(t)) for t in (0.15, 0.2)), 0.05)
-    straight = as_seen_at_once(observed(moved, camera), camera, speeds)
+    speeds = CameraVelocity.between(*(se3.inverse(steady(t)) for t in (0.15, 0.2)), 0.05)
+    straight = compensate_rolling_shutter(observed(moved, camera), camera, speeds)
     off = np.linalg.norm(moved.xy - at_once.xy, axis=1)
     left = np.linalg.norm(straight.xy - at_once.xy, axis=1)
     assert np.percentile(off, 90) > 5 and left.max() < 0.1
@@ -92,15 +92,15 @@ def test_without_depth_the_turning_is_undone(room):
 
     moved, at_once = rolling(room, turning, 6)
     camera = replace(room.camera, readout_s=READOUT_S)
-    speeds = Speeds.between(*(se3.inverse(turning(t)) for t in (0.15, 0.2)), 0.05)
-    straight = as_seen_at_once(observed(moved, camera, deep=False), camera, speeds)
+    speeds = CameraVelocity.between(*(se3.inverse(turning(t)) for t in (0.15, 0.2)), 0.05)
+    straight = compensate_rolling_shutter(observed(moved, camera, deep=False), camera, speeds)
     assert np.linalg.norm(straight.xy - at_once.xy, axis=1).max() < 0.1
     assert not straight.z.any() and np.isnan(straight.right).all()
 
 
 def test_speeds_are_those_that_move_the_points():
     before, now = (se3.inverse(steady(t)) for t in (0.2, 0.2 + 1e-4))
-    speeds = Speeds.between(before, now, 1e-4)
+    speeds = CameraVelocity.between(before, now, 1e-4)
     point = np.array([0.3, -0.2, 2.0])
     change = (se3.transform(now, point) - se3.transform(before, point)) / 1e-4
     local = se3.transform(now, point)
@@ -208,10 +208,10 @@ def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
     frame = room.see(np.eye(4), 0)
     camera = replace(room.camera, readout_s=READOUT_S)
     seen = observed(frame, camera)
-    wild = as_seen_at_once(seen, camera, Speeds(np.array([0.0, 0.0, 400.0]), np.zeros(3)))
+    wild = compensate_rolling_shutter(seen, camera, CameraVelocity(np.array([0.0, 0.0, 400.0]), np.zeros(3)))
     gone = (frame.keypoints.xy[:, 1] > 420) & (seen.z > 0) & (seen.z < 3)
     assert gone.any() and np.isfinite(wild.xy).all()
     np.testing.assert_array_equal(wild.xy[gone], seen.xy[gone])
     np.testing.assert_array_equal(wild.z[gone], seen.z[gone])
     blind = observed(room.blind(1), camera)
-    assert len(as_seen_at_once(blind, camera, Speeds(np.ones(3), np.ones(3)))) == 0
+    assert len(compensate_rolling_shutter(blind, camera, CameraVelocity(np.ones(3), np.ones(3)))) == 0

@@ -9,13 +9,10 @@ from point_world import PointWorld, track_all
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.mapping.islands import Islands
-from dynslam_bench.slam.mapping.map_store import packed
-from dynslam_bench.slam.mapping.saved_map import HEADER, MAP_SCHEMA, read_map
-from dynslam_bench.slam.monocular import MonocularBackend
-from dynslam_bench.slam.monocular_settings import MonocularBackendSettings
-from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.atlas import Atlas, packed
+from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
+from dynslam_bench.slam.map_files import HEADER, MAP_SCHEMA, read_map
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
 HALF = 45
 """Frames that the map is made of."""
@@ -49,7 +46,7 @@ def made(tmp_path_factory):
 
 def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
     room, _, file, backend = made
-    saved, loaded = packed(backend.world, Islands()), read_map(file)  # what is in memory, and as it was stored
+    saved, loaded = packed(backend.world, Atlas()), read_map(file)  # what is in memory, and as it was stored
     assert loaded.header.made_by == "a walk" and saved.keys() == loaded.arrays.keys() and len(saved["id"]) > 300
     for name, array in saved.items():
         assert array.dtype == loaded.arrays[name].dtype and array.tobytes() == loaded.arrays[name].tobytes(), name

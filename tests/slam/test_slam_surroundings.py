@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from dynslam_bench.core.settings import apply_overrides
-from dynslam_bench.slam.localisation import surroundings as rules
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.surroundings import Surroundings, apart, not_held
-from dynslam_bench.slam.mapping.map import Map
+from dynslam_bench.slam import tracking as rules
+from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.observation import observe
 from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.tracking import LocalMap, apart, weakly_connected
 
 SHARED = 10
 """Points that each keyframe of the chain shares with the next one."""
@@ -33,7 +33,7 @@ def chain(room):
 
 def surroundings(chain, *, enabled):
     settings = {"loop_closing.enabled": enabled, "loop_closing.away": 2}
-    return Surroundings(chain, apply_overrides(BackendSettings(), settings))
+    return LocalMap(chain, apply_overrides(BackendSettings(), settings))
 
 
 @pytest.mark.parametrize(
@@ -44,10 +44,10 @@ def test_what_is_apart_is_connected_over_no_third_and_was_made_long_before_or_af
 
 
 def test_who_shares_few_points_may_be_recognised_anew(chain, monkeypatch):
-    assert not_held(chain, 5, 1).tolist() == [0, 1, 2, 3, 4], "ten points do not hold the fourth in place"
+    assert weakly_connected(chain, 5, 1).tolist() == [0, 1, 2, 3, 4], "ten points do not hold the fourth in place"
     monkeypatch.setattr(rules, "HELD", SHARED)
-    assert not_held(chain, 5, 1).tolist() == [0, 1, 2], "the fourth holds the third"
-    assert not_held(chain, 5, 4).tolist() == [0, 1], "nor who was made not long before"
+    assert weakly_connected(chain, 5, 1).tolist() == [0, 1, 2], "the fourth holds the third"
+    assert weakly_connected(chain, 5, 4).tolist() == [0, 1], "nor who was made not long before"
 
 
 def test_without_loop_closing_everything_is_near(chain):

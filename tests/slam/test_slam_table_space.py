@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from ring_world import RingWorld
 
+from dynslam_bench.slam import table_space
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.mapping import table_space
-from dynslam_bench.slam.mapping.table_space import SMALL_BYTES, TableSpace
 from dynslam_bench.slam.settings import BackendSettings, LoopClosingSettings
+from dynslam_bench.slam.table_space import SMALL_BYTES, TableSpace
 
 STATM = Path("/proc/self/statm")
 

@@ -6,12 +6,11 @@ from point_world import PointWorld
 from ring_world import turned
 
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.localisation.observation import observe
-from dynslam_bench.slam.localisation.reach import Reach
-from dynslam_bench.slam.localisation.tracking import Tracked
-from dynslam_bench.slam.localisation.turn import Turn
-from dynslam_bench.slam.mapping.islands import Islands
+from dynslam_bench.slam.atlas import Atlas
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.relocalisation import RelocalisationGate, RotationEstimate
 from dynslam_bench.slam.settings import RelocalisationSettings, TrackingSettings
+from dynslam_bench.slam.tracking import TrackedFrame
 
 ROOM = PointWorld()
 
@@ -32,7 +31,7 @@ def pose(degrees, at=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize(("step", "sideways", "off"), [(3.0, 0.0, 1.0), (-3.0, 0.0, 1.0), (2.0, 0.03, 15.0)])
 def test_the_turn_is_followed_over_many_images(step, sideways, off):
     way = [pose(step * k, (sideways * k, 0.0, 0.0)) for k in range(16)]
-    turn = Turn(seen(way[0], 0), np.eye(3))
+    turn = RotationEstimate(seen(way[0], 0), np.eye(3))
     for index, each in enumerate(way[1:], 1):
         turn = turn.on(seen(each, index), ROOM.camera, 64)
     true = se3.inverse(way[-1]) @ way[0]
@@ -52,7 +51,7 @@ def test_the_turn_is_followed_over_many_images(step, sideways, off):
 
 @pytest.mark.parametrize("features", [0, 15, 400])
 def test_images_that_show_nothing_common_are_not_connected(features):
-    turn = Turn(seen(pose(0.0), 0), np.eye(3))
+    turn = RotationEstimate(seen(pose(0.0), 0), np.eye(3))
     other = ROOM.see(pose(180.0), 1, limit=features)
     keep, weight = np.ones(len(other), bool), np.ones(len(other), np.float32)
     assert turn.on(observe(other, keep, weight, ROOM.camera, np.ones(1), TrackingSettings()), ROOM.camera, 64) is None
@@ -63,24 +62,24 @@ def test_a_camera_that_still_sees_what_it_saw_was_not_put_elsewhere(degrees, els
     """It showed a hundred map points and shows none now: carried off, or only turned to what nobody has mapped."""
     settings = RelocalisationSettings()
     first = seen(pose(0.0), 0)
-    last = Tracked(first, np.arange(len(first)), np.eye(4), 0.0)
-    reach = Reach(ROOM.camera)
+    last = TrackedFrame(first, np.arange(len(first)), np.eye(4), 0.0)
+    reach = RelocalisationGate(ROOM.camera)
     reach.lost(last, seen(pose(degrees), 1), settings, shows=True)
     assert np.isinf(reach.metres(last, 0.1, settings)) is np.bool_(elsewhere)
     assert (reach.turn is None) is elsewhere
     lost = reach.since(last, seen(pose(2 * degrees), 2), 0.2, 0, settings)
     there, beside = se3.inverse(pose(2 * degrees)), se3.inverse(pose(2 * degrees + 90.0))
-    assert lost.may_be(Islands(), last.T_cam_world, 0, there)
-    assert lost.may_be(Islands(), last.T_cam_world, 0, beside) is elsewhere
+    assert lost.admits(Atlas(), last.T_cam_world, 0, there)
+    assert lost.admits(Atlas(), last.T_cam_world, 0, beside) is elsewhere
 
 
 def test_worlds_of_islands_are_turned_as_far_as_the_images_left_open():
-    islands, here = Islands(), np.zeros(3)
-    first = islands.begin(0, here, 1.0, 0.3)
-    second = islands.begin(first, here, 1.0, 0.4)
-    unseen = islands.begin(0, here, 1.0)
-    assert islands.slack(0, 0) == islands.slack(second, second) == 0.0
-    assert islands.slack(first, 0) == islands.slack(0, first) == pytest.approx(0.3)
-    assert islands.slack(second, 0) == pytest.approx(0.7), "it was begun from the first one"
-    assert islands.slack(second, first) == pytest.approx(1.0)
-    assert islands.slack(unseen, 0) == pytest.approx(np.pi)
+    submaps, here = Atlas(), np.zeros(3)
+    first = submaps.begin(0, here, 1.0, 0.3)
+    second = submaps.begin(first, here, 1.0, 0.4)
+    unseen = submaps.begin(0, here, 1.0)
+    assert submaps.slack(0, 0) == submaps.slack(second, second) == 0.0
+    assert submaps.slack(first, 0) == submaps.slack(0, first) == pytest.approx(0.3)
+    assert submaps.slack(second, 0) == pytest.approx(0.7), "it was begun from the first one"
+    assert submaps.slack(second, first) == pytest.approx(1.0)
+    assert submaps.slack(unseen, 0) == pytest.approx(np.pi)

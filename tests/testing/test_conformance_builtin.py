@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import dynslam_bench.culling.blocks
+import dynslam_bench.culling
 from dynslam_bench.contracts.filter import DynamicFilter
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
@@ -29,8 +29,8 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 def filters():
     """Every filter class of the culling room, found by looking."""
     found = {}
-    for module in pkgutil.iter_modules(dynslam_bench.culling.blocks.__path__):
-        loaded = importlib.import_module(f"dynslam_bench.culling.blocks.{module.name}")
+    for module in pkgutil.iter_modules(dynslam_bench.culling.__path__):
+        loaded = importlib.import_module(f"dynslam_bench.culling.{module.name}")
         for name, value in vars(loaded).items():
             if inspect.isclass(value) and value.__module__ == loaded.__name__ and DynamicFilter in value.__mro__[1:]:
                 found[name] = value

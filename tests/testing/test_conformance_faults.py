@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.filter import FilterResult
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry.se3 import inverse
 from dynslam_bench.geometry.trajectory import Trajectory

@@ -10,7 +10,7 @@ from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.core.errors import EvaluationError, TrackerError
 from dynslam_bench.evaluation.protocol import MONOCULAR, PROTOCOLS
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 
 OURS = [spec.id for spec in all_specs() if spec.sensors == "rgb" and issubclass(spec.settings, SystemSettings)]

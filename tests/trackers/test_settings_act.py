@@ -14,7 +14,7 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import Parameter
 from dynslam_bench.sequences.preprocessing import normalise
 from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
 

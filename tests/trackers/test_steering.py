@@ -1,4 +1,4 @@
-"""Steering acts as building with the same value does, ends with the episode, and is refused where nothing takes it.
+"""OnlineSettings acts as building with the same value does, ends with the episode, and is refused where nothing takes it.
 
 An episode steered from before its first frame is the episode of a tracker built with those settings, bit for bit; one
 after `reset` is that of a fresh tracker. All online settings of a tracker at once, and each by itself where it shows.
@@ -13,11 +13,10 @@ import pytest
 from quick_dense import quick
 from steering_scene import FRAMES, SmallScene, construct, difference, differing, play, settings_for
 
-from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Parameter, Settings, apply_overrides, tunable
-from dynslam_bench.core.steering import Steering, steerable_parameters
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.core.settings import OnlineSettings, Parameter, Settings, apply_overrides, online_parameters, tunable
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 
 SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
@@ -31,7 +30,7 @@ def online() -> dict[str, tuple[str, Parameter]]:
     """Every online setting, with the first tracker in which it has an effect."""
     found: dict[str, tuple[str, Parameter]] = {}
     for spec in SYSTEMS.values():
-        for parameter in steerable_parameters(spec.settings()):
+        for parameter in online_parameters(spec.settings()):
             found.setdefault(parameter.name, (spec.id, parameter))
     return found
 
@@ -111,7 +110,7 @@ def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene,
     spec = SYSTEMS[name]
     tracker = construct(spec, scene)
     settings = settings_for(spec)
-    ends = {p.name: p.low if number % 2 else p.high for number, p in enumerate(steerable_parameters(settings))}
+    ends = {p.name: p.low if number % 2 else p.high for number, p in enumerate(online_parameters(settings))}
     ends |= {"features.fast_threshold": 12, "features.fast_threshold_min": 3}
     extreme = apply_overrides(settings, ends)
     frames = SHORT // 2 if quick(spec.settings) else SHORT  # dense flow costs ten times as much
@@ -163,18 +162,18 @@ def test_only_what_differs_is_handed_on() -> None:
 
     given: list[tuple[str, float]] = []
     takers = [(name, lambda s, name=name: given.append((name, s.value))) for name in ("one", "two")]
-    steering = Steering(Whole(), takers)
+    steering = OnlineSettings(Whole(), takers)
     steering.configure(Whole(two=Part(value=2.0)))
     steering.configure(Whole(two=Part(value=2.0)))
     assert given == [("two", 2.0)]
     steering.restore()
     assert given[1:] == [("one", 1.0), ("two", 1.0)]
     with pytest.raises(SettingsError, match=r"'two.value' of Whole is taken by no part .*configure\(settings\)"):
-        Steering(Whole(), takers[:1])
+        OnlineSettings(Whole(), takers[:1])
 
 
 def test_what_is_switched_off_needs_nobody_who_takes_it() -> None:
-    names = {p.name.split(".")[0] for p in steerable_parameters(SYSTEMS["emfoa-oft-no-masks"].settings())}
+    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft-no-masks"].settings())}
     assert "segmentation" not in names and {"flow", "motion"} <= names
-    names = {p.name.split(".")[0] for p in steerable_parameters(SYSTEMS["emfoa-oft-no-depth-test"].settings())}
+    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft-no-depth-test"].settings())}
     assert not {"motion", "free_space"} & names

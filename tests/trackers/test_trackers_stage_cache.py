@@ -72,7 +72,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.features.build_extractor import build_extractor
+from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.features.cached import CachedExtractor
 from dynslam_bench.features.settings import FeatureSettings
 

@@ -15,9 +15,9 @@ import toy_tracker
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.tuning import StudySpec, Tuner
-from dynslam_bench.tuning.blocks import Block
-from dynslam_bench.tuning.design import Design, design_of
 from dynslam_bench.tuning.evaluate import Outcome
+from dynslam_bench.tuning.instances import ProblemInstance
+from dynslam_bench.tuning.splits import Design, design_of
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE, HELD_OUT = (
@@ -66,25 +66,33 @@ class SimulatedTuner(Tuner):
     ) -> None:
         self.effect, self.noise_seed, self.runs = effect, seed, 0
         with patch(
-            "dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design(spec.tune, spec.held_out)
+            "dynslam_bench.tuning.tuner.design_of", lambda spec, accept: simulated_design(spec.tune, spec.held_out)
         ):
             if not in_memory:
                 super().__init__(spec, results)
                 return
-            with patch("dynslam_bench.tuning.study.open_storage", lambda *_: optuna.storages.InMemoryStorage()):
+            with patch("dynslam_bench.tuning.tuner.open_storage", lambda *_: optuna.storages.InMemoryStorage()):
                 super().__init__(spec, results)
 
     def evaluate(
-        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
-    ) -> dict[Block, Outcome]:
-        self.runs += len(blocks)
-        return {block: Outcome(block, "", self._error(settings, block), 1.0, 0.03, 0.03, 1.0) for block in blocks}
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        jobs: int = 1,
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
+        self.runs += len(instances)
+        return {
+            instance: Outcome(instance, "", self._error(settings, instance), 1.0, 0.03, 0.03, 1.0)
+            for instance in instances
+        }
 
-    def _error(self, settings: Mapping[str, Any], block: Block) -> float:
+    def _error(self, settings: Mapping[str, Any], instance: ProblemInstance) -> float:
         who = digest(dict(settings))
-        scene = stream(self.noise_seed, "scene", block.scene).normal(0, 0.5)
-        own = stream(self.noise_seed, "own", who, block.scene).normal(0, SCENES_SD / math.sqrt(2))
-        start = stream(self.noise_seed, "start", who, str(block)).normal(0, STARTS_SD / math.sqrt(2))
+        scene = stream(self.noise_seed, "scene", instance.scene).normal(0, 0.5)
+        own = stream(self.noise_seed, "own", who, instance.scene).normal(0, SCENES_SD / math.sqrt(2))
+        start = stream(self.noise_seed, "start", who, str(instance)).normal(0, STARTS_SD / math.sqrt(2))
         return math.exp(math.log(0.03) + scene + self.effect(settings) + own + start)
 
 

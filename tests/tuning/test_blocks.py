@@ -1,4 +1,4 @@
-"""Blocks: what a study file names, and what is refused in one clear line."""
+"""Instances: what a study file names, and what is refused in one clear line."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ import pytest
 import toy_tracker
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.tuning.blocks import Block, parse_blocks, scenes
-from dynslam_bench.tuning.design import design_of, fresh_starts, with_more_starts
-from dynslam_bench.tuning.splits import check_splits
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances, scenes
+from dynslam_bench.tuning.splits import check_splits, design_of, fresh_starts, with_more_starts
 from dynslam_bench.tuning.study_file import StudySpec
 
 WALK = "synthetic/walking_xyz"
 
 
 def test_a_text_names_scenes_lengths_and_starts() -> None:
-    blocks = parse_blocks(f"{WALK}?scene=0-1,7&frames=80&offsets=0-4")
-    assert len(blocks) == 15
-    assert blocks[0] == Block(f"{WALK}?scene=0&frames=80")
-    assert blocks[-1] == Block(f"{WALK}?scene=7&frames=80", offset=4)
-    assert list(scenes(blocks)) == [f"{WALK}?scene=0", f"{WALK}?scene=1", f"{WALK}?scene=7"]
-    assert parse_blocks(f"{WALK}@0-1,7?frames=80&offsets=0-4") == blocks
+    instances = parse_instances(f"{WALK}?scene=0-1,7&frames=80&offsets=0-4")
+    assert len(instances) == 15
+    assert instances[0] == ProblemInstance(f"{WALK}?scene=0&frames=80")
+    assert instances[-1] == ProblemInstance(f"{WALK}?scene=7&frames=80", offset=4)
+    assert list(scenes(instances)) == [f"{WALK}?scene=0", f"{WALK}?scene=1", f"{WALK}?scene=7"]
+    assert parse_instances(f"{WALK}@0-1,7?frames=80&offsets=0-4") == instances
 
 
 @pytest.mark.parametrize("text", [
@@ -32,24 +31,24 @@ def test_a_text_names_scenes_lengths_and_starts() -> None:
     f"{WALK}[10:40]?scene=3&frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
 ])  # fmt: skip
 def test_what_a_block_prints_is_read_as_that_block(text: str) -> None:
-    blocks = parse_blocks(text)
-    assert blocks
-    for block in blocks:
-        assert parse_blocks(str(block)) == (block,)
+    instances = parse_instances(text)
+    assert instances
+    for instance in instances:
+        assert parse_instances(str(instance)) == (instance,)
 
 
 def test_parts_strides_and_degradation_reach_the_run() -> None:
-    (block,) = parse_blocks("bonn/crowd[20:120]?offsets=3&stride=2&degrade=blur:0.5&seeds=4")
-    run = block.run_spec("orb-slam2", threads=2)
+    (instance,) = parse_instances("bonn/crowd[20:120]?offsets=3&stride=2&degrade=blur:0.5&seeds=4")
+    run = instance.run_spec("orb-slam2", threads=2)
     assert (run.frames, run.offset, run.stride, run.seed, run.threads) == ((20, 120), 3, 2, 4, 2)
     assert run.degrade == {"blur": 0.5} and run.frames_seen == (23, 120)
-    assert parse_blocks("bonn/crowd?frames=120")[0].frames == (0, 120)
+    assert parse_instances("bonn/crowd?frames=120")[0].frames == (0, 120)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("bonn/crowd[0:10", 'names no blocks.*write it as "bonn/crowd'),
+        ("bonn/crowd[0:10", 'names no instances.*write it as "bonn/crowd'),
         ("bonn/crowd[9:3]", "9:3 is no range of frames"),
         (f"{WALK}?scene=5-2", "'5-2' of .* is neither a number nor a range"),
         (f"{WALK}?scene=1,0-2", "names a number twice"),
@@ -66,60 +65,64 @@ def test_parts_strides_and_degradation_reach_the_run() -> None:
 )
 def test_what_cannot_be_read_is_one_clear_line(text: str, message: str) -> None:
     with pytest.raises(DynslamError, match=message) as caught:
-        parse_blocks(text)
+        parse_instances(text)
     assert "\n" not in str(caught.value)
 
 
 def test_blocks_are_measured_against_their_sequence(tmp_path: Path) -> None:
     folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
-    assert len(Block(folder, (2, 10), offset=1, stride=3).open()) == 3
-    for block, message in (
-        (Block(folder, (0, 20)), r"takes the frames 0 to 19, but .* has 12 frames"),
-        (Block(folder, offset=11), "holds 1 frames, it needs 2"),
+    assert len(ProblemInstance(folder, (2, 10), offset=1, stride=3).open()) == 3
+    for instance, message in (
+        (ProblemInstance(folder, (0, 20)), r"takes the frames 0 to 19, but .* has 12 frames"),
+        (ProblemInstance(folder, offset=11), "holds 1 frames, it needs 2"),
     ):
         with pytest.raises(StudyError, match=message):
-            block.open()
+            instance.open()
     (Path(folder) / "groundtruth.txt").unlink()
     with pytest.raises(StudyError, match="has no ground truth"):
-        Block(folder).open()
+        ProblemInstance(folder).open()
 
 
 def test_the_digest_names_the_content(tmp_path: Path) -> None:
     folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
-    block = Block(folder, (0, 12), offset=2)
-    assert block.digest() == replace(block, frames=None).digest()
-    others = [replace(block, **change) for change in ({"offset": 1}, {"stride": 2}, {"frames": (0, 9)}, {"seed": 1})]
-    others.append(replace(block, degradation=(("blur", 0.5),)))
-    assert len({block.digest(), *(other.digest() for other in others)}) == 6
+    instance = ProblemInstance(folder, (0, 12), offset=2)
+    assert instance.digest() == replace(instance, frames=None).digest()
+    others = [replace(instance, **change) for change in ({"offset": 1}, {"stride": 2}, {"frames": (0, 9)}, {"seed": 1})]
+    others.append(replace(instance, degradation=(("blur", 0.5),)))
+    assert len({instance.digest(), *(other.digest() for other in others)}) == 6
 
 
 def test_blocks_of_one_recording_are_apart_or_repeats(tmp_path: Path) -> None:
     folder = str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
-    one, later = Block(folder, (0, 6)), Block(folder, (6, 12))
+    one, later = ProblemInstance(folder, (0, 6)), ProblemInstance(folder, (6, 12))
     assert check_splits("s", {"tune": [one, replace(one, offset=1), later]}) == []
-    for blocks, message in (
-        ([one, Block(folder, (4, 12))], "share 2 frames"),
+    for instances, message in (
+        ([one, ProblemInstance(folder, (4, 12))], "share 2 frames"),
         ([one, one], "is named twice"),
-        ([Block(folder), Block(folder, (0, 12))], "are the same frames"),
+        ([ProblemInstance(folder), ProblemInstance(folder, (0, 12))], "are the same frames"),
     ):
         with pytest.raises(StudyError, match=message):
-            check_splits("s", {"tune": blocks})
+            check_splits("s", {"tune": instances})
     with pytest.raises(StudyError, match=f"{re.escape(folder)}' held out are the same sequence"):
         check_splits("s", {"tune": [one], "held_out": [later]})
 
 
 def test_the_default_runs_from_three_starts_and_the_choice_is_made_on_unseen_blocks(tmp_path: Path) -> None:
-    few = parse_blocks(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
-    assert sorted(block.offset for block in with_more_starts(few) if block.scene.endswith("?scene=0")) == [0, 1, 3]
+    few = parse_instances(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
+    assert sorted(instance.offset for instance in with_more_starts(few) if instance.scene.endswith("?scene=0")) == [
+        0,
+        1,
+        3,
+    ]
     fresh = fresh_starts(few)
-    assert [block.offset for block in fresh[:2]] == [1, 2] and not {b.offset for b in fresh} & {0, 3}
+    assert [instance.offset for instance in fresh[:2]] == [1, 2] and not {b.offset for b in fresh} & {0, 3}
     spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}?scene=0-3&frames=20",), recorded=())
     design = design_of(spec)
-    assert {block.scene for block in design.confirm} == {block.scene for block in design.race}
+    assert {instance.scene for instance in design.confirm} == {instance.scene for instance in design.race}
     many = design_of(spec.model_copy(update={"tune": (f"{WALK}?scene=0-11&frames=20",)}))
-    confirm, race = ({block.scene for block in blocks} for blocks in (many.confirm, many.race))
+    confirm, race = ({instance.scene for instance in instances} for instances in (many.confirm, many.race))
     assert len(confirm) == 4 and len(race) == 8 and not confirm & race
-    assert len({block.scene for block in many.race[:8]}) == 8, "a growing set takes one of each scene in turn"
+    assert len({instance.scene for instance in many.race[:8]}) == 8, "a growing set takes one of each scene in turn"
 
 
 def test_a_recording_that_is_here_is_in_the_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,6 +130,8 @@ def test_a_recording_that_is_here_is_in_the_check(tmp_path: Path, monkeypatch: p
     root = tmp_path / "data"
     toy_tracker.make_sequence(root / "bonn" / "rgbd_bonn_crowd", 0.2)
     recorded = design_of(StudySpec(name="s", tune=tune, data_root=str(root))).recorded
-    assert [(block.sequence, block.offset) for block in recorded] == [("bonn/crowd", offset) for offset in range(4)]
+    assert [(instance.sequence, instance.offset) for instance in recorded] == [
+        ("bonn/crowd", offset) for offset in range(4)
+    ]
     assert design_of(StudySpec(name="s", tune=tune, recorded=(), data_root=str(root))).recorded == ()
     assert design_of(StudySpec(name="s", tune=tune, data_root=str(tmp_path / "empty"))).recorded == ()

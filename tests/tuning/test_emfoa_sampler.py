@@ -10,7 +10,7 @@ import optuna
 import pytest
 from optuna.samplers import BaseSampler
 
-from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
+from dynslam_bench.tuning.samplers import EmfoaSampler
 
 suites = pytest.importorskip("optuna.testing.pytest_samplers", reason="Optuna < 5 ships no sampler suite")
 

@@ -14,21 +14,21 @@ from simulated import SimulatedTuner, make_spec
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.toml import read_settings
-from dynslam_bench.tuning import Block, Outcome, finish, read_preset_text, write_page
-from dynslam_bench.tuning.evaluate import BlockFailedError
+from dynslam_bench.tuning import Outcome, ProblemInstance, finish, read_preset_text, write_page
+from dynslam_bench.tuning.evaluate import InstanceFailedError
 from dynslam_bench.tuning.objectives import OBJECTIVES, find_objective, own_objective, together
 
-PLAIN = [Block(f"synthetic/walking_xyz?scene={scene}") for scene in range(4)]
+PLAIN = [ProblemInstance(f"synthetic/walking_xyz?scene={scene}") for scene in range(4)]
 BLURRED = replace(PLAIN[0], degradation=(("blur", 0.5),))
 
 
-def outcome(block: Block, ate: float, time: float = 0.03, coverage: float = 1.0) -> Outcome:
-    return Outcome(block, "", ate, coverage, time, time, 1.0)
+def outcome(instance: ProblemInstance, ate: float, time: float = 0.03, coverage: float = 1.0) -> Outcome:
+    return Outcome(instance, "", ate, coverage, time, time, 1.0)
 
 
 def test_objectives_are_logarithms_of_ratios_by_hand() -> None:
-    default = {block: outcome(block, 0.02) for block in [*PLAIN, BLURRED]}
-    tuned = {block: outcome(block, 0.01 * (1 + scene), 0.015, 0.98) for scene, block in enumerate(PLAIN)}
+    default = {instance: outcome(instance, 0.02) for instance in [*PLAIN, BLURRED]}
+    tuned = {instance: outcome(instance, 0.01 * (1 + scene), 0.015, 0.98) for scene, instance in enumerate(PLAIN)}
     values = {name: each.value(tuned, default) for name, each in OBJECTIVES.items() if name != "robustness"}
     assert values["accuracy"] == pytest.approx(sum(math.log(n / 2) for n in (1, 2, 3, 4)) / 4)
     assert values["speed"] == pytest.approx(math.log(0.5))
@@ -41,8 +41,8 @@ def test_objectives_are_logarithms_of_ratios_by_hand() -> None:
 
 
 def test_what_cannot_be_an_objective_is_one_clear_line() -> None:
-    default = {block: outcome(block, 0.02) for block in PLAIN}
-    with pytest.raises(StudyError, match=r"'robustness' counts degraded blocks alone, but none .*degrade=blur:0.5"):
+    default = {instance: outcome(instance, 0.02) for instance in PLAIN}
+    with pytest.raises(StudyError, match=r"'robustness' counts degraded instances alone, but none .*degrade=blur:0.5"):
         OBJECTIVES["robustness"].value(default, default)
     with pytest.raises(StudyError, match=r"unknown objective 'sped'.*'speed'"):
         find_objective("sped")
@@ -50,7 +50,7 @@ def test_what_cannot_be_an_objective_is_one_clear_line() -> None:
     def nothing_at_all(run: Outcome) -> float:
         return 0.0
 
-    with pytest.raises(StudyError, match=r"'nothing_at_all' gives 0 on block '.*/walking_xyz\?scene=0&offsets=0'"):
+    with pytest.raises(StudyError, match=r"'nothing_at_all' gives 0 on instance '.*/walking_xyz\?scene=0&offsets=0'"):
         own_objective(nothing_at_all).value(default, default)
 
 
@@ -60,13 +60,18 @@ class TimedTuner(SimulatedTuner):
     price = 0.0
 
     def evaluate(
-        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
-    ) -> dict[Block, Outcome]:
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        jobs: int = 1,
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
         gain, wobble = float(settings.get("gain", 1.5)), int(settings.get("wobble", 2))
-        found = super().evaluate({"gain": gain}, blocks, jobs=jobs, cache=cache)
+        found = super().evaluate({"gain": gain}, instances, jobs=jobs, cache=cache)
         time = 0.02 * (0.5 + 0.25 * wobble) * gain
         cost = math.exp(self.price * max(0.0, 1.5 - gain))
-        return {block: replace(each, ate_m=each.ate_m * cost, processor_s=time) for block, each in found.items()}
+        return {instance: replace(each, ate_m=each.ate_m * cost, processor_s=time) for instance, each in found.items()}
 
 
 def spec(objectives: list[str], include: list[str], **changes: object):
@@ -122,23 +127,28 @@ class DriftingTuner(SimulatedTuner):
     """A machine that slows down with every run, and settings that change nothing; a gain of 13 breaks."""
 
     def evaluate(
-        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
-    ) -> dict[Block, Outcome]:
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        jobs: int = 1,
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
         if settings.get("gain") == 13.0:
-            raise BlockFailedError(f"{blocks[0]}: crashed")
+            raise InstanceFailedError(f"{instances[0]}: crashed")
         return {
-            block: replace(found, ate_m=0.02, processor_s=0.03 * 1.02 ** (self.runs / 2))
-            for block in blocks
-            for found in super(DriftingTuner, self).evaluate(settings, [block]).values()
+            instance: replace(found, ate_m=0.02, processor_s=0.03 * 1.02 ** (self.runs / 2))
+            for instance in instances
+            for found in super(DriftingTuner, self).evaluate(settings, [instance]).values()
         }
 
 
 def test_what_is_compared_runs_block_by_block_so_that_a_slowing_machine_decides_nothing(tmp_path: Path) -> None:
     tuner = DriftingTuner(make_spec(objectives=["speed"]), tmp_path)
-    blocks = tuner.design.held_out
-    default, same, broken = tuner.evaluate_beside([{}, {"gain": 1.1}, {"gain": 13.0}], blocks)
-    assert isinstance(broken, BlockFailedError) and not isinstance(default, BlockFailedError)
-    assert list(default) == list(blocks) == list(same)
+    instances = tuner.design.held_out
+    default, same, broken = tuner.evaluate_beside([{}, {"gain": 1.1}, {"gain": 13.0}], instances)
+    assert isinstance(broken, InstanceFailedError) and not isinstance(default, InstanceFailedError)
+    assert list(default) == list(instances) == list(same)
     assert OBJECTIVES["speed"].value(same, default) == pytest.approx(math.log(1.01), abs=0.002), "one run apart"
-    apart = [tuner.evaluate(settings, blocks) for settings in ({}, {"gain": 1.1})]
+    apart = [tuner.evaluate(settings, instances) for settings in ({}, {"gain": 1.1})]
     assert OBJECTIVES["speed"].value(apart[1], apart[0]) > 0.2, "all of one after all of the other"

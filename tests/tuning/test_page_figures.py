@@ -9,10 +9,10 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import FrozenTrial, create_trial
 
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.tuning.blocks import Block
-from dynslam_bench.tuning.design import Design, with_more_starts
+from dynslam_bench.tuning.figures import front, history, settings_table, slices
+from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.page import fewer_starts, star_of
-from dynslam_bench.tuning.page_figures import front, history, settings_table, slices
+from dynslam_bench.tuning.splits import Design, with_more_starts
 from dynslam_bench.tuning.summary import StudySummary
 
 SPACE = [
@@ -56,7 +56,7 @@ def test_every_setting_has_a_panel_of_its_own_scale(trials: list[FrozenTrial]) -
 
 @pytest.mark.parametrize(("offsets", "said"), [((0,), True), ((0, 1), True), ((0, 1, 2), False), ((0, 1, 2, 3), False)])
 def test_why_the_default_is_not_1_is_said_where_trials_run_from_fewer_starts(offsets: tuple, said: bool) -> None:
-    race = tuple(Block("synthetic/walking_xyz?scene=0", offset=offset) for offset in offsets)
+    race = tuple(ProblemInstance("synthetic/walking_xyz?scene=0", offset=offset) for offset in offsets)
     text = fewer_starts(Design(race, tuple(with_more_starts(race)), (), (), ()))
     assert ("over 3 or more starts" in text and "best so far" in text) is said and bool(text) is said
 

@@ -12,7 +12,7 @@ from dynslam_bench.tuning.samplers import CONSTRAINTS
 @pytest.mark.parametrize(
     ("bounds", "said"),
     [
-        ((0.01, 0.02, 0.03), "None of the 3 trials fulfils the constraints on its own blocks"),
+        ((0.01, 0.02, 0.03), "None of the 3 trials fulfils the constraints on its own instances"),
         ((-0.01, 0.02, 0.03), "2 trials violate a constraint and are not candidates"),
         ((-0.01, -0.02, -0.03), None),
     ],

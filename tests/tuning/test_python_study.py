@@ -14,9 +14,9 @@ import pytest
 from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, simulated_design, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.tuning import Block, Outcome, Study, StudySpec, Tuner, read_study
-from dynslam_bench.tuning.old_form import converted
+from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec, Tuner, read_study
 from dynslam_bench.tuning.storage import open_storage
+from dynslam_bench.tuning.study_file import converted
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
 DOCS = EXAMPLE.parents[1] / "docs"
@@ -31,13 +31,13 @@ class DrawnTuner(SimulatedTuner):
 
     def __init__(self, spec: StudySpec, results: Path, **given: Any) -> None:
         self.effect, self.noise_seed, self.runs = valley, 0, 0
-        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
+        with patch("dynslam_bench.tuning.tuner.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
             Tuner.__init__(self, spec, results, **given)
 
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dynslam_bench.tuning.python_study.Tuner", DrawnTuner)
+    monkeypatch.setattr("dynslam_bench.tuning.study.Tuner", DrawnTuner)
 
 
 def steady(run: Outcome) -> float:
@@ -70,10 +70,10 @@ def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
 
 
 def test_blocks_may_be_given_as_blocks(tmp_path: Path) -> None:
-    block = Block("synthetic/walking_xyz?scene=3&frames=20", offset=2)
-    study = Study(**{**FIELDS, "tune": [block, TUNE]}, results=tmp_path)
+    instance = ProblemInstance("synthetic/walking_xyz?scene=3&frames=20", offset=2)
+    study = Study(**{**FIELDS, "tune": [instance, TUNE]}, results=tmp_path)
     assert study.spec.tune == ("synthetic/walking_xyz?scene=3&frames=20&offsets=2", TUNE)
-    assert study.spec.blocks(study.spec.tune[0]) == [block]
+    assert study.spec.instances(study.spec.tune[0]) == [instance]
 
 
 @pytest.mark.parametrize(

@@ -19,10 +19,11 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from simulated import SimulatedTuner, make_spec, nothing, valley
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import finish, race
+from dynslam_bench.tuning import finish
+from dynslam_bench.tuning import pruning as race
 from dynslam_bench.tuning.objectives import ACCURACY
-from dynslam_bench.tuning.study import CRASHED_WORKER, StudyEvent
 from dynslam_bench.tuning.trials import errors_of
+from dynslam_bench.tuning.tuner import CRASHED_WORKER, StudyEvent
 
 
 def test_steps_grow_and_cost_the_same() -> None:
@@ -63,15 +64,15 @@ def test_told_values_are_true(rule: str, objectives: list[str], tmp_path: Path) 
     states = [trial.state for trial in trials]
     assert states[0] == TrialState.COMPLETE and TrialState.PRUNED in states
     for trial in trials:
-        blocks = list(errors_of(trial))
-        value = ACCURACY.value(tuner.evaluate(tuner.settings_of(trial), blocks), tuner.reference())
+        instances = list(errors_of(trial))
+        value = ACCURACY.value(tuner.evaluate(tuner.settings_of(trial), instances), tuner.reference())
         if trial.state == TrialState.COMPLETE:
-            assert blocks == list(tuner.design.race), "a value is one of all blocks"
+            assert instances == list(tuner.design.race), "a value is one of all instances"
             assert trial.values[0] == pytest.approx(value, abs=1e-12)
         else:
             assert trial.state == TrialState.PRUNED, "never told as complete"
-            assert len(blocks) < len(tuner.design.race) and "dropped after" in trial.user_attrs["reason"]
-            noted = race.noted(trial, len(blocks))
+            assert len(instances) < len(tuner.design.race) and "dropped after" in trial.user_attrs["reason"]
+            noted = race.noted(trial, len(instances))
             assert noted is not None and noted[0] == pytest.approx(value, abs=1e-12)
 
 
@@ -94,7 +95,7 @@ def test_the_race_takes_half_the_runs_of_the_full_grid_at_the_same_regret(tmp_pa
 
 
 def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
-    """Forty studies; a single comparison of the best trial on its own blocks would claim a gain in most of them."""
+    """Forty studies; a single comparison of the best trial on its own instances would claim a gain in most of them."""
     chosen = claims = lucky = 0
     for seed in range(40):
         tuner = SimulatedTuner(make_spec(sampler_seed=seed), tmp_path / str(seed), effect=nothing, seed=seed)

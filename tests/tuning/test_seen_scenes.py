@@ -9,7 +9,7 @@ from simulated import TRACKER, SimulatedTuner, make_spec, simulated_design
 
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.tuning import finish, write_page
-from dynslam_bench.tuning.seen import seen_note, splits_seen
+from dynslam_bench.tuning.splits import seen_note, splits_seen
 
 MASKED = {"tracker": "mask-rcnn", "space": {"include": ["features.n_features"]}, "trials": 3}
 
@@ -35,7 +35,7 @@ def test_page_summary_and_preset_mark_what_the_network_was_trained_on(tmp_path: 
     page = write_page(tuner, summary).read_text()
     note = seen_note(summary.seen)
     assert "race and choice" in note and page.count("trained on those very scenes") >= 3, "result and both tables"
-    assert "in the race §" in page and "unseen blocks §" in page and "held-out §" not in page
+    assert "in the race §" in page and "unseen instances §" in page and "held-out §" not in page
     assert "trained on" in (tuner.folder / "best.toml").read_text().replace("\n# ", " ")
 
 

@@ -19,8 +19,8 @@ from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
 from dynslam_bench.tuning.space import distribution
-from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
+from dynslam_bench.tuning.tuner import CRASHED_WORKER
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
@@ -87,7 +87,7 @@ def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> N
     trials = tuner.study.get_trials()
     assert trials
     for trial in trials:
-        named = {run_id for _, run_id, *_ in trial.user_attrs["blocks"]}
+        named = {run_id for _, run_id, *_ in trial.user_attrs["instances"]}
         assert len(named) == 2 and named <= stored
     assert {event.run_id for event in told if event.kind == "finished"} == stored  # those of the default among them
     frames = [event.partial["frames_done"] for event in told if event.kind == "progress" and event.partial]

@@ -9,7 +9,7 @@ import optuna
 import pytest
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning.callbacks import TensorBoard
+from dynslam_bench.tuning.study import TensorBoard
 
 VALUES = [(0.1, 30.0), (0.2, 20.0), (0.3, 10.0)]
 

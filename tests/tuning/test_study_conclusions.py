@@ -14,12 +14,11 @@ from scipy.stats import mstats
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import Study, StudySpec, finish, run_study, write_page
-from dynslam_bench.tuning.blocks import Block
 from dynslam_bench.tuning.evaluate import Outcome
-from dynslam_bench.tuning.importance import FEWEST_TRIALS, importances, inert_parameters
-from dynslam_bench.tuning.ratio import Ratio, compared
-from dynslam_bench.tuning.statistics import bounds, by_scene, centre, upper
-from dynslam_bench.tuning.summary import Candidate, StudySummary, choose, conclude
+from dynslam_bench.tuning.instances import ProblemInstance
+from dynslam_bench.tuning.objectives import bounds, by_scene, centre, upper
+from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, choose, compared, conclude
+from dynslam_bench.tuning.trials import FEWEST_TRIALS, importances, inert_parameters
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 CONFIRM = Ratio(ratio=0.7, low=0.6, high=0.82, n=8, sequences=4, bound=0.85)
@@ -58,12 +57,12 @@ def test_the_interval_is_students_and_from_ten_on_that_of_the_trimmed_mean() -> 
     assert bounds([1.0]) is None and upper([1.0], 0.95) == math.inf
 
 
-def outcomes(errors: dict[Block, float]) -> dict[Block, Outcome]:
-    return {block: Outcome(block, "", error, 1.0, 0.03, 0.03, 1.0) for block, error in errors.items()}
+def outcomes(errors: dict[ProblemInstance, float]) -> dict[ProblemInstance, Outcome]:
+    return {instance: Outcome(instance, "", error, 1.0, 0.03, 0.03, 1.0) for instance, error in errors.items()}
 
 
 def test_one_lucky_start_of_the_default_decides_nothing() -> None:
-    starts = [Block("s", offset=offset) for offset in range(3)]
+    starts = [ProblemInstance("s", offset=offset) for offset in range(3)]
     default = dict(zip(starts, (0.002, 0.02, 0.021), strict=True))
     same = dict.fromkeys(starts, 0.02)
     assert by_scene(same, default) == {starts[0].scene: pytest.approx(0.0)}
@@ -71,7 +70,7 @@ def test_one_lucky_start_of_the_default_decides_nothing() -> None:
 
 
 def test_few_scenes_have_an_interval_over_starts_that_shows_nothing() -> None:
-    starts = [Block("s", offset=offset) for offset in range(4)]
+    starts = [ProblemInstance("s", offset=offset) for offset in range(4)]
     found = compared(outcomes(dict.fromkeys(starts, 0.01)), outcomes(dict.fromkeys(starts, 0.02)))
     assert (found.ratio, found.low, found.high) == pytest.approx((0.5, 0.5, 0.5))
     assert found.sequences == 1 and found.n == 4 and not found.shows_gain and not found.shows_loss

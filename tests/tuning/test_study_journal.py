@@ -13,9 +13,8 @@ import pytest
 from faults import survey
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import database
-from dynslam_bench.tuning.database import open_database
-from dynslam_bench.tuning.journal_file import WholeLines
+from dynslam_bench.tuning import storage as database
+from dynslam_bench.tuning.storage import JournalFile, open_database
 
 LOSS = {"x": optuna.distributions.FloatDistribution(0, 1)}
 
@@ -24,14 +23,14 @@ def add(path: Path, upto: int) -> None:
     """Open the study and add finished trials until it has so many."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     path.parent.mkdir(exist_ok=True)
-    storage = optuna.storages.JournalStorage(WholeLines(path))
+    storage = optuna.storages.JournalStorage(JournalFile(path))
     study = optuna.create_study(storage=storage, study_name="s", load_if_exists=True)
     for number in range(len(study.trials), upto):
         study.add_trial(optuna.trial.create_trial(value=number / 8, params={"x": number / 8}, distributions=LOSS))
 
 
 def values(path: Path) -> list[float]:
-    storage = optuna.storages.JournalStorage(WholeLines(path))
+    storage = optuna.storages.JournalStorage(JournalFile(path))
     return [trial.value for trial in optuna.load_study(storage=storage, study_name="s").trials]
 
 

@@ -11,7 +11,7 @@ import toy_tracker
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.part import part_of
+from dynslam_bench.sequences.view import part_of
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, write_page
 from dynslam_bench.tuning.splits import check_splits
 from dynslam_bench.tuning.trials import errors_of
@@ -30,7 +30,7 @@ def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
 
 def faults(tune: list[str], held_out: list[str], *, accept: bool = False) -> list[str]:
     study = spec(tune, held_out)
-    splits = {"tune": study.blocks(*study.tune), "held_out": study.blocks(*study.held_out)}
+    splits = {"tune": study.instances(*study.tune), "held_out": study.instances(*study.held_out)}
     return check_splits(study.name, splits, accept=accept)
 
 
@@ -153,10 +153,10 @@ def test_a_tracker_without_randomness_has_repeats_that_differ(tmp_path: Path) ->
     fixed = {"include": ["gain"], "fixed": {"wobble": 0}}
     tuner = run_study(spec([folder], [], seeds=[0, 1], offsets=[0, 2], space=fixed), results=tmp_path / "results")
     errors = errors_of(tuner.study.get_trials()[1])
-    assert sorted((block.seed, block.offset) for block in errors) == [(0, 0), (0, 2), (1, 0), (1, 2)]
-    by_start = {start: {ate for block, ate in errors.items() if block.offset == start} for start in (0, 2)}
+    assert sorted((instance.seed, instance.offset) for instance in errors) == [(0, 0), (0, 2), (1, 0), (1, 2)]
+    by_start = {start: {ate for instance, ate in errors.items() if instance.offset == start} for start in (0, 2)}
     assert all(len(found) == 1 for found in by_start.values()) and by_start[0] != by_start[2]
     summary = finish(tuner)
-    fresh = {(block.seed, block.offset) for block in tuner.design.confirm}
+    fresh = {(instance.seed, instance.offset) for instance in tuner.design.confirm}
     assert fresh == {(1000, 1), (1001, 3), (1002, 4), (1003, 5)}
     assert "seeds changed nothing" in write_page(tuner, summary).read_text()

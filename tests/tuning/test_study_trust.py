@@ -14,7 +14,8 @@ import pytest
 from optuna.samplers import _cmaes as optuna_cmaes
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import Study, cmaes_state
+from dynslam_bench.tuning import Study
+from dynslam_bench.tuning import storage as cmaes_state
 from dynslam_bench.tuning.storage import open_storage
 from dynslam_bench.tuning.study_file import StudySpec
 

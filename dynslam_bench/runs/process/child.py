@@ -11,26 +11,37 @@ folder that goes with it.
 from __future__ import annotations
 
 import contextlib
+import errno
 import faulthandler
 import json
 import logging
 import os
+import re
 import resource
 import signal
 import sys
+import sysconfig
 import tempfile
 import threading
 import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.plugin_probe import ISOLATED_VARIABLE
-from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.temporary import TemporaryFolder
-
-from .failures import describe_failure
-from .family import adopt_orphans, die_with_parent
+from dynslam_bench.core.errors import (
+    DynslamError,
+    InfrastructureError,
+    PluginError,
+    SegmentationError,
+    SequenceError,
+    SettingsError,
+    TrajectoryError,
+)
+from dynslam_bench.core.files import TemporaryFolder, sweep
+from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
+from dynslam_bench.runs.process.tree import adopt_orphans, die_with_parent, end_descendants
 
 LOG_FILE = "log.txt"
 
@@ -139,3 +150,163 @@ def limit_threads(threads: int) -> None:
         os.environ["NUMBA_NUM_THREADS"] = str(threads)
     else:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+# What is said of an exception that ended a run: on which frame, what, and in which line of whose code.
+
+_LONGEST = 400
+_REFUSALS = (SettingsError, PluginError, TrajectoryError)
+"""Raised before the first frame is tracked, these say that what was asked for cannot be."""
+
+_DATA_FAULTS = (SequenceError, SegmentationError)
+"""These say, whenever they are raised, that an image, a mask or a network's weights are at fault."""
+
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE)
+"""What a disk says that is full, read-only, damaged or gone: no tracker can help it."""
+
+
+class FailedAt(Exception):
+    """Where a run was when its cause was raised."""
+
+
+@contextmanager
+def at(where: object) -> Iterator[None]:
+    """Note where the run was for what is raised inside; `where` is put into words only then."""
+    try:
+        yield
+    except Exception as error:
+        raise FailedAt(str(where)) from error
+    except SystemExit as error:
+        raise FailedAt(str(where)) from error
+
+
+def describe_failure(error: BaseException) -> dict[str, Any]:
+    """The last message of a run that an exception ended: ``status``, ``reason`` and ``refused``.
+
+    With ``infrastructure`` it was no fault of the run's: that says what broke. With ``data`` it was not the tracker's
+    own code that raised it, or what it was given to read cannot be read: the run says nothing about the tracker.
+
+    The reason reads ``frame 20 of 60: ValueError: too few points (my_tracker.py:31)``.
+    """
+    from dynslam_bench.contracts.checks import TrackerContractError, raised_by_tracker
+
+    where, cause = "", error
+    if isinstance(error, FailedAt) and error.__cause__ is not None:
+        where, cause = str(error), error.__cause__
+    text = " ".join(str(cause).split())[:_LONGEST]
+    named = f"{type(cause).__name__}: {text}".rstrip(": ")
+    if isinstance(cause, SystemExit):
+        named = f"sys.exit({cause.code!r}) was called"
+    kind = type(cause).__name__
+    broken = _broken(error)
+    if broken:
+        return _message("crashed", _located(where, broken)) | {"infrastructure": broken}
+    if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
+        return _message("out-of-memory", _located(where, named, cause))
+    if isinstance(cause, TrackerContractError):
+        return _message("invalid", _located(where, text))
+    data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
+    if isinstance(cause, DynslamError):
+        return _message("crashed", _located(where, text)) | {"refused": isinstance(cause, _REFUSALS)} | data
+    return _message("crashed", _located(where, named, cause)) | data
+
+
+def _broken(error: BaseException | None) -> str:
+    """What of the infrastructure broke, if an exception or one of its causes says that something did."""
+    while error is not None:
+        if isinstance(error, InfrastructureError) or (isinstance(error, OSError) and error.errno in _DISK_ERRORS):
+            return " ".join(str(error).split())[:_LONGEST]
+        error = error.__cause__ or error.__context__
+    return ""
+
+
+def _message(status: str, reason: str) -> dict[str, Any]:
+    return {"type": "failed", "status": status, "reason": reason}
+
+
+def _located(where: str, what: str, cause: BaseException | None = None) -> str:
+    """`what` with the frame before it, unless it names one itself, and the line of code behind it."""
+    before = "" if not where or re.search(r"\bframe \d+", what) else f"{where}: "
+    line = "" if cause is None else source_line(cause)
+    return before + what + (f" ({line})" if line else "")
+
+
+def source_line(error: BaseException) -> str:
+    """``file.py:31``: the innermost line of an exception's traceback that is in nobody's library, if there is one."""
+    lines = traceback.extract_tb(error.__traceback__)
+    if not lines:
+        return ""
+    foreign = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    outside = (*foreign, "<", sys.base_prefix)
+    own = [line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(outside)]
+    line = (own or lines)[-1]
+    return f"{Path(line.filename).name}:{line.lineno}"
+
+
+# The process above a run: it adopts and ends whatever the run leaves behind, also when the one above it is killed.
+
+_WATCHED = (signal.SIGCHLD, signal.SIGTERM)
+
+
+def keep(connection_fd: int, told: Callable[[int], None] | None = None) -> int:
+    """Make the run in a process below this one.
+
+    Args:
+        connection_fd: The run's end of the connection to the parent.
+        told: Called in this process with the run's process id, and in the run's with 0; None where this process was
+            started by a thread, whose end would pass for the parent's.
+
+    Returns:
+        The run's exit code; does not return if a signal ended the run, but ends by the same one.
+    """
+    if not adopt_orphans():
+        return main(Connection(connection_fd))
+    signal.pthread_sigmask(signal.SIG_BLOCK, _WATCHED)
+    if told is not None:
+        with contextlib.suppress(OSError):
+            os.setsid()
+        die_with_parent(signal.SIGTERM)
+    pid = os.fork()
+    if told is not None:
+        told(pid)
+    if pid == 0:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _WATCHED)
+        code = 1
+        try:
+            code = main(Connection(connection_fd))
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    os.close(connection_fd)
+    code = _outlast(pid)
+    end_descendants()
+    sweep()
+    if code < 0:
+        _end_by(-code)
+    return code
+
+
+def _outlast(pid: int) -> int:
+    """Wait for the run's end, and bury what it has orphaned meanwhile; ends early when the parent has ended."""
+    code = None
+    while code is None:
+        if signal.sigwait(_WATCHED) == signal.SIGTERM:
+            return -signal.SIGTERM
+        with contextlib.suppress(ChildProcessError):  # nobody is left
+            while (buried := os.waitpid(-1, os.WNOHANG))[0]:
+                if buried[0] == pid:
+                    code = os.waitstatus_to_exitcode(buried[1])
+    return code
+
+
+def _end_by(number: int) -> None:
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _WATCHED)
+    if number not in (signal.SIGKILL, signal.SIGSTOP):
+        signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
+
+
+if __name__ == "__main__":
+    os._exit(keep(int(sys.argv[1])))  # threads that a tracker left running must not hold it up

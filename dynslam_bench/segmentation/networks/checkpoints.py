@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dynslam_bench.core.download import Report, download
-from dynslam_bench.core.errors import DownloadError, SegmentationError
+from dynslam_bench.core.errors import DownloadError, SegmentationError, SequenceError
 from dynslam_bench.core.folders import weights_folder
+from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id
 
 EMBEDDED_NAME = "embedded.pt"
 ATTEMPTS = 3
@@ -85,3 +86,23 @@ def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> 
         )
         raise SegmentationError(f"cannot fetch the checkpoint '{checkpoint.id}': {error.args[0]}", by_hand) from error
     return path
+
+
+# Which sequences a network of this package was trained on: what it scores there is its best case, no judgement.
+
+
+def seen_in_training(source: str, sequence_id: str) -> bool:
+    """Whether masks come from a network that was trained on frames of that very scene.
+
+    Known of the embedded network alone: it was trained on every rendered sequence of the instances 0-99.
+
+    Args:
+        source: Where the masks come from, resolved (``embedded``, never ``auto``).
+        sequence_id: For example ``synthetic/walking_xyz?scene=3``.
+    """
+    if source != "embedded" or not sequence_id.startswith("synthetic/"):
+        return False
+    try:
+        return parse_synthetic_id(sequence_id).scene in TUNE_SCENES
+    except SequenceError:  # an imported trajectory may name any sequence
+        return False

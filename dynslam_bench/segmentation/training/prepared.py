@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,9 +16,10 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import atomic_folder
 from dynslam_bench.core.reading import TABLE_BYTES, read_json
 from dynslam_bench.core.records import digest
-
-from ..networks.images import boxes_of
-from .labelled import LabelledImage, LabelledImages
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.segmentation.postprocess import boxes_of
+from dynslam_bench.segmentation.training.labelled_images import LabelledImage, LabelledImages
+from dynslam_bench.segmentation.training.settings import TrainSettings
 
 MIN_VISIBLE_PX = 16
 """Objects with fewer pixels at the network's input size are not taught."""
@@ -188,3 +190,32 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
     if rng.random() < 0.4:
         value = value + rng.standard_normal(value.shape, np.float32) * np.float32(rng.uniform(0, 0.05))
     return np.asarray(np.rint(np.clip(value, 0, 1) * 255), np.uint8)
+
+
+# Which images a training step learns from.
+
+_ORDER: dict[tuple[int, int, int], np.ndarray[Any, np.dtype[np.int64]]] = {}
+
+
+def batch_of(sets: list[PreparedImages], settings: TrainSettings, step: int) -> list[Example]:
+    """The step's images: sets in proportion to their size, every image once an epoch, in random order."""
+    sizes = [len(one) for one in sets]
+    total = sum(sizes)
+    examples = []
+    for position in range(step * settings.batch, (step + 1) * settings.batch):
+        epoch, place = divmod(position, total)
+        number = _permuted(place, total, settings.seed, epoch)
+        chosen = 0
+        while number >= sizes[chosen]:
+            number -= sizes[chosen]
+            chosen += 1
+        examples.append(sets[chosen].varied(number, stream(settings.seed, "vary", position)))
+    return examples
+
+
+def _permuted(place: int, total: int, seed: int, epoch: int) -> int:
+    key = (total, seed, epoch)
+    if key not in _ORDER:
+        _ORDER.clear()
+        _ORDER[key] = stream(seed, "order", epoch).permutation(total)
+    return int(_ORDER[key][place])

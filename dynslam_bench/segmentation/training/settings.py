@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -36,3 +38,40 @@ class TrainSettings(Settings):
     patience: int = Field(0, ge=0, description="stop after so many evaluations without gain; 0 = never")
     checkpoint_every: int = Field(100, ge=1, description="steps between resumable checkpoints")
     seed: int = Field(0, ge=0, description="of weights, order and augmentation")
+
+
+# What a training run tells while it runs, and at its end.
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    """Where a training run is.
+
+    Attributes:
+        stage: ``data`` (images being prepared), ``train`` or ``validation``.
+        done: Images or steps done.
+        total: Images or steps in all.
+        values: Latest losses or scores.
+    """
+
+    stage: str
+    done: int
+    total: int
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What came of a training run.
+
+    Attributes:
+        best: The averaged weights with the best validation score, in our checkpoint format.
+        step: Step at which they were reached.
+        iou: Their mean IoU over the objects of the validation set.
+        stopped: Why the run ended: ``finished`` or ``no gain``.
+    """
+
+    best: Path
+    step: int
+    iou: float
+    stopped: str

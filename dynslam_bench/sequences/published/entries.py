@@ -11,9 +11,8 @@ from pydantic import Field
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera
-
-from ..readers.layouts import layout_of
-from .cameras import CAMERAS
+from dynslam_bench.sequences.cameras import CAMERAS
+from dynslam_bench.sequences.readers.layouts import layout_of
 
 Tag = Literal["static", "low-dynamic", "high-dynamic"]
 Split = Literal["tune", "held-out", ""]

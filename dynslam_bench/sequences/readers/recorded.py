@@ -12,18 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, MaskSource
-from dynslam_bench.core.digests import contents_digest
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.harmless import inside
+from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.records import digest
+from dynslam_bench.core.sanitise import inside
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.rigs import in_camera_axes
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .contents import Contents
-from .diagnostics import Dropped
-from .lists import ImageList
+from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList
 
 GROUND_TRUTH_DT_S = 0.02
 SLOWEST_S = 5.0
@@ -219,7 +216,7 @@ class RecordedSequence:
         return len(self._colour)
 
     def __getitem__(self, index: int) -> Frame:
-        from .images import read_colour, read_depth
+        from dynslam_bench.sequences.readers.images import read_colour, read_depth
 
         index = range(len(self))[index]
         size = (self.camera.width, self.camera.height)

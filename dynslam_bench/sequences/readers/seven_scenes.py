@@ -17,9 +17,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.stamps import from_seconds, to_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .contents import Contents
-from .frame_names import find_names, stamped
+from dynslam_bench.sequences.readers.lists import Contents, find_names, stamped
 
 CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=1000.0)
 FPS = 30.0

@@ -1,4 +1,4 @@
-"""Ids of the rendered sequences; light: imports neither numba nor OpenCV."""
+"""All families of rendered sequences, and their ids."""
 
 from __future__ import annotations
 
@@ -8,12 +8,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.sequences.synthetic.loops import FAST, LOOP, TRACKING
+from dynslam_bench.sequences.synthetic.objects import OBJECTS
+from dynslam_bench.sequences.synthetic.replicas import CONDITIONS, CROWD, SITTING, SYNCHRONOUS, WALKING, Family
+from dynslam_bench.sequences.synthetic.scene import World
+from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
 
-from .families.registry import FAMILIES, SYNTHETIC_IDS
-from .scenes.world import World
-from .settings import DEFAULT_FRAMES, HELD_OUT_INSTANCES, MAX_FRAMES
+FAMILIES: dict[str, Family] = {
+    family.name: family for family in (WALKING, SITTING, LOOP, FAST, OBJECTS, CROWD, SYNCHRONOUS, TRACKING, *CONDITIONS)
+}
+REPLICA_IDS = (*WALKING.ids(), *SITTING.ids())
+"""The eight rendered twins of TUM's fr3 dynamic sequences."""
+SYNTHETIC_IDS = tuple(name for family in FAMILIES.values() for name in family.ids())
+"""Every rendered sequence that is listed, instance 0, default length."""
 
-_OPTIONS = {"scene": (0, HELD_OUT_INSTANCES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
+
+# Ids of the rendered sequences; light: imports neither numba nor OpenCV.
+
+_OPTIONS = {"scene": (0, HELD_OUT_SCENES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
 """What may stand behind the question mark, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
@@ -58,7 +70,7 @@ class SyntheticId:
     @property
     def split(self) -> Literal["tune", "held-out"]:
         """Which split the scene belongs to."""
-        return "held-out" if self.scene in HELD_OUT_INSTANCES else "tune"
+        return "held-out" if self.scene in HELD_OUT_SCENES else "tune"
 
     @property
     def whole(self) -> str:

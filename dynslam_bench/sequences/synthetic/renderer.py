@@ -1,4 +1,8 @@
-"""Renders frames of a scene: geometry, colour, depth as measured, masks and flow."""
+"""How a frame's rows see the scene: all from one pose, or each from its own under a rolling shutter.
+
+Under a rolling shutter the camera's pose is exact for every row; things and people are placed as they are when the
+middle of the image is exposed.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
@@ -15,18 +19,147 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.sequences.synthetic import kernels, sensors
+from dynslam_bench.sequences.synthetic import kernels as motion_kernels
+from dynslam_bench.sequences.synthetic.arithmetic import cos, exp, norm, power, product, sin
+from dynslam_bench.sequences.synthetic.ids import SyntheticId
+from dynslam_bench.sequences.synthetic.kernels import NEAR_M
+from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
+from dynslam_bench.sequences.synthetic.scene import Scene, Snapshot
+from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
+from dynslam_bench.sequences.synthetic.textures import Atlas
 
-from .arithmetic import cos, exp, norm, power, product, sin
-from .bounds import bounds_of
-from .ids import SyntheticId
-from .kernels import motion as motion_kernels
-from .kernels import raycast as kernels
-from .kernels import sensors
-from .scenes.parts import QUAD, ROUND_CONE
-from .scenes.scene import Scene, Snapshot
-from .scenes.textures import Atlas
-from .settings import CAMERA, FPS, RenderSettings
-from .views import View, rolling_flow, view_of
+Array = NDArray[np.float64]
+_ROUNDS = 5
+"""Rounds of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The scene as the rows of one frame see it.
+
+    Attributes:
+        middle: The scene when the middle of the image is exposed.
+        poses: ``[R, 4, 4]`` camera poses of all rows; R is 1 or the height of the image.
+        scale: ``[P, 3]`` scale of each primitive's local axes.
+    """
+
+    middle: Snapshot
+    poses: Array
+    scale: Array
+
+    @property
+    def rolling(self) -> bool:
+        """Whether every row has its own pose."""
+        return len(self.poses) > 1
+
+    def local(self, seen: NDArray[np.int32]) -> Array:
+        """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`.
+
+        Under a rolling shutter those of the primitives `seen` alone are filled in.
+        """
+        if not self.rolling:
+            return self.middle.local[None]
+        inverse = np.swapaxes(self.middle.rotation[seen], 1, 2) / self.scale[seen, :, None]
+        poses = np.repeat(self.poses[:, None, :3], len(seen), axis=1)
+        poses[..., 3] -= self.middle.origin[seen]
+        local = np.empty((len(self.poses), len(self.scale), 12))
+        local[:, seen] = (product(inverse, poses)).reshape(len(poses), -1, 12)
+        return local
+
+    def at_row(self, row: int) -> Snapshot:
+        """The scene from the pose of a row."""
+        return self.middle if not self.rolling else replace(self.middle, T_world_cam=self.poses[row])
+
+
+def row_times(index: int, readout_s: float) -> Array:
+    """When each row of frame `index` is exposed, seconds from the start; the image's middle at the frame's stamp."""
+    rows = (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
+    return index / FPS + rows * readout_s
+
+
+def view_of(scene: Scene, index: int) -> View:
+    """How frame `index` sees the scene."""
+    middle, readout = scene.snapshot(index / FPS), scene.world.optics.readout_s
+    if readout == 0:
+        return View(middle, middle.T_world_cam[None], scene.scale)
+    return View(middle, scene.poses(row_times(index, readout)), scene.scale)
+
+
+def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -> NDArray[np.float32]:
+    """Exact flow float32 ``[H, W, 2]`` in pixels between frames whose rows have poses of their own.
+
+    A point is seen in the other frame by the row onto which that very row's pose projects it. Beyond the image's first
+    and last row the pose goes on as that row's.
+    """
+    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
+    turns, places = now.poses[:, :3, :3], now.poses[:, :3, 3]
+    world = product(rays * depth[..., None], np.swapaxes(turns, 1, 2)) + places[:, None]
+    turn = product(other.middle.rotation, np.swapaxes(now.middle.rotation, 1, 2))
+    shift = other.middle.origin - product(turn, now.middle.origin[:, :, None])[:, :, 0]
+    primitive = np.maximum(hit >> 3, 0)
+    world = product(turn[primitive], world[..., None])[..., 0] + shift[primitive]
+    row, last = v.copy(), CAMERA.height - 1
+    for _ in range(_ROUNDS):
+        first = np.clip(np.floor(row), 0, last - 1).astype(np.int64)
+        share = np.clip(row - first, 0.0, 1.0)[..., None]
+        ends = []
+        for near in (first, first + 1):
+            away = world - other.poses[near, :3, 3]
+            ends.append(product(away[..., None, :], other.poses[near, :3, :3])[..., 0, :])
+        points = (1 - share) * ends[0] + share * ends[1]
+        w = np.where(points[..., 2] > 0.05, points[..., 2], np.nan)
+        x, row_now = points[..., 0] / w * CAMERA.fx + CAMERA.cx, points[..., 1] / w * CAMERA.fy + CAMERA.cy
+        row = np.where(np.isfinite(row_now), row_now, row)
+    flow = np.stack([x - u, row_now - v], axis=-1)
+    flow[hit < 0] = np.nan
+    return flow.astype(np.float32)
+
+
+# Where in the image a primitive can be seen: the rectangle around the part of its box that lies before the camera.
+
+_MARGIN_PX = 2.0
+_EDGES = np.array([(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1])
+"""The twelve edges of a box, as pairs of corners; bit k of a corner's number is its side along axis k."""
+
+
+def bounds_of(points: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Bounds of boxes.
+
+    Args:
+        points: Corners ``[P, 8, 3]`` in the camera frame, metres.
+
+    Returns:
+        Least depth of all corners, and least u, least v, greatest u, greatest v (pixels, with a margin); an empty
+        rectangle (least above greatest) where a box lies behind the camera.
+    """
+    depth = points[:, :, 2]
+    rectangle = _project(points, depth > NEAR_M)
+    crossing = np.flatnonzero((depth.min(axis=1) <= NEAR_M) & (depth.max(axis=1) > NEAR_M))
+    if len(crossing):
+        a, b = points[crossing][:, _EDGES[:, 0]], points[crossing][:, _EDGES[:, 1]]
+        cut = (a[..., 2] > NEAR_M) != (b[..., 2] > NEAR_M)
+        share = (NEAR_M - a[..., 2]) / np.where(cut, b[..., 2] - a[..., 2], 1.0)
+        ends = a + share[..., None] * (b - a)
+        at_cut = _project(ends, cut)
+        rectangle[:2, crossing] = np.minimum(rectangle[:2, crossing], at_cut[:2])
+        rectangle[2:, crossing] = np.maximum(rectangle[2:, crossing], at_cut[2:])
+    low_u, low_v, high_u, high_v = rectangle
+    return depth.min(axis=1), low_u - _MARGIN_PX, low_v - _MARGIN_PX, high_u + _MARGIN_PX, high_v + _MARGIN_PX
+
+
+def _project(points: Array, valid: NDArray[np.bool_]) -> Array:
+    """Rectangle ``[4, P]`` (least u, v, greatest u, v) around the valid ones of points ``[P, K, 3]``."""
+    z = np.where(valid, points[..., 2], 1.0)
+    u = points[..., 0] / z * CAMERA.fx + CAMERA.cx
+    v = points[..., 1] / z * CAMERA.fy + CAMERA.cy
+    low = [np.where(valid, x, np.inf).min(axis=1) for x in (u, v)]
+    high = [np.where(valid, x, -np.inf).max(axis=1) for x in (u, v)]
+    return np.stack(low + high)
+
+
+# Renders frames of a scene: geometry, colour, depth as measured, masks and flow.
 
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])

@@ -9,9 +9,8 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from dynslam_bench.geometry.camera import Camera
-
-from .frame_to_frame import Aligner, FrameToFrame
-from .settings import Open3dOdometrySettings
+from dynslam_bench.trackers.adapters.odometry import Aligner, FrameToFrame
+from dynslam_bench.trackers.adapters.specs import Open3dOdometrySettings
 
 
 class Open3dOdometry(FrameToFrame[Any]):

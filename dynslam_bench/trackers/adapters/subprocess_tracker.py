@@ -1,27 +1,200 @@
-"""A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol)."""
+"""What a foreign program answers, as poses and numbers; anything else is one clear error."""
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.contracts.tracker import TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.errors import DynslamError, TrackerError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError
+from dynslam_bench.core.files import SHARED_MEMORY, TemporaryFolder
 from dynslam_bench.core.seeding import derive_seed
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.trackers.adapters.program import Program
+from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
 
-from .answers import read_final_answer, read_track_answer
-from .exchange import ImageExchange
-from .program import Program
-from .settings import ProgramSettings, SubprocessSettings
+
+def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[], float]) -> TrackResult:
+    """The result of one frame.
+
+    Args:
+        answer: What the program said.
+        who: Program and frame, for messages.
+        elapsed_s: Seconds since it was asked; what its own timings do not explain becomes ``transfer``.
+
+    Raises:
+        TrackerError: It is no pose.
+    """
+    state = answer.get("state")
+    if not isinstance(state, str) or state not in get_args(TrackingState):
+        known = ", ".join(get_args(TrackingState))
+        raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {known}")
+    pose = _pose(answer.get("T_world_cam"), who)
+    if pose is None and state == "ok":
+        raise TrackerError(f"{who}: answered state 'ok' without T_world_cam")
+    stats = _numbers(answer.get("stats"), "stats", who)
+    timings = _numbers(answer.get("timings"), "timings", who)
+    timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
+    return TrackResult(pose, cast(TrackingState, state), stats, timings)
+
+
+def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
+    """The final trajectory; rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``, camera to world.
+
+    Raises:
+        TrackerError: It is no trajectory.
+    """
+    try:
+        rows = np.asarray(answer.get("trajectory"), dtype=np.float64).reshape(-1, 8)
+    except (TypeError, ValueError, OverflowError):
+        raise TrackerError(
+            f"{who}: 'trajectory' is not a list of rows of 8 numbers", "timestamp tx ty tz qx qy qz qw"
+        ) from None
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    if not (np.abs(norms - 1) < 1e-3).all():  # also catches NaN
+        raise TrackerError(f"{who}: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:g}")
+    try:
+        return Trajectory(rows[:, 0], se3.from_quaternion(rows[:, 1:4], rows[:, 4:]))
+    except DynslamError as error:
+        raise TrackerError(f"{who}: {error}") from error
+
+
+def _pose(value: Any, who: str) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    try:
+        pose = np.asarray(value, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError, OverflowError):
+        raise TrackerError(
+            f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}", "row by row, camera to world"
+        ) from None
+    if not se3.is_pose(pose):
+        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
+    return pose
+
+
+def _numbers(value: Any, what: str, who: str) -> dict[str, float]:
+    try:
+        return {str(key): float(number) for key, number in (value or {}).items()}
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        raise TrackerError(f"{who}: {what} is not an object of numbers: {str(value)[:80]}") from None
+
+
+# How a foreign program gets the images: a memory-mapped file that is overwritten, or PNG files.
+
+FRAME_FILE = "frame.raw"
+
+
+class ImageExchange:
+    """A private folder through which the frames reach a program; removed by `close`, at the latest with the object.
+
+    ``raw``: one file ``frame.raw`` of fixed size, in shared memory where the system has it. It holds the colour image
+    (uint8 ``[H, W, 3]``, red first, row by row) at `rgb_offset` and the depth (little-endian float32 ``[H, W]``,
+    metres, 0 = missing) at `depth_offset`, and is overwritten before each ``track``. ``png``: for each frame an 8-bit
+    colour PNG and a 16-bit depth PNG in units of ``1 / depth_factor`` metres, as in TUM's files; those of the frame
+    before are removed.
+
+    Args:
+        camera: Of the frames.
+        mode: ``raw`` or ``png``.
+    """
+
+    def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
+        self.camera, self.mode = camera, mode
+        self._last: tuple[Path, ...] = ()
+        colour = camera.height * camera.width * 3
+        self.depth_offset = -(-colour // 16) * 16
+        size = self.depth_offset + camera.height * camera.width * 4
+        self._temporary = _with_space(size) if mode == "raw" else TemporaryFolder()
+        self.folder = self._temporary.path
+        if mode == "raw":
+            self._memory = np.memmap(self.folder / FRAME_FILE, np.uint8, "r+", shape=(size,))
+            self._rgb = self._memory[:colour].reshape(camera.height, camera.width, 3)
+            self._depth = self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
+
+    def announce(self) -> dict[str, Any]:
+        """What the program is told once, in ``reset``."""
+        if self.mode == "png":
+            return {"mode": "png", "depth_factor": self.camera.depth_factor}
+        return {
+            "mode": "raw",
+            "file": str(self.folder / FRAME_FILE),
+            "rgb_offset": 0,
+            "depth_offset": self.depth_offset,
+            "bytes": int(self._memory.size),
+        }
+
+    def put(self, frame: Frame) -> dict[str, Any]:
+        """Hand over a frame; what the program is told of it in ``track``.
+
+        Raises:
+            TrackerError: The images do not have the camera's size.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
+            raise TrackerError(
+                f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
+                f"but the camera is {self.camera.width}x{self.camera.height}"
+            )
+        if self.mode == "raw":
+            np.copyto(self._rgb, frame.rgb)
+            np.copyto(self._depth, frame.depth)
+            return {}
+        return self._write_png(frame)
+
+    def _write_png(self, frame: Frame) -> dict[str, Any]:
+        rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
+        units = np.rint(np.nan_to_num(frame.depth) * self.camera.depth_factor).clip(0, 65535).astype(np.uint16)
+        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        for path, image in ((rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)), (depth, units)):
+            if not cv2.imwrite(str(path), image, fast):
+                raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
+        for old in self._last:
+            if old not in (rgb, depth):
+                old.unlink(missing_ok=True)
+        self._last = (rgb, depth)
+        return {"rgb": str(rgb), "depth": str(depth)}
+
+    def close(self) -> None:
+        """Remove the folder; may be called more than once."""
+        self._temporary.close()
+
+
+def _with_space(size: int) -> TemporaryFolder:
+    """A folder with the file for the frames, its space taken already: a full disk would end the run by SIGBUS later.
+
+    Raises:
+        InfrastructureError: There is no room, neither in shared memory nor among the temporary files.
+    """
+    reasons = []
+    for base in (SHARED_MEMORY, None):
+        try:
+            folder = TemporaryFolder(base)
+        except OSError as error:
+            reasons.append(f"{base or tempfile.gettempdir()}: {error.strerror}")
+            continue
+        try:
+            (folder.path / FRAME_FILE).write_bytes(bytes(size))
+        except OSError as error:
+            folder.close()
+            reasons.append(f"{folder.path.parent}: {error.strerror}")
+            continue
+        return folder
+    raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")
+
+
+# A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol).
 
 PROTOCOL = 2
 """Of the JSON lines; since 2 the answer to ``track`` repeats its index."""

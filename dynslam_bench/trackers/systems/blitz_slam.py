@@ -5,11 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-from dynslam_bench.culling.blocks.depth_blocks_settings import DepthBlockSettings
-
-from .composition import SemanticSystemSettings, UnrepairedSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from dynslam_bench.culling.settings import BoxEpipolarSettings, DepthBlockSettings
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    UnrepairedSettings,
+    compose,
+    masks_in_words,
+    matches_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -26,8 +30,8 @@ class BlitzSlamSettings(SemanticSystemSettings):
 
 def build(settings: BlitzSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B9 and B1, then B3 inside the boxes with F from outside them."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.depth_blocks import DepthBlockFilter
 
     filters = [
         DepthBlockFilter(settings.depth_blocks, settings.segmentation),

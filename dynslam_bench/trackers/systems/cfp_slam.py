@@ -5,11 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
+from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    grown_in_words,
+    links_in_words,
+    masks_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -25,7 +30,7 @@ class CfpSlamSettings(SemanticSystemSettings):
 
 def build(settings: CfpSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B10, B8 as a weight of the optimiser."""
-    from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
+    from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
     return compose(settings, context, [ProbabilityFilter(settings.probability, settings.segmentation)], settings.flow)
 

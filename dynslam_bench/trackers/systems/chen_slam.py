@@ -8,11 +8,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-
-from .composition import SemanticSystemSettings, compose
-from .monocular import BACKEND, MonocularSemanticSettings
-from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
+from dynslam_bench.culling.settings import BoxEpipolarSettings
+from dynslam_bench.trackers.systems.composition import (
+    BACKEND,
+    MonocularSemanticSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    grown_in_words,
+    masks_in_words,
+    matches_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -34,8 +40,8 @@ class ChenSlamMonoSettings(MonocularSemanticSettings):
 
 def build(settings: ChenSlamSettings | ChenSlamMonoSettings, context: TrackerContext) -> SlamPipeline:
     """B1, then B3 on the rest."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     filters = [
         SemanticFilter(settings.segmentation),

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
-from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.culling.guard import GuardSettings
+from dynslam_bench.culling.settings import Unmatched
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.segmentation.classes import expand_classes
-from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings
+from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
 from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Where masks can come from, as `segmentation.source` names it."""
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts.filter import DynamicFilter
-    from dynslam_bench.segmentation.masks.schedule import MaskScheduler
+    from dynslam_bench.segmentation.schedule import MaskScheduler
     from dynslam_bench.slam.pipeline import SlamPipeline
 
 
@@ -96,13 +96,13 @@ def compose(
         SettingsError: The settings hold an online setting that has an effect and that no part takes.
     """
     from dynslam_bench.core.stage_cache import StageCache
-    from dynslam_bench.features.build_extractor import build_extractor
     from dynslam_bench.features.cached import cached_extractor
-    from dynslam_bench.flow.build_flow import build_flow
+    from dynslam_bench.features.registry import build_extractor
+    from dynslam_bench.flow.registry import build_flow
     from dynslam_bench.segmentation.cached import cache_segmenter
-    from dynslam_bench.slam.build_backend import build_backend
+    from dynslam_bench.slam.backend import build_backend
     from dynslam_bench.slam.pipeline import SlamPipeline
-    from dynslam_bench.slam.stage_clock import CachedStage
+    from dynslam_bench.slam.stages import CachedStage
 
     cache = None if context.cache is None else StageCache(Path(context.cache))
     cached: dict[str, CachedStage] = {}
@@ -131,7 +131,7 @@ def _mask_stage(
     settings: SystemSettings, context: TrackerContext, filters: Sequence[DynamicFilter], *, deferred: bool
 ) -> MaskScheduler | None:
     """Where the system's masks come from; None without a source, unless a filter needs one."""
-    from dynslam_bench.segmentation.masks.schedule import build_mask_stage
+    from dynslam_bench.segmentation.schedule import build_mask_stage
 
     masks = None
     if isinstance(settings, SemanticSystemSettings):
@@ -155,3 +155,102 @@ def _mask_stage(
             f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'", f"sources: {SOURCES}"
         )
     return masks
+
+
+# What systems without depth have in common.
+
+BACKEND = (
+    "monocular back end: the unit of length is the median depth of the first map; "
+    "no loop closing unless asked for (backend.loop_closing.enabled)"
+)
+"""What every one of them assumes."""
+
+
+class MonocularSystemSettings(SystemSettings):
+    """A system that never looks at depth."""
+
+    backend: MonocularBackendSettings = MonocularBackendSettings()
+
+
+class MonocularSemanticSettings(MonocularSystemSettings, SemanticSystemSettings):
+    """One with masks, which nothing repairs: that takes depth."""
+
+    segmentation: UnrepairedSettings = UnrepairedSettings()
+
+
+# What published systems have in common here, and how it is said in their specs.
+
+CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
+"""The paper's improved mask branch, as far as it is there."""
+
+
+class PublishedFlowSettings(FlowSettings):
+    """Lucas-Kanade as published systems use it: no source of theirs names a check on the way back, so there is none."""
+
+    method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
+        "lucas-kanade", meaning="which flow; the published one is Lucas-Kanade"
+    )
+    forward_backward_px: float = Field(
+        0.0,
+        ge=0.0,
+        le=100.0,
+        description="largest distance in pixels between a point and its way there and back; 0, no check, as published",
+    )
+
+
+LOST: dict[Unmatched, str] = {
+    "keep": "a feature that the flow loses is not judged and stays (not stated)",
+    "drop": "a feature that the flow loses is dropped",
+    "judge": "a feature that the flow loses is judged by the place where it was lost",
+}
+"""What becomes of features without a match, by the setting `unmatched`."""
+
+
+def masks_in_words(segmentation: SegmentationSettings, *, boxes: bool = False) -> str:
+    """Where a system's masks, or its boxes, come from, and what the shared stage adds to them."""
+    what = "boxes are those of the instance masks, which" if boxes else "masks"
+    bridged = (
+        f"missed detections bridged for {segmentation.compensate} segmented frames"
+        if segmentation.compensate
+        else "missed detections not bridged"
+    )
+    return (
+        f"{what} come from the stage that all systems share: scores of at least {segmentation.confidence:g}, {bridged}"
+    )
+
+
+def grown_in_words(segmentation: SegmentationSettings) -> str:
+    """How far a system's masks are grown, where its source does not say."""
+    return f"masks grown by {segmentation.dilation_px} px (not stated)"
+
+
+def tracks_in_words(flow: FlowSettings) -> str:
+    """How a system's flow is computed."""
+    check = (
+        f"a check of {flow.forward_backward_px:g} px on the way back"
+        if flow.forward_backward_px
+        else "no check on the way back"
+    )
+    return f"Lucas-Kanade tracks (window {flow.window_px} px, begun at the motion model's guess, {check})"
+
+
+def matches_in_words(flow: FlowSettings, unmatched: Unmatched) -> str:
+    """How a system that tests matches finds them, and what becomes of the features that have none."""
+    return f"matches are {tracks_in_words(flow)}; {LOST[unmatched]}"
+
+
+def links_in_words(flow: FlowSettings) -> str:
+    """How a system with a memory of features follows them, and what becomes of those that have no past."""
+    return f"features are followed by {tracks_in_words(flow)}, not by descriptors; one without a past begins at 0.5"
+
+
+# The presets that ship; what each is worth beside the defaults, on scenes that no choice has seen: docs/tuning.md.
+
+_SECOND: dict[str, Any] = {"segmentation.schedule": "every_nth", "segmentation.n": 2}
+FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.5}}
+"""The network sees every second frame, and every one while masks cover half of the view.
+
+Between them masks are carried along by optical flow.
+"""
+FAST_FLOW = {"fast": _SECOND | {"flow.budget": 24}}
+"""Every second frame, and the flow searches for less than half as long: behind masks no error shows a change."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
+from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.flow.settings import FlowSettings
-
-from .composition import SystemSettings, compose
-from .published import tracks_in_words
+from dynslam_bench.trackers.systems.composition import SystemSettings, compose, tracks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -24,7 +22,7 @@ class DaiSlamSettings(SystemSettings):
 
 def build(settings: DaiSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B7 in the front end."""
-    from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
+    from dynslam_bench.culling.correlation_graph import CorrelationFilter
 
     return compose(settings, context, [CorrelationFilter(settings.correlation)], settings.flow)
 

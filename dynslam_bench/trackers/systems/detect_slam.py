@@ -5,10 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, links_in_words, masks_in_words
+from dynslam_bench.culling.settings import ProbabilitySettings
+from dynslam_bench.trackers.systems.composition import (
+    ObjectSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    links_in_words,
+    masks_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -24,7 +29,7 @@ class DetectSlamSettings(SemanticSystemSettings):
 
 def build(settings: DetectSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 on keyframes feeds B8."""
-    from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
+    from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
     block = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")
     return compose(settings, context, [block], settings.flow)

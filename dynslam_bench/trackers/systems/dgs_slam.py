@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.residual_clusters_settings import ResidualSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
+from dynslam_bench.culling.settings import ResidualSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, compose, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -23,7 +21,7 @@ class DgsSlamSettings(SemanticSystemSettings):
 
 def build(settings: DgsSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B14."""
-    from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
+    from dynslam_bench.culling.residual_clusters import ResidualFilter
 
     return compose(settings, context, [ResidualFilter(settings.residual, settings.segmentation)])
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
 from dynslam_bench.culling.guard import GuardSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from dynslam_bench.culling.settings import BoxEpipolarSettings, MultiViewSettings
+from dynslam_bench.trackers.systems.composition import (
+    ObjectSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    masks_in_words,
+    matches_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -28,8 +32,8 @@ class DiSlamSettings(SemanticSystemSettings):
 
 def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 stricter inside boxes, then B4."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.multiview_depth import MultiViewFilter
 
     filters = [
         BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),

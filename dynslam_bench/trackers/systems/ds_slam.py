@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
+from dynslam_bench.culling.settings import MovingVoteSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, compose, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -23,7 +21,7 @@ class DsSlamSettings(SemanticSystemSettings):
 
 def build(settings: DsSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 on corners of its own, B11 as one global vote, B1 on people."""
-    from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
+    from dynslam_bench.culling.moving_vote import MovingVoteFilter
 
     return compose(settings, context, [MovingVoteFilter(settings.moving_vote, settings.segmentation)])
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
+from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, SystemSettings, compose
-from .published import CFPN, masks_in_words
+from dynslam_bench.trackers.systems.composition import (
+    CFPN,
+    SemanticSystemSettings,
+    SystemSettings,
+    compose,
+    masks_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts.filter import DynamicFilter
@@ -46,8 +50,8 @@ def build(settings: DynaSlamSettings | DynaSlamGeometrySettings, context: Tracke
     The code takes the union of both masks. The paper keeps the geometric mask where both find an object; the union
     stands for both here.
     """
-    from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.multiview_depth import MultiViewFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     filters: list[DynamicFilter] = [MultiViewFilter(settings.multiview)]
     if isinstance(settings, SemanticSystemSettings):
@@ -57,7 +61,7 @@ def build(settings: DynaSlamSettings | DynaSlamGeometrySettings, context: Tracke
 
 def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -> SlamPipeline:
     """N: B1 alone."""
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     return compose(settings, context, [SemanticFilter(settings.segmentation)])
 

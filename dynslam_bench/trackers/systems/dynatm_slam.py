@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.template_matching_settings import TemplateSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
+from dynslam_bench.culling.settings import TemplateSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, compose, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -23,7 +21,7 @@ class DynaTmSlamSettings(SemanticSystemSettings):
 
 def build(settings: DynaTmSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 with B13."""
-    from dynslam_bench.culling.blocks.template_matching import TemplateFilter
+    from dynslam_bench.culling.template_matching import TemplateFilter
 
     return compose(settings, context, [TemplateFilter(settings.template, settings.segmentation)])
 

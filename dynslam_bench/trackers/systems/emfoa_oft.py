@@ -10,14 +10,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
-from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
+from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, RigidMotionSettings
 from dynslam_bench.flow.settings import FlowSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, SystemSettings, compose
-from .presets import FAST_FLOW
-from .published import CFPN, grown_in_words, masks_in_words
+from dynslam_bench.trackers.systems.composition import (
+    CFPN,
+    FAST_FLOW,
+    ObjectSettings,
+    SemanticSystemSettings,
+    SystemSettings,
+    compose,
+    grown_in_words,
+    masks_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts.filter import DynamicFilter
@@ -99,7 +103,7 @@ class PaperSparseSettings(PaperSettings):
 
 def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
     """Mask culling, flow and epipolar culling, depth consistency: those of them that the settings have a group for."""
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     filters: list[DynamicFilter] = []
     if isinstance(settings, SemanticSystemSettings):
@@ -113,9 +117,9 @@ def build_object_mode(settings: MaskedEpipolarTestSettings, context: TrackerCont
 
 
 def _with_geometry(settings: SystemSettings, context: TrackerContext, filters: list[DynamicFilter]) -> SlamPipeline:
-    from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-    from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-    from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
+    from dynslam_bench.culling.epipolar import EpipolarFilter
+    from dynslam_bench.culling.free_space import FreeSpaceFilter
+    from dynslam_bench.culling.rigid_motion import RigidMotionFilter
 
     if not isinstance(settings, EpipolarTestSettings):
         return compose(settings, context, filters)

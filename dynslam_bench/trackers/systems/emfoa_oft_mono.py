@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-from dynslam_bench.slam.monocular_settings import NO_DEPTH
-
-from .composition import compose
-from .emfoa_oft import SKIPPED, SPARSE, EpipolarTestSettings
-from .monocular import BACKEND, MonocularSemanticSettings
-from .published import CFPN, grown_in_words, masks_in_words
+from dynslam_bench.culling.settings import EpipolarSettings
+from dynslam_bench.slam.settings import NO_DEPTH
+from dynslam_bench.trackers.systems.composition import (
+    BACKEND,
+    CFPN,
+    MonocularSemanticSettings,
+    compose,
+    grown_in_words,
+    masks_in_words,
+)
+from dynslam_bench.trackers.systems.emfoa_oft import SKIPPED, SPARSE, EpipolarTestSettings
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -36,8 +40,8 @@ class EmfoaOftMonoSettings(MonocularSemanticSettings, EpipolarTestSettings):
 
 def build(settings: EmfoaOftMonoSettings, context: TrackerContext) -> SlamPipeline:
     """Mask culling, then flow and epipolar culling."""
-    from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.epipolar import EpipolarFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     filters = [SemanticFilter(settings.segmentation), EpipolarFilter(settings.epipolar)]
     return compose(settings, context, filters, settings.flow)

@@ -5,10 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-
-from .composition import SemanticSystemSettings, compose
-from .presets import FAST_MASKS
-from .published import CFPN, masks_in_words
+from dynslam_bench.trackers.systems.composition import CFPN, FAST_MASKS, SemanticSystemSettings, compose, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -16,7 +13,7 @@ if TYPE_CHECKING:
 
 def build(settings: SemanticSystemSettings, context: TrackerContext) -> SlamPipeline:
     """Semantic culling, then the shared back end."""
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     return compose(settings, context, [SemanticFilter(settings.segmentation)])
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
+from dynslam_bench.culling.settings import BoxEpipolarSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    masks_in_words,
+    matches_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -25,8 +29,8 @@ class MorSlamSettings(SemanticSystemSettings):
 
 def build(settings: MorSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B9, B1, B3."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.semantic import SemanticFilter
 
     filters = [
         SemanticFilter(settings.segmentation),

@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_depth_settings import BoxDepthSettings
-from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
+from dynslam_bench.culling.settings import BoxDepthSettings, ReseedingSettings
 from dynslam_bench.features.settings import FeatureSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, compose, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -27,8 +24,8 @@ class NgdSlamSettings(SemanticSystemSettings):
 
 def build(settings: NgdSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 cut out by depth; B10 between detections; B12 fills up what is left."""
-    from dynslam_bench.culling.blocks.box_depth import BoxDepthFilter
-    from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
+    from dynslam_bench.culling.box_depth import BoxDepthFilter
+    from dynslam_bench.culling.reseeding import ReseedingFilter
 
     filters = [
         BoxDepthFilter(settings.box_depth, settings.segmentation),

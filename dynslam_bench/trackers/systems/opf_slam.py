@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-
-from .composition import SystemSettings, compose
-from .published import PublishedFlowSettings
+from dynslam_bench.culling.settings import EpipolarSettings
+from dynslam_bench.trackers.systems.composition import PublishedFlowSettings, SystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -25,7 +23,7 @@ class OpfSlamSettings(SystemSettings):
 
 def build(settings: OpfSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 alone, without semantics and without a degeneracy guard."""
-    from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
+    from dynslam_bench.culling.epipolar import EpipolarFilter
 
     return compose(settings, context, [EpipolarFilter(settings.epipolar)], settings.flow)
 

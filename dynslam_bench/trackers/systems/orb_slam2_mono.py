@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-
-from .composition import compose
-from .monocular import BACKEND, MonocularSystemSettings
+from dynslam_bench.trackers.systems.composition import BACKEND, MonocularSystemSettings, compose
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline

@@ -5,10 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
+from dynslam_bench.culling.settings import ClassRuleSettings
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    grown_in_words,
+    masks_in_words,
+    matches_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -23,7 +28,7 @@ class SegSlamSettings(SemanticSystemSettings):
 
 def build(settings: SegSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B1 and B15."""
-    from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
+    from dynslam_bench.culling.class_rule import ClassRuleFilter
 
     return compose(settings, context, [ClassRuleFilter(settings.class_rule, settings.segmentation)], settings.flow)
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
+from dynslam_bench.culling.settings import BoxEpipolarSettings
+from dynslam_bench.trackers.systems.composition import (
+    ObjectSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    masks_in_words,
+    matches_in_words,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -24,7 +29,7 @@ class SgcSlamSettings(SemanticSystemSettings):
 
 def build(settings: SgcSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B3 with F from outside the boxes."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
+    from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
 
     return compose(settings, context, [BoxEpipolarFilter(settings.box_epipolar, settings.segmentation)], settings.flow)
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
+from dynslam_bench.culling.settings import DepthRansacSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, compose, masks_in_words
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.pipeline import SlamPipeline
@@ -23,7 +21,7 @@ class YoloSlamSettings(SemanticSystemSettings):
 
 def build(settings: YoloSlamSettings, context: TrackerContext) -> SlamPipeline:
     """B2 with B6: the largest set of like depth in a box is the person."""
-    from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
+    from dynslam_bench.culling.depth_ransac import DepthRansacFilter
 
     return compose(settings, context, [DepthRansacFilter(settings.depth_ransac, settings.segmentation)])
 

@@ -13,8 +13,8 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
+from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.settings import BoxEpipolarSettings
 
 
 def test_box_epipolar_has_a_limit_of_its_own_inside_boxes() -> None:

@@ -12,8 +12,8 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.blocks.boxes import BoxFilter
-from dynslam_bench.culling.blocks.boxes_settings import BoxSettings
+from dynslam_bench.culling.semantic import BoxFilter
+from dynslam_bench.culling.settings import BoxSettings
 
 
 def test_boxes_drop_what_is_inside_and_nothing_else() -> None:

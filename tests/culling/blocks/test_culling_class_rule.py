@@ -16,8 +16,8 @@ from scenes import (
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import build
-from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
-from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
+from dynslam_bench.culling.class_rule import ClassRuleFilter
+from dynslam_bench.culling.settings import ClassRuleSettings
 
 
 def test_class_rule_drops_people_and_only_those_movable_things_that_move() -> None:

@@ -12,9 +12,9 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter, depth_variance, point_covariance
-from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
-from dynslam_bench.culling.tools.ego_motion import depth_sigma
+from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_variance, point_covariance
+from dynslam_bench.culling.ego_motion import depth_sigma
+from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.trackers import TRACKERS
 

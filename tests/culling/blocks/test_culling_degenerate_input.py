@@ -14,37 +14,38 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState
-from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-from dynslam_bench.culling.blocks.boxes import BoxFilter
-from dynslam_bench.culling.blocks.boxes_settings import BoxSettings
-from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
-from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
-from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
-from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
-from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter
-from dynslam_bench.culling.blocks.depth_blocks_settings import DepthBlockSettings
-from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
-from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
-from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
-from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
-from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
-from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
-from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
-from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
-from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
-from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
-from dynslam_bench.culling.blocks.residual_clusters_settings import ResidualSettings
-from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
-from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
-from dynslam_bench.culling.blocks.semantic import SemanticFilter
-from dynslam_bench.culling.blocks.template_matching import TemplateFilter
-from dynslam_bench.culling.blocks.template_matching_settings import TemplateSettings
+from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.class_rule import ClassRuleFilter
+from dynslam_bench.culling.correlation_graph import CorrelationFilter
+from dynslam_bench.culling.depth_blocks import DepthBlockFilter
+from dynslam_bench.culling.depth_ransac import DepthRansacFilter
+from dynslam_bench.culling.epipolar import EpipolarFilter
+from dynslam_bench.culling.free_space import FreeSpaceFilter
+from dynslam_bench.culling.moving_probability import ProbabilityFilter
+from dynslam_bench.culling.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.multiview_depth import MultiViewFilter
+from dynslam_bench.culling.reseeding import ReseedingFilter
+from dynslam_bench.culling.residual_clusters import ResidualFilter
+from dynslam_bench.culling.rigid_motion import RigidMotionFilter
+from dynslam_bench.culling.semantic import BoxFilter, SemanticFilter
+from dynslam_bench.culling.settings import (
+    BoxEpipolarSettings,
+    BoxSettings,
+    ClassRuleSettings,
+    CorrelationSettings,
+    DepthBlockSettings,
+    DepthRansacSettings,
+    EpipolarSettings,
+    FreeSpaceSettings,
+    MovingVoteSettings,
+    MultiViewSettings,
+    ProbabilitySettings,
+    ReseedingSettings,
+    ResidualSettings,
+    RigidMotionSettings,
+    TemplateSettings,
+)
+from dynslam_bench.culling.template_matching import TemplateFilter
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

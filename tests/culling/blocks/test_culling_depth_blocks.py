@@ -11,8 +11,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
-from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter, covered_blocks
-from dynslam_bench.culling.blocks.depth_blocks_settings import DepthBlockSettings
+from dynslam_bench.culling.depth_blocks import DepthBlockFilter, covered_blocks
+from dynslam_bench.culling.settings import DepthBlockSettings
 
 
 def person_before_a_wall() -> tuple[FrameBundle, np.ndarray]:

@@ -12,8 +12,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
-from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
+from dynslam_bench.culling.depth_ransac import DepthRansacFilter
+from dynslam_bench.culling.settings import DepthRansacSettings
 
 
 def test_depth_ransac_takes_the_person_and_leaves_the_wall_behind() -> None:

@@ -12,8 +12,8 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
+from dynslam_bench.culling.epipolar import EpipolarFilter
+from dynslam_bench.culling.settings import EpipolarSettings
 from dynslam_bench.geometry import se3
 
 

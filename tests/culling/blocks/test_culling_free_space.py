@@ -11,8 +11,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
+from dynslam_bench.culling.free_space import FreeSpaceFilter
+from dynslam_bench.culling.settings import FreeSpaceSettings
 
 
 def test_free_space_culls_what_stands_where_a_keyframe_saw_through() -> None:

@@ -13,8 +13,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter, expand
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
+from dynslam_bench.culling.moving_probability import ProbabilityFilter, expand
+from dynslam_bench.culling.settings import ProbabilitySettings
 
 
 def test_probability_rises_on_masks_and_is_inherited_along_the_flow() -> None:

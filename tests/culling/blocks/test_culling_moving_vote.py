@@ -14,8 +14,8 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
-from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
+from dynslam_bench.culling.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.settings import MovingVoteSettings
 
 
 @pytest.mark.parametrize("shift", [0, 12])

@@ -12,9 +12,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeView
-from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
-from dynslam_bench.culling.blocks.multiview_kernels import BIN_M, grow, hidden
+from dynslam_bench.culling.multiview_depth import BIN_M, MultiViewFilter, grow, hidden
+from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.trackers import TRACKERS
 
 WALL_M = 3.0

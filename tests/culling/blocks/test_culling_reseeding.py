@@ -10,8 +10,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
-from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
-from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
+from dynslam_bench.culling.reseeding import ReseedingFilter
+from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.orb import OrbExtractor
 from dynslam_bench.features.settings import FeatureSettings
 

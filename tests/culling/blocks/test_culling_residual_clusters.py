@@ -13,8 +13,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
-from dynslam_bench.culling.blocks.residual_clusters_settings import ResidualSettings
+from dynslam_bench.culling.residual_clusters import ResidualFilter
+from dynslam_bench.culling.settings import ResidualSettings
 
 
 def test_residual_clusters_find_the_part_that_the_camera_does_not_explain() -> None:

@@ -11,9 +11,9 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
-from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
-from dynslam_bench.culling.tools.ego_motion import refine_prediction
+from dynslam_bench.culling.ego_motion import refine_prediction
+from dynslam_bench.culling.rigid_motion import RigidMotionFilter
+from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import se3
 
 

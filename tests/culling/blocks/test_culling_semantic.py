@@ -9,7 +9,7 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.blocks.semantic import SemanticFilter
+from dynslam_bench.culling.semantic import SemanticFilter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 

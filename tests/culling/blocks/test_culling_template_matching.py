@@ -14,8 +14,8 @@ from scenes import (
 )
 
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.blocks.template_matching import TemplateFilter
-from dynslam_bench.culling.blocks.template_matching_settings import TemplateSettings
+from dynslam_bench.culling.settings import TemplateSettings
+from dynslam_bench.culling.template_matching import TemplateFilter
 
 
 @pytest.mark.parametrize("shift", [0, 12])

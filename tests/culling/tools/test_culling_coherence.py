@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dynslam_bench.culling.tools.coherence import coherent
+from dynslam_bench.culling.ego_motion import coherent
 
 
 def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:

@@ -9,7 +9,7 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.tools.ego_motion import refine_prediction
+from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.geometry import se3
 
 

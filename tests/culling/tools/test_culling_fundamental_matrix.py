@@ -10,7 +10,7 @@ from scenes import (
     scene,
 )
 
-from dynslam_bench.culling.tools.fundamental_matrix import Estimator, epipolar_distance, fundamental_matrix
+from dynslam_bench.culling.matches import Estimator, epipolar_distance, fundamental_matrix
 from dynslam_bench.geometry import se3
 
 

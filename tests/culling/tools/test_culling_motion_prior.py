@@ -8,10 +8,10 @@ from scenes import CAMERA, bundle, splat
 
 from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FilterState
-from dynslam_bench.culling.tools.ego_motion import CORRELATION, prior_information
+from dynslam_bench.culling.ego_motion import CORRELATION, prior_information
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.localisation.motion_model import MotionState
+from dynslam_bench.slam.motion_model import MotionState
 from dynslam_bench.slam.settings import MotionModelSettings
 
 

@@ -8,7 +8,7 @@ from dynslam_bench.core.errors import PluginError, SettingsError, TrajectoryErro
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.testing import CornerSequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.registry import resolve_settings
@@ -134,7 +134,7 @@ def test_names_with_a_colon_still_load_specs(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(
         "from dynslam_bench.trackers import TrackerSpec\n"
-        "SPEC = TrackerSpec('mine', 'dynslam_bench.trackers.adapters.never_move:NeverMove', 'mine')\n"
+        "SPEC = TrackerSpec('mine', 'dynslam_bench.trackers.adapters.controls:NeverMove', 'mine')\n"
     )
     assert TRACKERS.get(f"{file}:SPEC").id == "mine"
     assert TRACKERS.get("dynslam_bench.trackers.adapters.specs:NEVER_MOVE").id == "never-move"

@@ -9,12 +9,10 @@ import pytest
 
 from dynslam_bench.core.errors import SegmentationError, SequenceError, SettingsError
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, load_object
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.registry import FLOWS
+from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.segmentation.registry import SEGMENTERS
-from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.published.datasets import DATASETS
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
+from dynslam_bench.sequences.catalogue import DATASETS, open_sequence
 from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.systems.composition import SystemSettings, compose

@@ -16,8 +16,8 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
-from dynslam_bench.trackers.adapters import opencv_odometry
-from dynslam_bench.trackers.adapters.frame_to_frame import FrameToFrame, undistortion_maps
+from dynslam_bench.trackers.adapters import odometry as opencv_odometry
+from dynslam_bench.trackers.adapters.odometry import FrameToFrame, undistortion_maps
 
 XYZ = Path(__file__).resolve().parents[4] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
 needs_data = pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")

@@ -16,9 +16,8 @@ from dynslam_bench.core.errors import SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
-from dynslam_bench.trackers.adapters.orbslam3 import check_camera, settings_yaml
-from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
-from dynslam_bench.trackers.adapters.vocabulary import find_vocabulary
+from dynslam_bench.trackers.adapters.orbslam3 import check_camera, find_vocabulary, settings_yaml
+from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 PACKED = SHARED / "weights" / "orb_vocabulary_small.txt.xz"

@@ -16,8 +16,8 @@ from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import InfrastructureError, SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.trackers import build_tracker
-from dynslam_bench.trackers.adapters import exchange
-from dynslam_bench.trackers.adapters.settings import SubprocessSettings
+from dynslam_bench.trackers.adapters import subprocess_tracker as exchange
+from dynslam_bench.trackers.adapters.specs import SubprocessSettings
 
 FAULTS = {
     "raises": ("raise ValueError('no such camera')", "exit code 1; its last line: 'ValueError: no such camera'"),

@@ -9,10 +9,10 @@ import numpy as np
 from quick_dense import QUICK_DENSE
 
 import dynslam_bench
-from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
-from dynslam_bench.flow.dense import aggregation
-from dynslam_bench.flow.dense import labels as dense
-from dynslam_bench.flow.dense.at_points import DensePointFlow
+from dynslam_bench.flow import dense_flow as dense
+from dynslam_bench.flow import dense_kernels as aggregation
+from dynslam_bench.flow.dense_flow import DensePointFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker

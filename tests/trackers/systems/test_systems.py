@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from quick_dense import quick
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Parameter, Settings, parameters, settings_table
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -21,7 +21,7 @@ from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.measured import epipolar_skipped
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
 
 FRAMES = 6

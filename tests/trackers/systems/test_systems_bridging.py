@@ -11,11 +11,11 @@ from quick_dense import quick
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.masks.postprocess import select
+from dynslam_bench.segmentation.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 
 SEEN = 2

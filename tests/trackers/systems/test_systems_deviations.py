@@ -9,11 +9,12 @@ from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import build, parameters
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.trackers import TRACKERS, TrackerSpec
-from dynslam_bench.trackers.specs import all_specs
-from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
-from dynslam_bench.trackers.systems.published import (
+from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.trackers.systems.composition import (
     LOST,
     PublishedFlowSettings,
+    SemanticSystemSettings,
+    SystemSettings,
     grown_in_words,
     links_in_words,
     masks_in_words,

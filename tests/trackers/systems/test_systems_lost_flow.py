@@ -14,8 +14,8 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
-from dynslam_bench.trackers.specs import all_specs
-from dynslam_bench.trackers.systems.published import PublishedFlowSettings
+from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.trackers.systems.composition import PublishedFlowSettings
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 TESTED = {

@@ -1,0 +1,316 @@
+"""DAISY Filter Flow at sparse points: what SLAM needs of it, without an image of labels.
+
+Per point: a label search over the matching cost (Eq. 1) with propagation between neighbouring points, then sub-pixel
+refinement, then the way back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.flow import layout
+from dynslam_bench.flow.degenerate import (
+    STATS_NAMES,
+    empty_result,
+    flow_stats,
+    invalid_result,
+    is_degenerate,
+    usable_points,
+)
+from dynslam_bench.flow.label_search import PROPAGATING, Phase, Plan, make_plan, phase_runner
+from dynslam_bench.flow.matching_cost import (
+    CostTables,
+    MatchingCosts,
+    Reference,
+    describe,
+    parabola,
+    reference_appearance,
+    side,
+    tables_for,
+)
+from dynslam_bench.flow.orientation_maps import OrientationMaps, orientation_maps
+from dynslam_bench.flow.propagation import (
+    common_motions,
+    dissenting_labels,
+    label_turns,
+    nearest_neighbours,
+    transported_labels,
+)
+from dynslam_bench.flow.refinement import Window, coarse_to_fine, similarity_lucas_kanade
+from dynslam_bench.flow.search_kernels import SearchState, new_state
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.workers import BufferPool, run_stripes
+
+VOTE = (192, np.float32(5.0))
+"""Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
+NEIGHBOUR_WINDOW = 40
+PARABOLA_STEP_PX = 2.0
+COARSE = (7, 3, 2)
+"""Radius, margin and warps of the refinement at half resolution."""
+FINE_MARGIN, FINE_WARPS, BACK_MARGIN = 2, 2, 3
+TOLERANCE_PX = 0.03
+MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
+
+
+class Pair(NamedTuple):
+    """Two prepared images, and the tables of their matching cost."""
+
+    reference: OrientationMaps
+    target: OrientationMaps
+    tables: CostTables
+
+
+class SparseDaisyFlow:
+    """Sparse flow on the processor; see `contracts.flow.FlowEstimator`.
+
+    Args:
+        settings: How.
+        threads: Over which rows and points are divided; the result does not depend on it.
+    """
+
+    stats_names = STATS_NAMES
+
+    def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
+        self.settings = settings or FlowSettings()
+        self.threads = max(1, threads)
+        self.pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
+        self._buffers = BufferPool()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> SparseDaisyFlow:
+        """A flow of the same settings with threads of its own: nothing is carried from frame to frame here."""
+        return SparseDaisyFlow(self.settings, threads=self.threads)
+
+    def configure(self, settings: FlowSettings) -> None:
+        """Put other settings into force from the next call on."""
+        self.settings = settings
+
+    def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
+        """The orientation maps of a uint8 ``[H, W]`` image."""
+        return orientation_maps(gray, threads=self.threads, pool=self.pool, buffers=self._buffers)
+
+    def track(
+        self,
+        reference: OrientationMaps,
+        target: OrientationMaps,
+        points: NDArray[np.float32],
+        *,
+        guess: NDArray[np.float32] | None = None,
+        seed: int = 0,
+    ) -> FlowResult:
+        """Find points of the reference in the target; see `FlowEstimator.track`."""
+        points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
+        if not len(points):
+            return empty_result()
+        if is_degenerate(reference.gray, target.gray):
+            return invalid_result(points)
+        usable = usable_points(points, reference.gray.shape)
+        if not usable.all():
+            inner = self.track(
+                reference, target, points[usable], guess=None if guess is None else guess[usable], seed=seed
+            )
+            return _scatter(inner, points, usable)
+        pair = Pair(reference, target, tables_for(reference.gray.shape, self.settings))
+        return self._track(pair, points, guess, seed)
+
+    def _track(
+        self, pair: Pair, points: NDArray[np.float32], guess: NDArray[np.float32] | None, seed: int
+    ) -> FlowResult:
+        settings = self.settings
+        described = self.describe(pair.reference, points, pair.tables)
+        neighbours = self.neighbours(points)
+        state = self.search(described, pair, neighbours, guess, seed)
+        labels, cost = state.flames[:, 0].copy(), state.costs[:, 0]
+        evaluations = state.used.copy()
+        n = len(points)
+        if settings.refinement != "none":
+            self.parabola(described, labels, pair, evaluations)
+        valid = (cost < settings.max_cost * pair.tables.ceiling) & (evaluations > 0)
+        if settings.refinement == "lucas-kanade":
+            correlation = self.refine(points, labels, pair)
+            if settings.search in PROPAGATING and n > 2:
+                self.second_opinion(points, labels, correlation, neighbours, pair)
+            valid &= correlation > settings.min_correlation
+        xy = points + labels[:, :2]
+        height, width = pair.target.gray.shape
+        valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
+        if settings.forward_backward_px > 0:
+            going = np.flatnonzero(valid)
+            back = self._way_back(points[going], xy[going], labels[going], pair)
+            valid[going] = back <= settings.forward_backward_px
+        stats = flow_stats(n, int(valid.sum()), int(evaluations.sum()))
+        return FlowResult(xy, valid, np.asarray(cost / pair.tables.ceiling, dtype=np.float32), stats)
+
+    def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
+        """What the search needs of the reference points: their rotated descriptors and appearance."""
+        count, supports = len(points), len(tables.support)
+        descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
+        self.stripes(describe, count, points, side(image), tables, descriptors)
+        appearance = np.zeros((count, supports, 2), dtype=np.int32)
+        if tables.appearance:
+            reference_appearance(points, side(image), tables, appearance)
+        return Reference(points, descriptors, appearance)
+
+    def neighbours(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Indices ``[N, K]`` of the points whose labels the search exchanges; none for searches without propagation."""
+        return self.nearest(points) if self.settings.search in PROPAGATING else np.empty((len(points), 0), np.int64)
+
+    def nearest(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Indices ``[N, K]`` of each point's nearest others."""
+        n = len(points)
+        count = min(MOST_NEIGHBOURS, n - 1)
+        found = np.empty((n, count), dtype=np.int64)
+        if count:
+            order = np.argsort(points[:, 0], kind="stable")
+            self.stripes(nearest_neighbours, n, points[order], order, NEIGHBOUR_WINDOW, found)
+        return found
+
+    def _runner(self, plan: Plan, described: Reference, pair: Pair, state: SearchState, seed: int) -> Phase:
+        """The function that spends one phase's evaluations on all points."""
+        costs = MatchingCosts(described, side(pair.target), pair.tables)
+        return phase_runner(plan, self.settings, costs, state, seed, self.stripes)
+
+    def search(
+        self,
+        described: Reference,
+        pair: Pair,
+        neighbours: NDArray[np.int64],
+        guess: NDArray[np.float32] | None,
+        seed: int,
+    ) -> SearchState:
+        """The label search alone: phases of `FlowSettings.search` with propagation between them.
+
+        Returns:
+            The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
+        """
+        settings, points = self.settings, described.points
+        n = len(points)
+        start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
+        if guess is not None:
+            offset = np.asarray(guess, dtype=np.float32).reshape(-1, 2) - points
+            start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
+        turn = np.deg2rad(settings.rotation_range_deg)
+        extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, turn], dtype=np.float32)
+        lower, upper = start[:, 0] - extent, start[:, 0] + extent
+        plan = make_plan(settings)
+        state = new_state(n, plan.population, lower, upper, pair.tables.ceiling)
+        state.flames[:, :] = start
+        run = self._runner(plan, described, pair, state, seed)
+        run(0, start if plan.shrink > 0 else _with_zero_flow(start))
+        if settings.search in PROPAGATING:
+            neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
+            motions = np.full((2, 4), np.nan, dtype=np.float32)
+            candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
+            for number in range(1, len(plan.ends)):
+                best = state.flames[:, 0].copy()
+                if settings.similarity_seeds:
+                    common_motions(points, best, state.costs[:, 0].copy(), *VOTE, np.uint64(seed + number), motions)
+                told = (label_turns(best), neighbours, motions)
+                self.stripes(transported_labels, n, points, best, *told, lower, upper, candidates)
+                run(number, candidates)
+        return state
+
+    def stripes(self, function: Callable[..., Any], count: int, *arguments: Any) -> None:
+        """`run_stripes` over the threads of this flow."""
+        run_stripes(function, count, self.threads, self.pool, *arguments)
+
+    def parabola(
+        self, described: Reference, labels: NDArray[np.float32], pair: Pair, evaluations: NDArray[np.int64]
+    ) -> None:
+        """Move labels in place to the lowest point of a parabola through the costs around them; counts evaluations."""
+        step, target = np.float32(PARABOLA_STEP_PX), side(pair.target)
+        self.stripes(parabola, len(labels), labels, step, described, target, pair.tables, evaluations)
+
+    def refine(self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
+        """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
+        correlation = np.empty(len(points), dtype=np.float32)
+        radius, iterations = self.settings.refinement_window_px // 2, self.settings.refinement_iterations
+        coarse = Window(2, *COARSE, iterations, np.float32(TOLERANCE_PX))
+        fine = Window(1, radius, FINE_MARGIN, FINE_WARPS, iterations, np.float32(TOLERANCE_PX))
+        images = (pair.reference.framed_half, pair.target.framed_half, pair.reference.framed, pair.target.framed)
+        self.stripes(coarse_to_fine, len(points), points, labels, *images, coarse, fine, correlation)
+        return correlation
+
+    def second_opinion(
+        self,
+        points: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        correlation: NDArray[np.float32],
+        neighbours: NDArray[np.int64],
+        pair: Pair,
+    ) -> None:
+        """Try what agreeing neighbours, then what most points say, where it contradicts a point's own label.
+
+        The other label is taken where, refined, it looks as good: repetitive textures look alike one period off.
+        """
+        n = len(points)
+        extent = np.full((n, 4), 8.0, dtype=np.float32)
+        predictions = np.empty((n, neighbours.shape[1], 4), dtype=np.float32)
+        turns, no_motion = label_turns(labels), np.empty((0, 4), np.float32)
+        transported_labels(0, n, points, labels, turns, neighbours, no_motion, -extent, extent, predictions)
+        alternative = np.empty((n, 4), dtype=np.float32)
+        dissents = np.empty(n, dtype=np.bool_)
+        dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
+        self._reconsider(points, labels, correlation, alternative, dissents, pair)
+        if not self.settings.similarity_seeds:
+            return
+        motions = np.empty((2, 4), dtype=np.float32)
+        doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
+        common_motions(points, labels, doubt, *VOTE, np.uint64(1), motions)
+        predictions = np.empty((n, 2, 4), dtype=np.float32)
+        nobody = np.empty((n, 0), np.int64)
+        transported_labels(0, n, points, labels, turns, nobody, motions, -extent, extent, predictions)
+        alternative = np.ascontiguousarray(predictions[:, 0])
+        with np.errstate(invalid="ignore"):
+            dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
+        self._reconsider(points, labels, correlation, alternative, dissents, pair)
+
+    def _reconsider(
+        self,
+        points: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        correlation: NDArray[np.float32],
+        alternative: NDArray[np.float32],
+        dissents: NDArray[np.bool_],
+        pair: Pair,
+    ) -> None:
+        chosen = np.flatnonzero(dissents)
+        if not len(chosen):
+            return
+        other = alternative[chosen]
+        seen = self.refine(points[chosen], other, pair)
+        better = seen > correlation[chosen] - CONSENSUS_MARGIN
+        labels[chosen[better]], correlation[chosen[better]] = other[better], seen[better]
+
+    def _way_back(
+        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
+    ) -> NDArray[np.float32]:
+        """Distance in pixels between each point and where the inverse label, refined the other way, takes it."""
+        inverse = -labels
+        correlation = np.empty(len(points), dtype=np.float32)
+        radius, iterations = self.settings.refinement_window_px // 2, self.settings.refinement_iterations
+        window = Window(1, radius, BACK_MARGIN, 1, iterations, np.float32(TOLERANCE_PX))
+        ends, images = np.ascontiguousarray(xy), (pair.target.framed, pair.reference.framed)
+        self.stripes(similarity_lucas_kanade, len(points), ends, inverse, *images, window, correlation)
+        distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
+        return distance
+
+
+def _with_zero_flow(start: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Start labels ``[N, 1, 4]`` and, where they are no zero flow, that too: ``[N, 2, 4]``, NaN means none."""
+    zero = np.zeros_like(start)
+    zero[~start.any(axis=2)] = np.nan
+    return np.concatenate([start, zero], axis=1)
+
+
+def _scatter(inner: FlowResult, points: NDArray[np.float32], usable: NDArray[np.bool_]) -> FlowResult:
+    """Spread the result of the usable points over all."""
+    xy, valid = points.copy(), np.zeros(len(points), dtype=np.bool_)
+    cost = np.ones(len(points), dtype=np.float32)
+    xy[usable], valid[usable], cost[usable] = inner.xy, inner.valid, inner.cost
+    return FlowResult(xy, valid, cost, {**inner.stats, "points": float(len(points))})

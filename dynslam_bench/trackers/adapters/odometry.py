@@ -1,0 +1,205 @@
+"""What dense frame-to-frame odometries share: undistortion, the chain of relative motions, and what counts as lost."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from copy import copy
+from typing import Any, Generic, Protocol, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.trackers.adapters.specs import OpenCvOdometrySettings
+
+LEAST_DEPTH_PIXELS = 1000
+PATIENCE = 5
+
+Prepared = TypeVar("Prepared")
+
+
+class Aligner(Protocol[Prepared]):
+    """The alignment of two RGB-D images of one camera."""
+
+    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Prepared:
+        """What is computed once an image: colour uint8 ``[H, W, 3]``, depth float32 ``[H, W]``, metres, 0 = missing."""
+        ...
+
+    def align(self, reference: Prepared, current: Prepared) -> NDArray[np.float64] | None:
+        """``T_reference_current`` ``[4, 4]``; None if they cannot be aligned."""
+        ...
+
+
+class FrameToFrame(ABC, Generic[Prepared]):
+    """Chains the motions from frame to frame; subclasses say how two frames are aligned.
+
+    A frame that cannot be aligned is lost. The next one is aligned to the last good frame again, at most five times in
+    a row; then the chain goes on from the newest frame as if the camera had not moved since.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._aligner: Aligner[Prepared] | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> FrameToFrame[Prepared]:
+        """A tracker at the same frame; the alignment and the last good frame are shared, since neither changes."""
+        return copy(self)
+
+    @abstractmethod
+    def make_aligner(self, camera: Camera) -> Aligner[Prepared]:
+        """The alignment for images of this (undistorted) camera."""
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence; nothing here is random."""
+        self._aligner = self.make_aligner(camera.undistorted())
+        self._maps = undistortion_maps(camera)
+        self._reference: Prepared | None = None
+        self._pose: NDArray[np.float64] = np.eye(4)
+        self._failures = 0
+
+    def track(self, frame: Frame) -> TrackResult:
+        """``initialising`` until a frame has depth, then ``ok``, or ``lost`` where it cannot be aligned.
+
+        Raises:
+            TrackerError: `reset` was not called.
+        """
+        if self._aligner is None:
+            raise TrackerError(f"{self._name} was given a frame before reset()")
+        start = time.perf_counter()
+        rgb, depth = self._undistort(frame)
+        known = float((depth > 0).mean())
+        stats = {"depth_fraction": known}
+        if known * depth.size < LEAST_DEPTH_PIXELS:
+            state = "initialising" if self._reference is None else "lost"
+            return TrackResult(None, state, stats, {"tracking": time.perf_counter() - start})  # type: ignore[arg-type]
+        current = self._aligner.prepare(rgb, depth)
+        motion = np.eye(4) if self._reference is None else self._aligner.align(self._reference, current)
+        good = False
+        if motion is not None and se3.is_pose(motion):
+            good = True
+            self._pose = self._pose @ motion
+        self._failures = 0 if good else self._failures + 1
+        if good or self._failures >= PATIENCE:
+            self._reference = current
+        timings = {"tracking": time.perf_counter() - start}
+        if not good:
+            return TrackResult(None, "lost", stats, timings)
+        return TrackResult(self._pose.copy(), "ok", stats, timings)
+
+    def _undistort(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        known = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        if self._maps is None:
+            return frame.rgb, known
+        rgb = cv2.remap(frame.rgb, *self._maps, cv2.INTER_LINEAR)
+        depth = cv2.remap(known, *self._maps, cv2.INTER_NEAREST)
+        return np.asarray(rgb, dtype=np.uint8), np.asarray(depth, dtype=np.float32)
+
+
+def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Column and row ``[H, W]`` in the distorted image of each undistorted pixel; None without distortion."""
+    if not camera.is_distorted:
+        return None
+    distortion, turn, size = np.asarray(camera.distortion), np.eye(3), (camera.width, camera.height)
+    columns, rows = cv2.initUndistortRectifyMap(camera.matrix, distortion, turn, camera.matrix, size, cv2.CV_32FC1)
+    return np.asarray(columns, dtype=np.float32), np.asarray(rows, dtype=np.float32)
+
+
+# OpenCV's dense RGB-D odometry: `cv2.Odometry` of OpenCV 5, `cv2.rgbd` of the contrib packages of OpenCV 4.
+
+INSTALL = "pip install 'opencv-python-headless>=5' (or, for OpenCV 4, opencv-contrib-python-headless)"
+
+
+def unavailable() -> str:
+    """How to get an OpenCV with RGB-D odometry; empty if this one has it."""
+    return "" if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd") else f"OpenCV {cv2.__version__} lacks it: {INSTALL}"
+
+
+class OpenCvOdometry(FrameToFrame[Any]):
+    """Dense frame-to-frame odometry of OpenCV with its default pyramid and iterations.
+
+    Raises:
+        TrackerError: This OpenCV has none.
+    """
+
+    def __init__(self, settings: OpenCvOdometrySettings) -> None:
+        super().__init__("opencv-odometry")
+        reason = unavailable()
+        if reason:
+            raise TrackerError("opencv-odometry cannot run", reason)
+        self.settings = settings
+
+    def make_aligner(self, camera: Camera) -> Aligner[Any]:
+        """That of the OpenCV at hand."""
+        return _Odometry5(camera, self.settings) if hasattr(cv2, "Odometry") else _Odometry4(camera, self.settings)
+
+
+class _Odometry5:
+    """`cv2.Odometry`, OpenCV 5; missing depth is NaN there."""
+
+    def __init__(self, camera: Camera, settings: OpenCvOdometrySettings) -> None:
+        options = cv2.OdometrySettings()
+        options.setCameraMatrix(camera.matrix.astype(np.float32))
+        options.setMinDepth(settings.min_depth_m)
+        options.setMaxDepth(settings.max_depth_m)
+        options.setMaxDepthDiff(settings.max_depth_difference_m)
+        kinds = {
+            "rgbd": cv2.OdometryType_RGB_DEPTH,
+            "icp": cv2.OdometryType_DEPTH,
+            "rgb": cv2.OdometryType_RGB,
+        }
+        # OdometryAlgoType_FAST fails for colour alone in 5.0.0 and was no faster here
+        self._odometry = cv2.Odometry(kinds[settings.method], options, cv2.OdometryAlgoType_COMMON)
+
+    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
+        return cv2.OdometryFrame(np.where(depth > 0, depth, np.float32(np.nan)), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+
+    def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
+        try:
+            self._odometry.prepareFrames(reference, current)
+            success, T_current_reference = self._odometry.compute(reference, current)
+        except cv2.error:  # too little texture or depth in one of them
+            return None
+        return _inverted(success, T_current_reference)
+
+
+class _Odometry4:
+    """`cv2.rgbd`, OpenCV 4 contrib."""
+
+    def __init__(self, camera: Camera, settings: OpenCvOdometrySettings) -> None:
+        rgbd: Any = getattr(cv2, "rgbd")  # noqa: B009 - only the contrib packages have it
+        create = {
+            "rgbd": rgbd.RgbdICPOdometry_create,
+            "icp": rgbd.ICPOdometry_create,
+            "rgb": rgbd.RgbdOdometry_create,
+        }
+        self._odometry = create[settings.method](
+            camera.matrix.astype(np.float32),
+            minDepth=settings.min_depth_m,
+            maxDepth=settings.max_depth_m,
+            maxDepthDiff=settings.max_depth_difference_m,
+        )
+
+    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
+        known = depth > 0
+        masked = np.where(known, depth, np.float32(np.nan))
+        return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), masked, known.astype(np.uint8) * 255
+
+    def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
+        try:
+            success, T_current_reference = self._odometry.compute(*reference, *current)
+        except cv2.error:
+            return None
+        return _inverted(success, T_current_reference)
+
+
+def _inverted(success: bool, T_current_reference: Any) -> NDArray[np.float64] | None:
+    if not success:
+        return None
+    pose = np.asarray(T_current_reference, dtype=np.float64)
+    return se3.inverse(pose) if se3.is_pose(pose) else None

@@ -1,0 +1,370 @@
+"""What the page of one run shows: its facts, its frames over time, its track beside the true one, its log."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.reading import MEGABYTE, TABLE_BYTES, read_bytes
+from dynslam_bench.evaluation.evaluate import pose_errors
+from dynslam_bench.evaluation.protocol import Protocol, RPESpec
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.reports.figures import broken, significant
+from dynslam_bench.reports.html.page import packed_rows
+from dynslam_bench.reports.model.load import LoadedRun
+from dynslam_bench.reports.model.missing import run_command
+from dynslam_bench.reports.tables.errors import DOUBT
+from dynslam_bench.runs.frames import CSV_FILE
+
+Array = NDArray[np.float64]
+
+MOST_FRAMES = 400
+"""Frames of a run that its page shows unless something else is asked for."""
+_LOG_BYTES = 20_000
+_WHOLE = ("total_s", "processor_s", "read_s")
+"""Times of a frame that are no stage of it: the figure stacks stages."""
+
+
+def run_content(
+    run: LoadedRun, frames: RunFrames, protocol: Protocol, truth: Trajectory | None, most: int = MOST_FRAMES
+) -> dict[str, Any]:
+    """Everything that the page of a run shows, as the page's script reads it.
+
+    Args:
+        run: The run.
+        frames: Its frames.
+        protocol: How its errors are computed.
+        truth: Ground truth of its part of the sequence.
+        most: Frames that are shown; of longer runs every second, third, ...
+    """
+    row, record = run.row, run.record
+    return {
+        "id": row.run_id,
+        "status": row.status,
+        "ending": row.ending,
+        "reason": row.reason,
+        "facts": _facts(run, protocol.rpe),
+        "settings": {name: _plain(value) for name, value in record.settings.items()},
+        "overrides": sorted(record.overrides),
+        "stages": [
+            [name, *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s))]
+            for name, time in record.timings.items()
+        ],
+        "protocol": protocol.describe(),
+        "started": row.started,
+        "machine": row.machine,
+        "notes": [*row.notes, *filter(None, [frames.fault])],
+        "command": run_command(row),
+        "asked": row.command,
+        "log": _log(run),
+        "frames": _series(frames, most),
+        "track": _track(run, protocol, truth, most),
+    }
+
+
+def _facts(run: LoadedRun, rpe: Sequence[RPESpec]) -> list[list[str | float | None]]:
+    """Name, number and unit of what is known of a run."""
+    row, record = run.row, run.record
+    facts: list[tuple[str, float | None, str]] = [
+        ("ATE, lost frames held", None if row.score_m is None else 1000 * row.score_m, "mm"),
+        ("ATE of the tracked frames", _scaled(row.metrics.get("ate_rmse_m"), 1000), "mm"),
+        ("ATE of the final trajectory", _scaled(row.final_ate_m, 1000), "mm"),
+        *(
+            (f"RPE over {s.describe()}", _scaled(row.metrics.get(s.metric("trans")), 1000), "mm/s" if s.rate else "mm")
+            for s in rpe
+        ),
+        ("coverage", 100 * row.coverage, "%"),
+        ("frame time", row.frame_ms, "ms"),
+        ("real time", row.real_time_factor, "×"),
+        ("memory", row.peak_memory_mb, "MB"),
+        ("keyframes", record.keyframes, ""),
+        ("map points", record.map_points, ""),
+        ("mask overlap (IoU)", row.mask_iou, ""),
+    ]
+    return [[name, significant(value), unit] for name, value, unit in facts if value is not None]
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, str | int | bool) or value is None else str(value)
+
+
+def _log(run: LoadedRun) -> str:
+    path = run.store.folder(run.row.run_id) / "log.txt"
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        before = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
+        file.seek(before)
+        text = file.read(_LOG_BYTES)
+    return (f"... {before} bytes before\n" if before else "") + text.decode(errors="replace")
+
+
+def _series(frames: RunFrames, most: int) -> dict[str, Any]:
+    """The frames over time, thinned and packed."""
+    columns = frames.columns
+    if not columns:
+        return {}
+    step = -(-len(frames) // most)
+    stamps, start = columns["timestamp"], float(columns["timestamp"][0])
+    stages = [name for name in columns if name.endswith("_s") and name not in _WHOLE]
+    counts = [name for name in COUNTS if f"stat_{name}" in columns]
+    rows = [stamps - start, 1000 * frames.errors_m, 100 * frames.share]
+    rows += [columns[f"stat_{name}"] for name in counts] + [1000 * columns[name] for name in stages]
+    t, error, share, *others = packed_rows([np.asarray(row, dtype=np.float64)[::step] for row in rows])
+    found: dict[str, Any] = {
+        "count": len(frames),
+        "step": step,
+        "start": start,
+        "t": t,
+        "states": "".join(state[:1] for state in columns["state"][::step].tolist()),
+        "frame_error_mm": error,
+        "share_source": frames.share_source,
+        "counts": dict(zip(counts, others, strict=False)),
+        "stages": {name[:-2]: row for name, row in zip(stages, others[len(counts) :], strict=True)},
+    }
+    return found | {"share": share} if np.isfinite(frames.share).any() else found
+
+
+def _track(run: LoadedRun, protocol: Protocol, truth: Trajectory | None, most: int) -> dict[str, Any]:
+    """The aligned track beside the true one; without ground truth the track alone; empty if nothing was tracked.
+
+    Where the time between two poses exceeds twice the median interval, all series have a gap.
+    """
+    try:
+        estimate = run.trajectory(run.row.trajectory)
+        if estimate is None or len(estimate) < 2:
+            return {}
+        if truth is None or not run.row.metrics:
+            return _packed_track(estimate, {"xyz": estimate.positions, "angles": _angles(estimate, estimate)}, most)
+        aligned, true, series = pose_errors(estimate, truth, protocol)
+    except DynslamError as error:
+        return {"reason": str(error)}
+    columns = {
+        "error_mm": 1000 * series["trans_m"],
+        "rotation_deg": series["rot_deg"],
+        "xyz": aligned.positions,
+        "true_xyz": true.positions,
+        "angles": _angles(aligned, true),
+        "true_angles": _angles(true, true),
+    }
+    return _packed_track(aligned, columns, most) | {"alignment": protocol.alignment, "doubt": _rotation_doubt(run)}
+
+
+def _rotation_doubt(run: LoadedRun) -> str:
+    """Why the angles of an aligned track say nothing of the tracker; empty where they do."""
+    uncertainty = run.row.rotation_uncertainty_deg
+    if run.row.rotation_reliable or uncertainty is None:
+        return ""
+    return (
+        f"{DOUBT} Rotation is unreliable: the path hardly determines the alignment's rotation (standard error "
+        f"{uncertainty:.0f}°), which turns all angles shown here. Positions are not affected."
+    )
+
+
+def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) -> dict[str, Any]:
+    """Series along a track ``[N]`` or ``[N, 3]``, thinned, broken at gaps and packed."""
+    start = float(track.timestamps[0])
+    widths = [1 if values.ndim == 1 else values.shape[1] for values in columns.values()]
+    together = np.column_stack(list(columns.values()))
+    stamps, values = broken(track.timestamps - start, together, most)
+    t, *rows = packed_rows(np.vstack([stamps, values.T]))
+    found: dict[str, Any] = {"start": start, "t": t}
+    for name, width in zip(columns, widths, strict=True):
+        found[name] = rows[0] if width == 1 else rows[:width]
+        rows = rows[width:]
+    return found
+
+
+def _angles(track: Trajectory, true: Trajectory) -> Array:
+    """Yaw, pitch and roll (about the camera's y, x and z) from the first true pose, in degrees ``[N, 3]``."""
+    turned = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
+    yaw = np.arctan2(turned[:, 0, 2], turned[:, 2, 2])
+    pitch = np.arcsin(np.clip(-turned[:, 1, 2], -1, 1))
+    roll = np.arctan2(turned[:, 1, 0], turned[:, 1, 1])
+    return np.asarray(np.degrees(np.unwrap(np.stack([yaw, pitch, roll], axis=1), axis=0)))
+
+
+# The frames of runs, from their ``frames.csv``: many tables at once, since parsing one alone is mostly overhead.
+
+Columns = dict[str, NDArray[Any]]
+
+COUNTS = ("keypoints", "culled", "matches", "inliers")
+_STATS = {f"stat_{name}" for name in (*COUNTS, "mask_fraction")}
+_NEEDED = {"index", "timestamp", "state", "frame_error_trans_m"}
+_TOGETHER = 8 * MEGABYTE
+"""About how many bytes of tables are parsed at once."""
+_ASKED = 5
+"""Runs of a column that are asked for the exact shares of its frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunFrames:
+    """The frames of a run.
+
+    Attributes:
+        columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an imported trajectory.
+        share: Share of the pixels that show people ``[N]``, nan where it is not known.
+        share_source: Where that comes from, in words; empty where nothing is known.
+        fault: Why there are no frames though there is a table; empty otherwise.
+    """
+
+    columns: Columns
+    share: Array
+    share_source: str
+    fault: str = ""
+
+    def __len__(self) -> int:
+        return len(self.share)
+
+    @property
+    def errors_m(self) -> Array:
+        """Frame-to-frame translational errors ``[N]`` in metres, nan where there is none."""
+        return np.asarray(self.columns["frame_error_trans_m"], dtype=np.float64)
+
+
+def read_frames(runs: Sequence[LoadedRun], exact: Mapping[int, float]) -> Iterator[RunFrames]:
+    """The frames of some runs with the share of dynamic pixels: the exact one if it is known, else by their own masks.
+
+    Args:
+        runs: Runs of one column.
+        exact: Frame in the numbering of the runs' part without offset to the exact share.
+    """
+    paths = [run.store.folder(run.row.run_id) / CSV_FILE for run in runs]
+    for run, columns in zip(runs, read_tables(paths, _is_shown), strict=True):
+        if isinstance(columns, RunError):
+            yield RunFrames({}, np.zeros(0), "", str(columns))
+        elif columns is None:
+            yield RunFrames({}, np.zeros(0), "")
+        elif exact:
+            share = [exact.get(index + run.row.offset, np.nan) for index in columns["index"].tolist()]
+            yield RunFrames(columns, np.array(share), "exact masks")
+        elif (own := columns.get("stat_mask_fraction")) is not None and own.any():  # else it may have no masks
+            yield RunFrames(columns, own.astype(np.float64), "the tracker's own masks")
+        else:
+            yield RunFrames(columns, np.full(len(columns["index"]), np.nan), "")
+
+
+def exact_shares(runs: Sequence[LoadedRun]) -> dict[int, float]:
+    """Frame (before the offset) to its exact share of dynamic pixels, from those of the first runs that know it."""
+    shares: dict[int, float] = {}
+    asked = runs[:_ASKED]
+    paths = [run.store.folder(run.row.run_id) / CSV_FILE for run in asked]
+    for run, columns in zip(asked, read_tables(paths, {"index", "dynamic_share"}.__contains__), strict=True):
+        if columns is None or isinstance(columns, RunError) or "dynamic_share" not in columns:
+            continue  # what is damaged is said on the page of that run
+        known = np.isfinite(columns["dynamic_share"])
+        if known.any():
+            indices = (columns["index"][known] + run.row.offset).tolist()
+            shares |= dict(zip(indices, columns["dynamic_share"][known].tolist(), strict=True))
+    return shares
+
+
+def read_tables(paths: Sequence[Path], wanted: Callable[[str], bool]) -> Iterator[Columns | RunError | None]:
+    """Columns of some ``frames.csv``, in their order: numbers, and the state in words.
+
+    Tables with one heading are parsed together, as far as nothing about them is unusual.
+
+    Yields:
+        A name to values ``[N]``; None where there is no table; a `RunError` for one that holds no frames, or something
+        else than numbers.
+    """
+    contents: list[bytes | RunError | None] = []
+    held = 0
+    for at, path in enumerate(paths):
+        contents.append(_content(path))
+        held += len(contents[-1]) if isinstance(contents[-1], bytes) else 0
+        if held > _TOGETHER or at == len(paths) - 1:
+            yield from _parsed(contents, wanted)
+            contents, held = [], 0
+
+
+def _content(path: Path) -> bytes | RunError | None:
+    try:
+        if not path.is_file() or not path.stat().st_size:
+            return None
+        return read_bytes(path, limit=TABLE_BYTES)
+    except (DynslamError, OSError) as error:
+        return RunError(f"{CSV_FILE} is damaged: {error}")
+
+
+def _parsed(
+    contents: Sequence[bytes | RunError | None], wanted: Callable[[str], bool]
+) -> list[Columns | RunError | None]:
+    """The columns of every table; those with the heading of the first one together."""
+    tables = [content for content in contents if isinstance(content, bytes)]
+    heading = tables[0].partition(b"\n")[0] + b"\n" if tables else b""
+    alike = [table for table in tables if table.startswith(heading)]
+    together = iter(_apart(alike, len(heading), wanted))
+    found: list[Columns | RunError | None] = []
+    for content in contents:
+        columns: Columns | RunError | None
+        if not isinstance(content, bytes):
+            found.append(content)
+            continue
+        columns = next(together, None) if content.startswith(heading) else None
+        found.append(_faultless(_parse(content, wanted) if columns is None else columns, wanted))
+    return found
+
+
+def _apart(tables: Sequence[bytes], heading: int, wanted: Callable[[str], bool]) -> list[Columns]:
+    """The columns of tables with one heading, parsed at once; nothing if a line of theirs cannot be told to be one row.
+
+    Args:
+        tables: Their content.
+        heading: Bytes of the heading.
+        wanted: Which columns.
+    """
+    whole = b"".join([tables[0][:heading], *(table[heading:] for table in tables)]) if tables else b""
+    if len(tables) < 2 or b'"' in whole or not all(table.endswith(b"\n") for table in tables):
+        return []
+    found = _parse(whole, wanted)
+    ends = np.cumsum([table.count(b"\n") - 1 for table in tables]).tolist()
+    if isinstance(found, RunError) or {len(values) for values in found.values()} != {ends[-1]}:
+        return []
+    starts = [0, *ends]
+    return [
+        {name: values[start:end] for name, values in found.items()} for start, end in zip(starts, ends, strict=False)
+    ]
+
+
+def _parse(content: bytes, wanted: Callable[[str], bool]) -> Columns | RunError:
+    """What a table holds, whatever it is; what is no table at all is a `RunError`."""
+    kinds: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
+    try:
+        table = pd.read_csv(io.BytesIO(content), usecols=wanted, dtype=kinds, low_memory=False)
+    except (ValueError, OverflowError, OSError) as error:
+        return RunError(f"{CSV_FILE} is damaged: {error}")
+    if not isinstance(table.index, pd.RangeIndex):
+        return RunError(f"{CSV_FILE} is damaged: its lines have more cells than its heading")
+    return {str(name): table[name].to_numpy() for name in table}
+
+
+def _faultless(columns: Columns | RunError, wanted: Callable[[str], bool]) -> Columns | RunError:
+    """The columns of one table, or what is wrong with them."""
+    if isinstance(columns, RunError):
+        return columns
+    needed = [name for name in _NEEDED if wanted(name)]
+    if not set(needed) <= set(columns) or not len(columns[needed[0]]):
+        return RunError(f"{CSV_FILE} holds no frames")
+    if not np.isfinite(columns.get("timestamp", 0.0)).all():
+        return RunError(f"{CSV_FILE} is damaged: not every frame has a stamp")
+    return columns
+
+
+def _is_shown(name: str) -> bool:
+    """Whether the page shows a column of ``frames.csv``."""
+    return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))

@@ -1,0 +1,299 @@
+"""The median of any number of the runs that succeeded, by tracker and sequence, and the marks of the best."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from statistics import median
+
+import numpy as np
+
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell
+from dynslam_bench.reports.model.published import ReportedCell
+from dynslam_bench.reports.model.row import SEEN, RunRow
+from dynslam_bench.reports.tables.leaderboard import SEEN_NOTE, sequence_columns, skipped_words
+from dynslam_bench.reports.tables.runs import run_link
+from dynslam_bench.reports.tables.table import Column, Emphasis, Table, TableCell, emphasise, mm, significant_text
+
+Value = Callable[[RunRow], float | None]
+"""A number of a run; None where it has none."""
+DOUBT = "‡"
+"""Behind a number that says nothing of its tracker."""
+
+
+def metric_table(
+    board: Board,
+    value: Value,
+    name: str,
+    title: str,
+    caption: str,
+    *,
+    unit: str = "RMSE, mm",
+    text: Callable[[float], str] = mm,
+    larger_is_better: bool = False,
+    trackers: Sequence[str] | None = None,
+    doubt: Callable[[Cell], str] = lambda cell: "",
+) -> Table | None:
+    """Median of any number of the runs that succeeded, by tracker and sequence; None if no run has it.
+
+    Args:
+        board: The board.
+        value: The number of a run.
+        name: Id of the table.
+        title: Heading.
+        caption: How to read it.
+        unit: What the numbers are, in a word or two.
+        text: How the number is written; metres become millimetres by default.
+        larger_is_better: Which end is bold.
+        trackers: Variant keys; the board's by default.
+        doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT` and is never bold.
+    """
+    keys = board.trackers if trackers is None else trackers
+    at = {(key, name): cell for key in keys for name, cell in board.cells[key].items() if name in board.sequences}
+    found = {place: number for place, cell in at.items() if (number := median_of(cell, value)) is not None}
+    if not found:
+        return None
+    doubted = {place: words for place in found if (words := doubt(at[place]))}
+    sign = -1.0 if larger_is_better else 1.0
+    marks = column_marks(board, {place: sign * number for place, number in found.items() if place not in doubted})
+    present = [key for key in keys if any((key, sequence) in found for sequence in board.sequences)]
+    rows = []
+    for key in present:
+        cells = [TableCell(board.labels[key])]
+        for place in ((key, sequence) for sequence in board.sequences):
+            cell, number, why = at.get(place), found.get(place), doubted.get(place, "")
+            if cell is not None and not cell.success:
+                cells.append(TableCell(emphasis="failed", tip=cell.ending))
+            elif cell is None or number is None:
+                cells.append(TableCell())
+            else:
+                shown, mark = text(number) + DOUBT * bool(why), "muted" if why else marks.get(place, "")
+                tip = why or (SEEN_NOTE if cell.seen else cell.ending)
+                cells.append(TableCell(shown + SEEN * cell.seen, skipped_words(cell), number, mark, tip=tip))
+        rows.append(cells)
+    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
+    competing = sum(key in board.ranked for key in present)
+    muted = [at for at, key in enumerate(present) if key not in board.ranked]
+    separators = {competing} if 0 < competing < len(rows) else set()
+    return Table(name, title, caption, columns, rows, muted, separators, f"{title} ({unit})")
+
+
+def median_of(cell: Cell, value: Value) -> float | None:
+    """Median of a number over the runs of a cell that count and succeeded."""
+    values = [number for row in cell.kept if not row.failed and (number := value(row)) is not None]
+    return median(values) if values else None
+
+
+def column_marks(board: Board, values: dict[tuple[str, str], float]) -> dict[tuple[str, str], Emphasis]:
+    """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
+
+    Args:
+        board: The board.
+        values: ``(variant, sequence)`` to a number, less is better; what has none takes no part.
+    """
+    marks: dict[tuple[str, str], Emphasis] = {}
+    for name in board.sequences:
+        cells = {key: board.cells[key][name] for key in board.ranked if name in board.cells[key]}
+        keys = [key for key, cell in cells.items() if not cell.failed and board.competes(key, name)]
+        found = emphasise([values.get((key, name)) for key in keys])
+        marks |= {(key, name): mark for key, mark in zip(keys, found, strict=True)}
+    return marks
+
+
+# Tables with one column for every sequence: absolute and relative errors, and published numbers beside them.
+
+
+def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
+    """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
+    sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
+    usual = sizes.most_common(1)[0][0] if sizes else 1
+    medians = {(key, name): cell.median for key in board.ranked for name, cell in board.cells[key].items()}
+    marks = column_marks(board, {place: value for place, value in medians.items() if value is not None})
+    rows, muted = [], {at for at, key in enumerate(board.trackers) if key not in board.ranked}
+    for key in board.trackers:
+        cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
+        for name in board.sequences:
+            cells.append(_error_cell(board, key, name, marks.get((key, name), ""), usual))
+        rows.append(cells)
+    separators = board.separators() | {len(rows)}
+    rows.append([TableCell(STATIC_CAMERA), *(_never_cell(board, name) for name in board.sequences)])
+    muted.add(len(rows) - 1)
+    if reported:
+        separators.add(len(rows))
+        for name, tag in dict.fromkeys((cell.system, cell.tag) for cell in reported):
+            muted.add(len(rows))
+            found = [cell for cell in reported if (cell.system, cell.tag) == (name, tag)]
+            rows.append([TableCell(name, tag=tag), *_reported_cells(board, found)])
+    caption = (
+        f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
+        "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
+        "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
+        "camera, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
+        f"nothing succeeded. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four "
+        f"times or more). Bold best, italic second among ranked trackers. {_names_note(board)}{protocol.describe()}."
+    )
+    if reported:
+        caption += (
+            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only, "
+            "and lost frames are left out of most. Rows marked 'claimed by the paper' are the implemented paper's own, "
+            "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
+            "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
+        )
+    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
+    if any(row.seen_in_training for row in board.rows):
+        columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
+        rows = [[*row, TableCell(_trained_on(board, board.trackers, at))] for at, row in enumerate(rows)]
+        caption += f" {SEEN_NOTE}"
+    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
+    return Table(
+        "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
+    )
+
+
+def _trained_on(board: Board, keys: Sequence[str], at: int) -> str:
+    """The sequences on which the masks of a row's tracker were trained; empty for the rows below the trackers."""
+    cells = board.cells[keys[at]] if at < len(keys) else {}
+    return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].seen)
+
+
+def final_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the final trajectories, of the trackers that have one."""
+    return metric_table(
+        board,
+        lambda row: row.final_ate_m,
+        "final_trajectory",
+        "Error of the final trajectory",
+        "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
+        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+        trackers=[*board.trackers, *board.final_only],
+    )
+
+
+def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the tracked frames only."""
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ate_rmse_m"),
+        "lost_frames_excluded",
+        "Error without the lost frames",
+        "Median ATE (RMSE, millimetres) of the tracked frames only, of the runs that succeeded: the sensitivity to "
+        f"lost frames, not what ranks. {protocol.describe()}.",
+    )
+
+
+def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
+    """One table for each relative error of the protocol and each of its parts."""
+    tables = []
+    for spec in protocol.rpe:
+        for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
+            metric = spec.metric(part)
+            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
+            table = metric_table(
+                board,
+                lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]
+                f"rpe_{spec.key}_{part}",
+                f"Relative pose error over {spec.describe()}: {name}",
+                f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
+                f"they tracked. {protocol.describe()}.",
+                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
+                text=mm if unit == "m" else significant_text,
+            )
+            if table is not None:
+                tables.append(table)
+    return tables
+
+
+def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Absolute rotational error, marked where it is an error of the alignment rather than of the tracker."""
+    caption = (
+        "Absolute rotational error (RMSE in °), median over the runs that succeeded, after the alignment of the "
+        f"positions, on the frames that they tracked. {protocol.describe()}."
+    )
+    if any(_rotation_doubt(cell) for cells in board.cells.values() for cell in cells.values()):
+        caption += (
+            f" {DOUBT} Unreliable: the path hardly determines the alignment's rotation (its standard error is above "
+            f"{RELIABLE_DEG:.0f}° in a run of the cell), so the number says nothing of the tracker and takes no part "
+            "in emphasis. Translational and relative errors are not affected."
+        )
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ape_rot_rmse_deg"),
+        "ape_rotation",
+        "Absolute rotational error",
+        caption,
+        unit="RMSE, °",
+        text=significant_text,
+        doubt=_rotation_doubt,
+    )
+
+
+def _rotation_doubt(cell: Cell) -> str:
+    """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
+    found = [row.rotation_uncertainty_deg or 0.0 for row in cell.kept if not row.failed and not row.rotation_reliable]
+    return f"unreliable: the alignment's rotation is known to ±{max(found):.0f}° only" if found else ""
+
+
+def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
+    cell = board.cells[key].get(sequence)
+    if cell is None or cell.median is None:
+        return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
+    coverage, link = 100 * float(np.mean([row.coverage for row in cell.rows])), run_link(cell.typical)
+    if not cell.success:
+        tip = f"counts as {mm(cell.median)} mm, coverage {coverage:.1f} %"
+        return TableCell(cell.ending, _count(cell, usual), emphasis="failed", tip=tip, link=link)
+    notes = [_spread(cell), _count(cell, usual), skipped_words(cell)]
+    if board.no_better_than_static(key, sequence):
+        notes.append("no better than a static camera")
+    if cell.failed:
+        notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
+    small = ", ".join(filter(None, notes))
+    base = board.reference_median(sequence)
+    if base is None:
+        shown = mm(cell.median) + SEEN * cell.seen
+        return TableCell(shown, small, cell.median, mark, tip=f"coverage {coverage:.1f} %", link=link)
+    ratio = cell.median / max(base, 1e-6)
+    if cell.seen:
+        return TableCell(mm(cell.median) + SEEN, small, cell.median, mark, tip=SEEN_NOTE, link=link)
+    colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
+    tip = f"{ratio:.2f} × the reference, coverage {coverage:.1f} %" + (f"; {cell.ending}" if cell.failed else "")
+    return TableCell(mm(cell.median), small, cell.median, mark, colour, tip, link=link)
+
+
+def _spread(cell: Cell) -> str:
+    if len(cell.scores) > 1:
+        low, high = np.percentile(cell.scores, [25, 75])
+        return f"±{significant_text(500.0 * float(high - low), 2)}"
+    return "deterministic" if cell.deterministic else ""
+
+
+def _count(cell: Cell, usual: int) -> str:
+    return "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
+
+
+def _never_cell(board: Board, sequence: str) -> TableCell:
+    value, base = board.static_camera[sequence], board.reference_median(sequence)
+    if base is None:
+        return TableCell(mm(value), value=value)
+    ratio = value / max(base, 1e-6)
+    return TableCell(mm(value), value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
+
+
+def _reported_cells(board: Board, reported: Sequence[ReportedCell]) -> list[TableCell]:
+    cells = []
+    for sequence in board.sequences:
+        found = [cell for cell in reported if cell.sequence == sequence]
+        cells.append(TableCell(mm(found[0].value), value=found[0].value, tip=found[0].source) if found else TableCell())
+    return cells
+
+
+def shade(ratio: float) -> float:
+    """-1 at a quarter of the reference's error or less, 0 at the same, 1 at four times or more."""
+    return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
+
+
+def _names_note(board: Board) -> str:
+    """What the shortened headings stand for; empty where they are whole."""
+    first = board.sequences[0]
+    return "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
