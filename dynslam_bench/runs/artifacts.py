@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
-from dynslam_bench.core.array_files import read_npz
 from dynslam_bench.core.errors import RunError, TrackerError
+from dynslam_bench.core.reading import read_npz
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align

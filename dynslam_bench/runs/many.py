@@ -28,8 +28,9 @@ from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.identity import ResolvedRun, resolve
 from dynslam_bench.runs.one import OnProgress, run_one
 from dynslam_bench.runs.record import FAILED, RunRecord
+from dynslam_bench.runs.run_index import RUN_FILE
 from dynslam_bench.runs.spec import RunSpec
-from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RUN_FILE, RunStore, score
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, score
 from dynslam_bench.slam.map_files import MAP_FILE
 
 T = TypeVar("T")
@@ -210,7 +211,7 @@ class _Bench:
         if run.spec.label not in ("", record.tracker.label):
             record = self.store.relabel(record, run.spec.label)
         if record.study and not run.spec.study:
-            record = self.store.leave_study(record)
+            record = self.store.rewrite(record, study="")
         score(self.store, record, self.protocol)
         self.tell("reused", run, record=record)
         return record

@@ -18,7 +18,7 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
 from dynslam_bench.runs.process.child import LOG_FILE
-from dynslam_bench.runs.process.fork_server import make_job, start_child
+from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
 from dynslam_bench.runs.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
@@ -119,13 +119,13 @@ def _watched(
         InfrastructureError: What the run needs broke; nothing is known of the run.
     """
     log = LogFile(work / LOG_FILE)
-    child = start_child()
+    child = Child()
     try:
         return supervise(child, job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
     except InfrastructureError:
         if not child.lost:
             raise
-        child = start_child()
+        child = Child()
         return supervise(child, job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
     finally:
         log.finish()

@@ -12,10 +12,9 @@ from pydantic import Field
 
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.files import atomic_folder, write_atomic
-from dynslam_bench.core.passwords import without_passwords, words_without_passwords
 from dynslam_bench.core.reading import parse_json, read_bytes, read_json, read_lines, read_text
 from dynslam_bench.core.records import Record
-from dynslam_bench.core.sanitise import inside, printable, storable
+from dynslam_bench.core.sanitise import inside, printable, storable, without_passwords, words_without_passwords
 from dynslam_bench.core.toml import parse_toml
 
 

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.core import image_header, images
+from dynslam_bench.core import images
+from dynslam_bench.core import images as image_header
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.networks import loading

@@ -15,17 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.core import array_files, reading
+from dynslam_bench.core import reading
+from dynslam_bench.core import reading as array_files
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the cache reads
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model import load as known_rows
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.runs import RunRecord, RunStore, run_index, run_list
+from dynslam_bench.runs import RunRecord, RunStore, run_index
 from dynslam_bench.runs import artifacts as snapshots
 from dynslam_bench.runs import frames as rows
 from dynslam_bench.runs import many as packing
 from dynslam_bench.runs import run_index as line_file
+from dynslam_bench.runs import store as run_list
 from dynslam_bench.runs.frames import FrameLog, load_frames
 from dynslam_bench.runs.scoring import evaluate_run
 from dynslam_bench.sequences.fetch import Receipt

@@ -17,7 +17,7 @@ from dynslam_bench.core.files import claimed
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunStore
 from dynslam_bench.runs.run_index import index_file
-from dynslam_bench.runs.run_list import list_runs
+from dynslam_bench.runs.store import list_runs
 from dynslam_bench.tuning.storage import JournalFile
 
 SECRET = "the user's own words"

@@ -9,8 +9,7 @@ from envs_toys import TARGET
 
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunRecord, RunSpec, RunStore, run_one, score
-from dynslam_bench.runs.run_list import list_runs
-from dynslam_bench.runs.store import rescore
+from dynslam_bench.runs.store import list_runs, rescore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 

@@ -16,7 +16,7 @@ from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import RunStore, load_frames, score
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, read_log, write_csv
-from dynslam_bench.runs.run_list import list_runs
+from dynslam_bench.runs.store import list_runs
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
