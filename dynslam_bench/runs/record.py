@@ -15,7 +15,7 @@ RUN_SCHEMA = 1
 METRIC_SCHEMA = 1
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
-IDENTITY_SCHEME = 2
+IDENTITY_SCHEME = 1
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 _CODE = ("tracker_version", "distribution", "source", "requires", "files")
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")

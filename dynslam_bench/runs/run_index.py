@@ -184,7 +184,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         record: The run.
         metrics: Its errors under some protocol; None without.
     """
-    from dynslam_bench.segmentation.training_set import seen_in_training  # loads the catalogue of all sequences
+    from dynslam_bench.segmentation.networks.checkpoints import seen_in_training  # loads the catalogue of all sequences
 
     errors = {} if metrics is None else metrics.metrics
     not_scored = "" if metrics is None or errors else metrics.reasons.get(metrics.trajectory, "")

@@ -39,9 +39,9 @@ _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
     *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
-    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.build_flow"),
-    *("dynslam_bench.segmentation.masks.schedule", _CHILD),
-    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.specs"),
+    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.registry"),
+    *("dynslam_bench.segmentation.schedule", _CHILD),
+    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry"),
 )
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""

@@ -20,6 +20,8 @@ from dynslam_bench.runs.spec import Limits
 
 Message = dict[str, Any]
 _POLL_S = 0.1
+_TREE_S = 0.5
+"""Seconds between two looks at the process tree, for which psutil reads the status of all processes."""
 _STOP_GRACE_S = 30.0
 _FIRST_WARM = 1
 """The first frame after which nothing is loaded or compiled any more: a flow needs two frames before it compiles."""
@@ -107,6 +109,7 @@ class _Supervisor:
     peak_mb: float = 0.0
     stop_sent: float | None = None
     next_look: float = 0.0
+    next_tree: float = 0.0
 
     def run(self) -> Verdict:
         connection = self.child.connection
@@ -210,7 +213,9 @@ class _Supervisor:
         self.next_look = now + _POLL_S
         if self.tick is not None:
             self.tick()
-        self.child.members = process_tree(self.child.pid) or self.child.members
+        if now >= self.next_tree:
+            self.next_tree = now + _TREE_S
+            self.child.members = process_tree(self.child.pid) or self.child.members
         used_mb = memory_mb(self.child.members)
         self.peak_mb = max(self.peak_mb, used_mb)
         if self.memory_mb is not None and used_mb > self.memory_mb:
