@@ -144,7 +144,7 @@ def test_what_holds_no_password_stays_as_it_is() -> None:
 def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
     with pytest.raises(RunError, match="does not lie in"):
         inside(tmp_path, name, where="a list", kind=RunError)
-    assert inside(tmp_path, "rgb/1.000.png", where="a list") == tmp_path / "rgb" / "1.000.png"
+    assert inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError) == tmp_path / "rgb" / "1.000.png"
 
 
 def test_terminals_get_nothing_that_they_act_upon() -> None:

@@ -15,7 +15,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 from reports_fake_store import add_run
 
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.runs import RunStore, store as store_module
+from dynslam_bench.runs import RunStore
+from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.run_index import FIELDS, run_row
 from dynslam_bench.runs.store import list_runs, rescore
 
