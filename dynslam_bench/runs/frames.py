@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass as validated
 
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.sanitise import storable
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import format_ns, ns_of
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -110,7 +111,7 @@ class FrameRow:
             reward_m=outcome.reward,
             mask_iou=mask_iou,
             timings=dict(outcome.timings),
-            stats=dict(outcome.stats),
+            stats=storable(dict(outcome.stats)),
             pose=pose,
             dynamic_share=dynamic_share,
         )

@@ -15,7 +15,7 @@ from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import RunStore, load_frames, score
-from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, read_log, write_csv
+from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
 from dynslam_bench.runs.store import list_runs
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,8 +36,8 @@ def store(tmp_path: Path) -> RunStore:
 
 def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
-    assert read_log(tmp_path / "log") == (ROWS, "")
-    assert read_log(tmp_path / "none") == ([], "")
+    assert FrameLog.read(tmp_path / "log") == FrameLog(ROWS)
+    assert FrameLog.read(tmp_path / "none") == FrameLog()
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
