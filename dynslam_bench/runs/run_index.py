@@ -1,8 +1,8 @@
 """The index of a store: one SQLite file with what was computed from its runs, and runs as rows of tables.
 
-The index holds metrics, rows of lists and rows of reports. Each value holds for one version of the code that computed it
-and for one state (times and sizes) of the files that it was computed from. The file may be deleted at any time; values
-that are missing, damaged or out of date are computed again from the run folders.
+The index holds metrics, rows of lists and rows of reports. Each value holds for one version of the code that computed
+it and for one state (times and sizes) of the files that it was computed from. The file may be deleted at any time;
+values that are missing, damaged or out of date are computed again from the run folders.
 """
 
 from __future__ import annotations

@@ -165,20 +165,6 @@ def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: P
     assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
 
 
-def test_what_a_killed_process_left_beside_a_folder_is_swept_up(tmp_path: Path) -> None:
-    dead = os.fork()
-    if dead == 0:
-        with atomic_folder(tmp_path / "seq") as work:
-            (work / "half").touch()
-            os._exit(9)
-    os.waitpid(dead, 0)
-    (left,) = tmp_path.iterdir()
-    assert (left / "half").exists()
-    with atomic_folder(tmp_path / "seq"), atomic_folder(tmp_path / "other"):
-        assert not left.exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "seq"]
-
-
 @pytest.mark.parametrize("size", [0, 1, 1 << 16, (1 << 16) + 1, 1 << 17])
 def test_files_of_any_size_are_read_whole_up_to_the_limit(tmp_path, size):
     path = tmp_path / "file"

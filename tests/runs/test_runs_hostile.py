@@ -63,15 +63,6 @@ def test_every_bad_end_is_one_line(attack, mode: str, status: str, reason: str) 
     assert "\n" not in record.reason
 
 
-@pytest.mark.parametrize(
-    ("mode", "reason"), [("segfault", "SIGSEGV"), ("os._exit", "the process left with exit code 0"), ("thread", "")]
-)
-def test_a_fresh_interpreter_ends_likewise(attack, monkeypatch, mode: str, reason: str) -> None:
-    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")
-    record, _ = attack(mode)
-    assert record.reason.startswith(reason) and record.failed == bool(reason)
-
-
 @linux
 @pytest.mark.parametrize("start", ["fork", "fresh"])
 def test_nothing_survives_a_good_run(attack, monkeypatch, start: str) -> None:

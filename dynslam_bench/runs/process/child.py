@@ -2,9 +2,9 @@
 
 Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`) and may send ``stop``
 later. The child sends ``ready`` first (its time counts from then on), ``started``, ``frame`` (once a frame, the sign of
-life) and ``progress`` every so many frames; it ends with ``done``, ``stopped`` or ``failed``. Its results are files in the
-job's folder: ``frames.jsonl``, written frame by frame so that a crash loses nothing, and at the end the final trajectory
-and the map. Its temporary files lie in a private folder that is removed with it.
+life) and ``progress`` every so many frames; it ends with ``done``, ``stopped`` or ``failed``. Its results are files in
+the job's folder: ``frames.jsonl``, written frame by frame so that a crash loses nothing, and at the end the final
+trajectory and the map. Its temporary files lie in a private folder that is removed with it.
 """
 
 from __future__ import annotations

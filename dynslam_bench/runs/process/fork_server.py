@@ -1,10 +1,10 @@
 """The fork server: a process that has imported everything heavy and forks the children of runs in 10 ms each.
 
-The parent asks for a child over a Unix socket: one byte with two file descriptors, the child's end of its connection and
-a pipe. On the pipe the server answers with the child's process id and, later, its exit code, a JSON line each. A run's
-end is reported after all processes that it had started have ended and its temporary files are removed. When the socket
-closes, because the parent has ended, the server kills its children and ends. It has a session of its own, so that
-signals of a terminal do not reach it before.
+The parent asks for a child over a Unix socket: one byte with two file descriptors, the child's end of its connection
+and a pipe. On the pipe the server answers with the child's process id and, later, its exit code, a JSON line each. A
+run's end is reported after all processes that it had started have ended and its temporary files are removed. When the
+socket closes, because the parent has ended, the server kills its children and ends. It has a session of its own, so
+that signals of a terminal do not reach it before.
 
 Where forking is not safe (macOS) the server starts each child in a fresh interpreter instead.
 ``multiprocessing``'s own fork server re-imports the caller's main script and may not be used in daemonic processes, see

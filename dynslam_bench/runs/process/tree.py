@@ -1,7 +1,7 @@
 """Process trees: their members, their memory, and how they are ended.
 
-A tracker may start processes, put them into sessions of their own and forget them. On Linux the fork server and each run
-are subreapers (``prctl(2)``): they become the parents of the orphans below them, so that the tree stays complete.
+A tracker may start processes, put them into sessions of their own and forget them. On Linux the fork server and each
+run are subreapers (``prctl(2)``): they become the parents of the orphans below them, so that the tree stays complete.
 """
 
 from __future__ import annotations
