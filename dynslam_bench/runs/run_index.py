@@ -61,18 +61,10 @@ class RunIndex:
 
     def get(self, name: str, version: str, run_id: str) -> str | None:
         """The value of one run, as `read` gives it."""
-        return self.read(name, version, [run_id], query=" AND run_id = ?", arguments=(run_id,)).get(run_id)
+        rows = self._select("name = ? AND version = ? AND run_id = ?", (name, version, run_id))
+        return next((value for _, state, value in rows if self._holds(run_id, state, value)), None)
 
-    def read(
-        self,
-        name: str,
-        version: str,
-        run_ids: Iterable[str],
-        *,
-        check_links: bool = False,
-        query: str = "",
-        arguments: tuple[str, ...] = (),
-    ) -> dict[str, str]:
+    def read(self, name: str, version: str, run_ids: Iterable[str], *, check_links: bool = False) -> dict[str, str]:
         """The values that hold, by run.
 
         Args:
@@ -80,19 +72,24 @@ class RunIndex:
             version: Digest of the code that computes them.
             run_ids: Runs that are stored.
             check_links: Whether runs whose folders hold links to elsewhere or pipes are left out, too.
-            query: Further condition of the query.
-            arguments: Its arguments.
         """
         stored = set(run_ids)
-        command = f"SELECT run_id, state, value FROM computed WHERE name = ? AND version = ?{query}"
-        values = {}
+        return {
+            run_id: value
+            for run_id, state, value in self._select("name = ? AND version = ?", (name, version))
+            if run_id in stored and self._holds(run_id, state, value)
+            if not check_links or self._is_plain(run_id, state)
+        }
+
+    def _select(self, condition: str, arguments: tuple[str, ...]) -> list[tuple[Any, Any, Any]]:
         with contextlib.suppress(sqlite3.Error), self._opened(anew=False) as connection:
-            for run_id, state, value in connection.execute(command, (name, version, *arguments)):
-                part = str(state).partition(" ")[0]
-                if run_id in stored and state == self.state(run_id, part) and isinstance(value, str):
-                    if not check_links or self._is_plain(run_id, part):
-                        values[run_id] = value
-        return values
+            return connection.execute(
+                f"SELECT run_id, state, value FROM computed WHERE {condition}", arguments
+            ).fetchall()
+        return []
+
+    def _holds(self, run_id: str, state: Any, value: Any) -> bool:
+        return isinstance(value, str) and isinstance(state, str) and state == self.state(run_id, _part_of(state))
 
     def write(self, name: str, version: str, entries: Iterable[tuple[str, str, str]]) -> None:
         """Keep values; a store that cannot be written stays as it is.
@@ -145,13 +142,17 @@ class RunIndex:
                 connection.execute(_TABLE)
             yield connection
 
-    def _is_plain(self, run_id: str, part: str) -> bool:
+    def _is_plain(self, run_id: str, state: str) -> bool:
         try:
             check_plain(self.root / "runs" / run_id, self.root)
-            check_plain(self.root / "sequences" / part, self.root)
+            check_plain(self.root / "sequences" / _part_of(state), self.root)
         except RunError:
             return False
         return True
+
+
+def _part_of(state: str) -> str:
+    return state.partition(" ")[0]
 
 
 def file_stamp(file: str | Path) -> str:

@@ -31,7 +31,7 @@ from dynslam_bench.sequences.readers import images as reader
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
 from dynslam_bench.trackers.adapters import orbslam3 as vocabulary
 
-from .mutate import mutate, mutate_png
+from .mutate import mutate, mutate_png, mutate_zip
 from .target import Target, at
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
@@ -210,21 +210,6 @@ def _checkpoints() -> list[bytes]:
     return [*found, buffer.getvalue(), bomb.getvalue()]
 
 
-def _restored(data: bytes, random: Random) -> bytes:
-    """A zip archive with right checksums and a damaged file inside, as torch reads it."""
-    buffer = io.BytesIO()
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-            for name in old.namelist():
-                content = old.read(name)
-                if name.endswith(".pkl") or random.random() < 0.02:
-                    content = mutate(content, [content], random)
-                new.writestr(name, content)
-    except Exception:  # a seed that is no archive any more is damaged as bytes
-        return mutate(data, [data], random)
-    return buffer.getvalue()
-
-
 def _onnx() -> bytes:
     """A model of one input and one output, written by hand."""
 
@@ -280,7 +265,7 @@ TARGETS = [
     Target("rendered frame", _read_rendered, _rendered, mutate_png),
     Target("archive", _extract, _archives, _tar_checked),
     Target(
-        "checkpoint", lambda data, folder: loading.load_network(at(folder, "net.pt", data)), _checkpoints, _restored
+        "checkpoint", lambda data, folder: loading.load_network(at(folder, "net.pt", data)), _checkpoints, mutate_zip
     ),
     Target(
         "ONNX header",

@@ -10,7 +10,6 @@ import tempfile
 import zipfile
 from functools import cache
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from dynslam_bench.sequences.fetch import Receipt
 from dynslam_bench.tuning import Study, StudySummary
 from dynslam_bench.tuning import storage as cmaes_state
 
-from .mutate import mutate, mutate_json, mutate_lines
+from .mutate import mutate_json, mutate_lines, mutate_zip
 from .target import Target, at
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
@@ -141,25 +140,6 @@ def _renamed(packed: bytes, run: str) -> bytes:
     return buffer.getvalue()
 
 
-def _repacked(data: bytes, random: Random) -> bytes:
-    """A sound archive whose files, or their names, are damaged."""
-    buffer = io.BytesIO()
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-            for name in old.namelist():
-                content = old.read(name)
-                if random.random() < 0.3:
-                    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
-                if random.random() < 0.05:
-                    name = random.choice(
-                        ["../x.txt", "/etc/passwd", "runs/zz/run.json", f"runs/{'0' * 16}/run.json", name]
-                    )
-                new.writestr(name, content)
-    except Exception:  # a seed that is no archive any more is damaged as bytes
-        return mutate(data, [data], random)
-    return buffer.getvalue()
-
-
 def _read_study(data: bytes | None, folder: Path) -> None:
     """As it is stored, or as somebody wrote it; ``other`` is a study whose journal holds another one."""
     results = folder / "results"
@@ -230,20 +210,6 @@ def _snapshot_seeds() -> list[bytes]:
     return found
 
 
-def rezipped(data: bytes, random: Random) -> bytes:
-    """A sound archive with one damaged array."""
-    buffer = io.BytesIO()
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-            chosen = random.choice(old.namelist())
-            for name in old.namelist():
-                content = old.read(name) if old.getinfo(name).file_size < 1 << 16 else b""
-                new.writestr(name, mutate(content, [content], random) if name == chosen else content)
-    except Exception:  # a seed that is no archive any more is damaged as bytes
-        return mutate(data, [data], random)
-    return buffer.getvalue()
-
-
 def _state_seeds() -> list[bytes]:
     """What such a state is made of, without the package that makes it."""
     state = {"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}
@@ -269,7 +235,7 @@ TARGETS = [
         lambda data, folder: load_frames(at(folder, rows.CSV_FILE, data)),
         lambda: [_stored(f"runs/{RUN}/frames.csv")],
     ),
-    Target("packed run", lambda data, folder: packing.unpack(data or b"", RunStore(folder)), _packed_seeds, _repacked),
+    Target("packed run", lambda data, folder: packing.unpack(data or b"", RunStore(folder)), _packed_seeds, mutate_zip),
     Target("study's summary", **_summary(StudySummary, "studies/small/summary.json")),
     Target("stored study", _read_study, _study_seeds, mutate_json),
     Target("journal of a study", _read_journal, lambda: [_stored("studies/small/journal.log")], mutate_lines),
@@ -283,7 +249,7 @@ TARGETS = [
         "snapshots of a run",
         lambda data, folder: snapshots.read_snapshots(at(folder, snapshots.SNAPSHOTS_FILE, data).parent),
         _snapshot_seeds,
-        rezipped,
+        mutate_zip,
     ),
     Target("stage cache entry", _read_entry, lambda: [_entry()]),
     Target("state of CMA-ES", lambda data, folder: cmaes_state._OnlyStates.loads(data or b""), _state_seeds),

@@ -287,12 +287,11 @@ def digest_of(path: Path) -> str:
     Raises:
         OSError: One cannot be read.
     """
-    found = sha256()
-    for each in sorted(part for part in path.iterdir() if part.is_file()) if path.is_dir() else [path]:
-        with each.open("rb") as file:
-            while block := file.read(1 << 20):
-                found.update(block)
-    return found.hexdigest()
+    whole = sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            whole.update(file.read_bytes())
+    return whole.hexdigest()
 
 
 # The sequence that a stored run saw, opened again, and only if it is still the same.
