@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynslam_bench.core import moved
-
 __version__: str
 
 _checkout = Path(__file__).resolve().parent.parent
@@ -18,7 +16,6 @@ if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.
     # In a bare checkout `envs/`, `tuning/` and `reports/` lie beside this package instead of inside it.
     __path__.append(str(_checkout))
 del _checkout
-moved.install()
 
 
 def __getattr__(name: str) -> str:

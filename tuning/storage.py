@@ -27,7 +27,7 @@ from sqlalchemy import event
 from sqlalchemy.exc import DBAPIError
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.passwords import HIDDEN, without_passwords
+from dynslam_bench.core.sanitise import HIDDEN, without_passwords
 from dynslam_bench.tuning.study_file import StudySpec
 
 JOURNAL = "journal.log"

@@ -19,7 +19,7 @@ from dynslam_bench.cli import trajectories as imports
 from dynslam_bench.cli.ending import interrupted, leave_interrupted
 from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START
 from dynslam_bench.cli.output import complain_of, drawn_download, for_scripts
-from dynslam_bench.core.download_progress import show_downloads
+from dynslam_bench.core.download import show_downloads
 from dynslam_bench.core.errors import DynslamError
 
 INTERRUPT_CODE = 130

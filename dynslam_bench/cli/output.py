@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
-from dynslam_bench.core.download_progress import Report
+from dynslam_bench.core.download import Report
 from dynslam_bench.core.sanitise import printable
 
 if TYPE_CHECKING:

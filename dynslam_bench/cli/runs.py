@@ -41,7 +41,7 @@ def list_(
     from dynslam_bench.core.errors import RunError, did_you_mean
     from dynslam_bench.runs import RunStore
     from dynslam_bench.runs.record import Status
-    from dynslam_bench.runs.run_list import collector_paused, list_runs
+    from dynslam_bench.runs.store import list_runs
 
     if status is not None and status not in get_args(Status):
         raise RunError(f"unknown status '{status}'", did_you_mean(status, get_args(Status)))
@@ -50,8 +50,7 @@ def list_(
         raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     with progress("reading runs") as advance:
         rows, unreadable = list_runs(store, protocol, on_progress=advance)
-    with collector_paused():
-        show_rows([row for row in rows if status in (None, row["status"])], store, protocol, as_json=as_json)
+    show_rows([row for row in rows if status in (None, row["status"])], store, protocol, as_json=as_json)
     for bad in unreadable:
         complain(f"unreadable: {bad.path}: {bad.reason}")
 

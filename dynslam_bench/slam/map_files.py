@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
-from dynslam_bench.core.array_files import MOST_BYTES, read_npz
 from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
-from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
+from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
 from dynslam_bench.core.records import Record, schema, write_atomic
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera

@@ -15,7 +15,7 @@ from dynslam_bench.core import errors
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.runs.process.child import LOG_FILE
-from dynslam_bench.runs.process.fork_server import make_job, start_child
+from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
 from dynslam_bench.runs.spec import Limits
 from dynslam_bench.testing.report import OBSERVER, Check, ConformanceReport
@@ -80,7 +80,7 @@ def isolated_tracker_report(
                 log.look()
                 follow.wait()
 
-            verdict = supervise(start_child(), job, limits, follow.told, tick=tick, located=False)
+            verdict = supervise(Child(), job, limits, follow.told, tick=tick, located=False)
         subject = verdict.final.get("subject", subject)
         if verdict.status == "ok":
             return ConformanceReport(subject, known)

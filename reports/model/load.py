@@ -8,35 +8,25 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, cast
+from typing import Any
 
 from pydantic import TypeAdapter
 
 import dynslam_bench
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError, did_you_mean
 from dynslam_bench.core.fingerprint import package_digest
-from dynslam_bench.core.records import Digest, digest
+from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports.model.row import RunRow, Which, log_of, make_row
 from dynslam_bench.runs.process.fork_server import child_environment
 from dynslam_bench.runs.record import RunRecord
-from dynslam_bench.runs.run_index import (
-    Stamp,
-    add_lines,
-    folder_state,
-    read_line_file,
-    remove_older,
-    stamp_if_there,
-    write_line_file,
-)
-from dynslam_bench.runs.run_list import collector_paused
 from dynslam_bench.runs.store import RunStore
 
 OnProgress = Callable[[float, float | None, str], None]
@@ -331,14 +321,10 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     return stores
 
 
-# Rows that a report has taken before, a line each in the store's ``index/``: an unchanged run is not read again.
+# Rows that a report has taken before, kept in the store's index: an unchanged run is not read again.
 
 _CODE = ("evaluation", "geometry", "reports/model", "runs")
-_MOST_STALE = 0.2
-"""Share of lines that hold no longer from which on the file is written anew."""
-
-_Line = tuple[Digest, Digest, str, str, int, int, RunRow | None]
-_LINES: TypeAdapter[list[_Line]] = TypeAdapter(list[_Line])
+_ROW: TypeAdapter[RunRow | None] = TypeAdapter(RunRow | None)
 
 
 @dataclass(frozen=True)
@@ -347,41 +333,27 @@ class CachedRow:
 
     Attributes:
         run_id: Its id.
-        part: Its part of a sequence.
-        run_state: Of its files, see `folder_state`.
-        part_state: Of the ground truth and the stamps of its part.
-        scored: Of its stored errors.
+        state: Of its files, see `RunIndex.state`; the run's part of a sequence comes first.
         row: Its row; None for a run that was stopped on request, which no report shows.
     """
 
     run_id: str
-    part: str
-    run_state: str
-    part_state: str
-    scored: Stamp
+    state: str
     row: RunRow | None
 
-    def line(self) -> str:
-        """The same as a line of JSON, without what the place of the store adds."""
-        row = "null" if self.row is None else self.row.model_dump_json(exclude_defaults=True, exclude={"log"})
-        words = ",".join(f'"{word}"' for word in (self.run_id, self.part, self.run_state, self.part_state))
-        return f"[{words},{self.scored[0]},{self.scored[1]},{row}]"
-
-    @classmethod
-    def of(cls, line: _Line) -> CachedRow:
-        """What a line says."""
-        return cls(*line[:4], line[4:6], line[6])
+    @property
+    def part(self) -> str:
+        """The run's part of a sequence."""
+        return self.state.partition(" ")[0]
 
     def answer(self) -> list[Any]:
         """The same as a helper's answer."""
-        row = None if self.row is None else self.row.model_dump(mode="json")
-        return [self.run_id, self.part, self.run_state, self.part_state, *self.scored, row]
+        return [self.run_id, self.state, None if self.row is None else self.row.model_dump(mode="json")]
 
     @classmethod
     def answered(cls, answer: Sequence[Any]) -> CachedRow:
         """What a helper has answered."""
-        row = None if answer[6] is None else RunRow.model_validate(answer[6])
-        return cls.of(cast(_Line, (*answer[:6], row)))
+        return cls(answer[0], answer[1], None if answer[2] is None else RunRow.model_validate(answer[2]))
 
 
 class RowCache:
@@ -396,29 +368,25 @@ class RowCache:
     """
 
     def __init__(self, store: RunStore, protocol: Protocol) -> None:
-        self.store, self._protocol, self._digest = store, protocol, protocol.digest()
-        self._older = f"rows-{self._digest}-*"
-        code = digest([dynslam_bench.__version__, package_digest(_CODE)])
-        self._path = store.root / "index" / self._older.replace("*", f"{code}.jsonl")
-        self._part_states: dict[str, str] = {}
+        self.store, self._protocol = store, protocol
+        self._name = f"report {protocol.digest()}"
+        self._version = digest([dynslam_bench.__version__, package_digest(_CODE)])
 
     def read(self) -> tuple[list[CachedRow], list[str]]:
         """All that hold, and the ids of the runs of which none does."""
-        with collector_paused():
-            lines, damaged = read_line_file(self._path, _LINES)
-            stored = self.store.ids()
-            newest = {line[0]: line for line in lines}
-            known = (CachedRow.of(newest[run_id]) for run_id in stored if run_id in newest)
-            found = {each.run_id: each for each in known if self._holds(each)}
-        count = len(lines) + damaged
-        if count - len(found) > _MOST_STALE * count:
-            write_line_file(self._path, _lines(found.values()), self._older)
-        elif not count:
-            remove_older(self._path, self._older)
-        for run_id, each in found.items():
-            if each.row is not None:
-                each.row.log = log_of(self.store, run_id)
-        return list(found.values()), [run_id for run_id in stored if run_id not in found]
+        stored = self.store.ids()
+        rows = []
+        for run_id, text in self.store.index.read(self._name, self._version, stored, check_links=True).items():
+            with suppress(ValueError):
+                state, value = json.loads(text)
+                row = _ROW.validate_python(value)
+                if row is None or (row.run_id, row.protocol_digest) == (run_id, self._protocol.digest()):
+                    rows.append(CachedRow(run_id, str(state), row))
+        for cached in rows:
+            if cached.row is not None:
+                cached.row.log = log_of(self.store, cached.run_id)
+        there = {cached.run_id for cached in rows}
+        return rows, [run_id for run_id in stored if run_id not in there]
 
     def take_all(self, run_ids: Iterable[str], told: Callable[[str], None]) -> tuple[list[CachedRow], list[str]]:
         """Read some runs, score them, and keep their rows for later reports, as far as the store can be written.
@@ -434,64 +402,19 @@ class RowCache:
         unreadable: list[str] = []
         for run_id in run_ids:
             try:
-                known = self._take(run_id)
-                taken.append(known)
-                told("" if known.row is None else f"scoring {known.row.tracker} on {known.row.sequence}")
+                record, state = self.store.read_with_state(run_id)
+                row = None if record.status == "stopped" else make_row(self.store, record, self._protocol)
+                taken.append(CachedRow(run_id, state, row))
+                told("" if row is None else f"scoring {row.tracker} on {row.sequence}")
             except DynslamError as error:
                 unreadable.append(f"{self.store.folder(run_id)}: {error}")
                 told("")
-        if taken:
-            add_lines(self._path, _lines(taken))
+        entries = []
+        for cached in taken:
+            value = None if cached.row is None else cached.row.model_dump(mode="json", exclude={"log"})
+            entries.append((cached.run_id, cached.state, json.dumps([cached.state, value])))
+        self.store.index.write(self._name, self._version, entries)
         return taken, unreadable
-
-    def _take(self, run_id: str) -> CachedRow:
-        """Read a run and score it.
-
-        Raises:
-            DynslamError: It has no valid record.
-        """
-        run_state = self._run_state(run_id)  # before anything is read
-        record = self.store.read_whole(run_id)
-        part = record.sequence.part
-        try:
-            part_state = self._part_state(part)
-        except DynslamError:  # why the run cannot be evaluated
-            part_state = ""
-        row = None if record.status == "stopped" else make_row(self.store, record, self._protocol)
-        scored = self._scored(run_id)  # errors that were missing or out of date have just been written
-        return CachedRow(run_id, part, run_state, part_state, scored, row)
-
-    def _holds(self, known: CachedRow) -> bool:
-        """Whether nothing has changed of what a row was taken from, and it is that of its run."""
-        row = known.row
-        if row is not None and (row.run_id, row.protocol_digest) != (known.run_id, self._digest):
-            return False
-        try:
-            return (
-                known.scored == self._scored(known.run_id)
-                and known.run_state == self._run_state(known.run_id)
-                and known.part_state == self._part_state(known.part)
-            )
-        except DynslamError:  # there is a link by now
-            return False
-
-    def _scored(self, run_id: str) -> Stamp:
-        return stamp_if_there(f"{self.store.root}/metrics/{self._digest}/{run_id}.json")
-
-    def _run_state(self, run_id: str) -> str:
-        return folder_state(f"{self.store.runs}/{run_id}", self.store.root)
-
-    def _part_state(self, part: str) -> str:
-        """Of the files of a part when they were first asked for."""
-        if part not in self._part_states:
-            self._part_states[part] = folder_state(f"{self.store.root}/sequences/{part}", self.store.root)
-        return self._part_states[part]
-
-
-def _lines(rows: Iterable[CachedRow]) -> Iterator[str]:
-    for row in rows:
-        with suppress(ValueError):  # half characters, of the name of a folder: it is read every time
-            yield row.line()
 
 
 # Helper processes of a report: thousands of runs are read, scored and drawn on all cores.

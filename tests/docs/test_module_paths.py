@@ -7,13 +7,11 @@ from pathlib import Path
 from documented_names import ROOT
 from module_paths import is_there, taken
 
-from dynslam_bench.core.moved import MOVED
-
 GROUPS = {f"dynslam_bench.{name}" for name in ("segmenters", "filters", "features", "flow", "sequences", "trackers")}
 """Groups of entry points: not all of them are rooms."""
 
 
-OLD = (*GROUPS, *MOVED)
+OLD = tuple(GROUPS)
 
 
 def test_every_path_leads_somewhere() -> None:

@@ -10,11 +10,9 @@ import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam import atlas as map_store
-from dynslam_bench.slam import map_files as saved_map
-from dynslam_bench.slam import map_files as saved_map_faults
 from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 
-from .records import rezipped
+from .mutate import mutate_zip
 from .target import Target, at
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
@@ -74,12 +72,4 @@ def _read(data: bytes | None, folder: Path) -> None:
     world.remove_keyframe(int(world.keyframes[0]))
 
 
-TARGETS = [
-    Target(
-        "map of a run",
-        _read,
-        _seeds,
-        (saved_map.read_map, saved_map_faults, map_store.restored, map_store._table, map_store._submaps),
-        rezipped,
-    )
-]
+TARGETS = [Target("map of a run", _read, _seeds, mutate_zip)]

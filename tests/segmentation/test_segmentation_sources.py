@@ -15,7 +15,7 @@ import pytest
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
-from dynslam_bench.core import download_progress
+from dynslam_bench.core import download as download_progress
 from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.core.settings import apply_overrides, build, parameters

@@ -20,8 +20,7 @@ import pytest
 from sequence_folders import make_folder
 
 from dynslam_bench.core.errors import SequenceError, TrajectoryError
-from dynslam_bench.core.image_header import image_size
-from dynslam_bench.core.images import read_image
+from dynslam_bench.core.images import image_size, read_image
 from dynslam_bench.geometry.trajectory_files import load_tum
 from dynslam_bench.sequences import archives, open_sequence
 from dynslam_bench.sequences.fetch import MANIFEST, verify

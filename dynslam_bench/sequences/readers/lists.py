@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.image_header import image_size
+from dynslam_bench.core.images import image_size
 from dynslam_bench.core.reading import MEGABYTE, read_bytes, read_lines
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.stamps import format_ns, ns_of, parse_ns, refuse_close, to_seconds
