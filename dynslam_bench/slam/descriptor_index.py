@@ -1,7 +1,7 @@
-"""An inverted index of the keyframes' descriptors: which features have a piece of theirs in common with a frame's.
+"""Inverted index of binary descriptors by their 16-bit substrings (multi-index hashing: Norouzi, Punjani, Fleet 2012).
 
-Looking at every feature of every keyframe takes as long as there are keyframes; the index goes to those alone that
-share something (Sivic and Zisserman, Video Google, ICCV 2003, with words for pieces).
+Scoring every feature of every keyframe takes as long as there are keyframes; the index visits those alone that share a
+substring with the frame (inverted files: Sivic and Zisserman, Video Google, ICCV 2003).
 """
 
 from __future__ import annotations
@@ -12,96 +12,93 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import kernel
 
 VALUES = 1 << 16
-"""Values of a piece."""
-EVERY = 4
-"""Only every so many-th piece is looked at: the others change the ranking little and cost as much again."""
-ROOM = 256
-"""Features are given room in steps of so many."""
+"""Values of a substring."""
+STRIDE = 4
+"""Every fourth substring is indexed: the others change the ranking little and cost as much again."""
+FEATURE_STEP = 256
+"""The capacity for features grows in steps of so many."""
 SLOTS = 640
-"""Keyframes that there is room for at once: as many as are kept by default, and some that come and go."""
+"""Initial capacity for keyframes: as many as are kept by default, and some more."""
 BLOCK = 8
-"""Numbers in a block of a list: the block that goes on, and keyframes. It is half a line of the processor's cache, so
-that a list is read in as few places of the memory as can be."""
+"""Numbers in a block of a list: the next block, then keyframes. Half a cache line, so that a list is read fast."""
 CHANGED = 0.25
-"""A keyframe that has gained or lost this share of its points is taken up anew."""
+"""A keyframe is indexed again when it has gained or lost this share of its points."""
 
-Pieces = NDArray[np.uint16]
+Substrings = NDArray[np.uint16]
 Ints = NDArray[np.int32]
 Slots = NDArray[np.int64]
 
 
 class DescriptorIndex:
-    """Lists of keyframes by the pieces of their descriptors: once for each feature that observes a point.
-
-    Keyframes that came and went, and those whose points are others by now, are seen to when it is asked.
-    """
+    """Lists of keyframes by descriptor substring, one entry for each feature that observes a point."""
 
     def __init__(self) -> None:
-        self._begin(0, 0, 0)
+        self._reset(0, 0, 0)
 
-    def _begin(self, slots: int, features: int, places: int) -> None:
+    def _reset(self, slots: int, features: int, positions: int) -> None:
         self._ids = np.full(slots, -1, np.int64)
         self._counts = np.zeros(slots, np.int64)
-        self._pieces = np.full((slots, features, places), 0, np.uint16)  # in memory from now on: it does not grow
-        self._first = np.full((places, VALUES), -1, np.int32)
-        self._blocks = np.full((2 * places * VALUES, BLOCK), -1, np.int32)
+        self._substrings = np.full((slots, features, positions), 0, np.uint16)
+        self._first = np.full((positions, VALUES), -1, np.int32)
+        self._blocks = np.full((2 * positions * VALUES, BLOCK), -1, np.int32)
         self._free = np.arange(len(self._blocks), dtype=np.int32)
         self._freed = len(self._free)
 
-    def renew(self, alive: NDArray[np.bool_], ids: Slots, kf_point: Ints, pieces: Pieces) -> None:
-        """Take up the keyframes of now.
+    def update(self, alive: NDArray[np.bool_], ids: Slots, kf_point: Ints, words: NDArray[np.uint64]) -> None:
+        """Index new and changed keyframes, and remove the culled ones.
 
         Args:
-            alive: Of each slot, whether a keyframe is there ``[S]``.
-            ids: Of each slot, its keyframe's ``[S]``.
+            alive: Of each slot, whether it holds a keyframe ``[S]``.
+            ids: Of each slot, its keyframe's id ``[S]``.
             kf_point: Of each slot and feature the point that it observes ``[S, F]``; those with -1 do not count.
-            pieces: Pieces of their descriptors ``[S, F, P]``.
+            words: Descriptors ``[S, F, W]``.
         """
-        slots, features, places = pieces.shape
-        if slots > len(self._ids) or features > self._pieces.shape[1] or places != self._pieces.shape[2]:
-            self._begin(max(slots, SLOTS), -(-features // ROOM) * ROOM, places)
-        known = np.full(len(self._ids), -1, np.int64)
-        known[:slots] = np.where(alive, ids, -1)
-        changed = known != self._ids
+        substrings = words.view(np.uint16)[:, :, ::STRIDE]
+        slots, features, positions = substrings.shape
+        if slots > len(self._ids) or features > self._substrings.shape[1] or positions != self._substrings.shape[2]:
+            self._reset(max(slots, SLOTS), -(-features // FEATURE_STEP) * FEATURE_STEP, positions)
+        current = np.full(len(self._ids), -1, np.int64)
+        current[:slots] = np.where(alive, ids, -1)
+        changed = current != self._ids
         changed[:slots] |= np.abs(_observed(kf_point, alive) - self._counts[:slots]) > CHANGED * self._counts[:slots]
         for slot in np.flatnonzero(changed).tolist():
-            old = self._pieces[slot, : self._counts[slot]]
-            self._freed = _take_out(self._first, self._blocks, self._free, self._freed, old, slot)
-            rows = np.flatnonzero(kf_point[slot] >= 0) if known[slot] >= 0 else np.zeros(0, np.int64)
-            self._ids[slot], self._counts[slot] = known[slot], len(rows)
+            old = self._substrings[slot, : self._counts[slot]]
+            self._freed = _remove(self._first, self._blocks, self._free, self._freed, old, slot)
+            rows = np.flatnonzero(kf_point[slot] >= 0) if current[slot] >= 0 else np.zeros(0, np.int64)
+            self._ids[slot], self._counts[slot] = current[slot], len(rows)
             if not len(rows):
                 continue
-            self._pieces[slot, : len(rows)] = pieces[slot, rows]
-            self._make_room(len(rows) * places)
-            new = self._pieces[slot, : len(rows)]
-            self._freed = _put_in(self._first, self._blocks, self._free, self._freed, new, slot)
+            self._substrings[slot, : len(rows)] = substrings[slot, rows]
+            self._reserve(len(rows) * positions)
+            new = self._substrings[slot, : len(rows)]
+            self._freed = _insert(self._first, self._blocks, self._free, self._freed, new, slot)
 
-    def _make_room(self, blocks: int) -> None:
-        """See that so many blocks are free; there are a quarter more then, if not more are asked for."""
+    def _reserve(self, blocks: int) -> None:
+        """See that so many blocks are free; adds at least a quarter of the capacity."""
         if self._freed >= blocks:
             return
-        had, more = len(self._blocks), max(len(self._blocks) // 4, blocks)
+        before, more = len(self._blocks), max(len(self._blocks) // 4, blocks)
         self._blocks = np.concatenate([self._blocks, np.full((more, BLOCK), -1, np.int32)])
-        free = np.zeros(had + more, np.int32)
-        free[: self._freed] = self._free[: self._freed]
-        free[self._freed : self._freed + more] = np.arange(had, had + more)
-        self._free, self._freed = free, self._freed + more
+        self._free = np.concatenate([self._free[: self._freed], np.arange(before, before + more, dtype=np.int32)])
+        self._free = np.concatenate([self._free, np.zeros(before - self._freed, np.int32)])
+        self._freed += more
 
-    def score(self, slots: Slots, own: Pieces) -> tuple[NDArray[np.float64], Slots]:
-        """For each of the keyframes ``[K]`` the sum of the weights of what it shares with a frame, and its points.
+    def score(self, slots: Slots, words: NDArray[np.uint64]) -> tuple[NDArray[np.float64], Slots]:
+        """For each of the keyframes ``[K]`` the sum of the weights of the shared substrings, and its number of points.
 
-        A piece weighs the logarithm of how much rarer it is than all of the frame's pieces together.
+        The weight is the logarithm of how much rarer a substring is than all of the frame's together.
 
         Args:
             slots: Of the keyframes.
-            own: The frame's pieces ``[N, P]``.
+            words: The frame's descriptors ``[N, W]``.
         """
-        values = [np.unique(own[:, place]) for place in range(own.shape[1])]
-        place = np.repeat(np.arange(len(values)), [len(each) for each in values])
+        substrings = np.ascontiguousarray(words).view(np.uint16)[:, ::STRIDE]
+        values = [np.unique(column) for column in substrings.T]
+        position = np.repeat(np.arange(len(values)), [len(column) for column in values])
         row = np.full(len(self._ids), -1, np.int32)
         row[slots] = np.arange(len(slots), dtype=np.int32)
-        lists = self._first, self._blocks, place, np.concatenate(values)
-        return _score(*lists, row, len(slots)), self._counts[slots]
+        score = _score(self._first, self._blocks, position, np.concatenate(values), row, len(slots))
+        return score, self._counts[slots]
 
 
 @kernel
@@ -116,16 +113,16 @@ def _observed(kf_point: Ints, alive: NDArray[np.bool_]) -> Slots:
 
 
 @kernel
-def _put_in(first: Ints, blocks: Ints, free: Ints, freed: int, pieces: Pieces, slot: int) -> int:
-    """List a keyframe; how many blocks are free then. A list begins with the block that has room, if one has."""
-    for place in range(pieces.shape[1]):
-        for feature in range(pieces.shape[0]):
-            value = pieces[feature, place]
-            head = first[place, value]
+def _insert(first: Ints, blocks: Ints, free: Ints, freed: int, substrings: Substrings, slot: int) -> int:
+    """Insert a keyframe; returns how many blocks are free then. The first block of a list is the one with room."""
+    for position in range(substrings.shape[1]):
+        for feature in range(substrings.shape[0]):
+            value = substrings[feature, position]
+            head = first[position, value]
             if head < 0 or blocks[head, BLOCK - 1] >= 0:
                 freed -= 1
                 blocks[free[freed], 0] = head
-                head = first[place, value] = free[freed]
+                head = first[position, value] = free[freed]
             at = 1
             while blocks[head, at] >= 0:
                 at += 1
@@ -134,45 +131,47 @@ def _put_in(first: Ints, blocks: Ints, free: Ints, freed: int, pieces: Pieces, s
 
 
 @kernel
-def _take_out(first: Ints, blocks: Ints, free: Ints, freed: int, pieces: Pieces, slot: int) -> int:
-    """Take a keyframe from the lists; how many blocks are free then. The last in the first block fills the gap."""
-    for place in range(pieces.shape[1]):
-        for feature in range(pieces.shape[0]):
-            value = pieces[feature, place]
-            head = first[place, value]
+def _remove(first: Ints, blocks: Ints, free: Ints, freed: int, substrings: Substrings, slot: int) -> int:
+    """Remove a keyframe; returns how many blocks are free then. The last entry of the first block fills the gap."""
+    for position in range(substrings.shape[1]):
+        for feature in range(substrings.shape[0]):
+            value = substrings[feature, position]
+            head = first[position, value]
             last = BLOCK - 1
             while blocks[head, last] < 0:
                 last -= 1
-            block, found = head, False
-            while not found:
+            block, removed = head, False
+            while not removed:
                 for at in range(1, BLOCK):
                     if blocks[block, at] == slot:
                         blocks[block, at] = blocks[head, last]
-                        found = True
+                        removed = True
                         break
                 block = blocks[block, 0]
             blocks[head, last] = -1
             if last == 1:
-                first[place, value] = blocks[head, 0]
+                first[position, value] = blocks[head, 0]
                 free[freed] = head
                 freed += 1
     return freed
 
 
 @kernel
-def _score(first: Ints, blocks: Ints, places: Slots, values: Pieces, row: Ints, rows: int) -> NDArray[np.float64]:
-    score, own, shared = np.zeros(rows), np.zeros(len(values), np.int64), 0
+def _score(
+    first: Ints, blocks: Ints, positions: Slots, values: Substrings, row: Ints, rows: int
+) -> NDArray[np.float64]:
+    score, counts, total = np.zeros(rows), np.zeros(len(values), np.int64), 0
     for k in range(len(values)):
-        block = first[places[k], values[k]]
+        block = first[positions[k], values[k]]
         while block >= 0:
             for at in range(1, BLOCK):
                 slot = blocks[block, at]
-                own[k] += slot >= 0 and row[slot] >= 0
+                counts[k] += slot >= 0 and row[slot] >= 0
             block = blocks[block, 0]
-        shared += own[k]
+        total += counts[k]
     for k in range(len(values)):
-        block = first[places[k], values[k]] if own[k] else -1
-        weight = np.log(shared / max(own[k], 1))
+        block = first[positions[k], values[k]] if counts[k] else -1
+        weight = np.log(total / max(counts[k], 1))
         while block >= 0:
             for at in range(1, BLOCK):
                 slot = blocks[block, at]
