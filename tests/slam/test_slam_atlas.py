@@ -168,7 +168,5 @@ def test_the_motion_continues_in_the_camera_frame_where_a_loop_transforms_the_wo
     assert np.allclose(moved.position, 2.0 * transform[:3, :3] @ state.position)
     assert np.array_equal(moved.speed[3:], state.speed[3:])
     assert np.allclose(np.linalg.eigvalsh(moved.covariance[6:9, 6:9]), 4.0 * np.array([0.1, 0.2, 0.3]))
-    steps = [
-        s.T_cam_world @ se3.inverse(s.predicted(0.1, MotionModelSettings()).T_cam_world) for s in (moved, state)
-    ]
+    steps = [s.T_cam_world @ se3.inverse(s.predicted(0.1, MotionModelSettings()).T_cam_world) for s in (moved, state)]
     assert np.allclose(steps[0][:3, :3], steps[1][:3, :3]) and np.allclose(steps[0][:3, 3], 2.0 * steps[1][:3, 3])

@@ -145,9 +145,7 @@ def rotation_alone(room):
         (rotation_alone, {}, {}, 0.02),
         (lambda room: room.path(40), {}, {"wrong": 500}, 0.03),  # 500 of 700 fit nothing
         (lambda room: room.path(40), {"bundle_adjustment__solver": "schur"}, {}, 0.015),
-        pytest.param(
-            lambda room: room.path(40), {"bundle_adjustment__solver": "gtsam"}, {}, 0.015, marks=NEEDS_GTSAM
-        ),
+        pytest.param(lambda room: room.path(40), {"bundle_adjustment__solver": "gtsam"}, {}, 0.015, marks=NEEDS_GTSAM),
     ],
 )
 def test_other_paths_noise_and_solvers(room, path, settings, noise, limit):
@@ -239,9 +237,7 @@ def test_views_and_points_fit_each_other(room):
 def test_the_number_of_keyframes_is_bounded_and_those_around_the_camera_stay(room):
     """They overlap most: when they were culled first, the local error grew tenfold on long paths."""
     most, truth = 16, room.path(240)
-    backend = make_backend(
-        room, keyframes__maximum=most, keyframes__tracked_share=1.0, keyframes__redundant_share=1.0
-    )
+    backend = make_backend(room, keyframes__maximum=most, keyframes__tracked_share=1.0, keyframes__redundant_share=1.0)
     made, results = [], []
     for index, pose in enumerate(truth):
         results += track_all(backend, [room.see(pose, index)])

@@ -67,7 +67,9 @@ def reference_scores(world, keyframes, features):
     scores = []
     for slot, columns in zip(keyframes.tolist(), shared, strict=True):
         weights = [
-            np.log(total / np.count_nonzero(everything[p] == value)) for p, column in enumerate(columns) for value in column
+            np.log(total / np.count_nonzero(everything[p] == value))
+            for p, column in enumerate(columns)
+            for value in column
         ]
         scores.append(sum(weights) / np.sqrt(max(np.count_nonzero(world.kf_point[slot] >= 0), 1)))
     return np.array(scores)
