@@ -40,7 +40,7 @@ class Map:
         it has, where they begin in obs_kf and obs_ft, and how many it has room for there).
 
     Attributes (others):
-        index: Inverted index of the keyframes' descriptors.
+        index: Sorted substrings of the keyframes' descriptors.
 
     Attributes (observations ``[O]``, those of each point in a row, oldest first):
         obs_kf, obs_ft (observing keyframe slots and feature numbers).

@@ -95,32 +95,8 @@ def test_the_index_follows_keyframes_that_come_and_go(room, seed):
     assert compared > 8
 
 
-def words_of(substrings):
-    """Descriptors whose first indexed substring is given."""
-    words = np.zeros((*substrings.shape, 1), np.uint64)
-    words.view(np.uint16)[..., 0] = substrings
-    return words
-
-
-@pytest.mark.parametrize("values", [1 << 16, 300])
-def test_the_index_grows_with_any_number_of_substrings(values):
-    """More than its first capacity; of all values, or crowded on few."""
-    rng, slots, features = np.random.default_rng(0), 640, 2400
-    substrings = rng.integers(0, values, (slots, features)).astype(np.uint16)
-    kf_point = np.where(rng.random((slots, features)) < 0.9, 7, -1).astype(np.int32)
-    index, ids, query = DescriptorIndex(), np.arange(slots), rng.integers(0, values, 500).astype(np.uint16)
-    index.update(np.ones(slots, bool), ids, kf_point, words_of(substrings))
-    score, points = index.score(ids, words_of(query))
-    np.testing.assert_array_equal(points, (kf_point >= 0).sum(axis=1))
-    held = np.array([np.bincount(substrings[k, kf_point[k] >= 0], minlength=values) for k in ids])[:, np.unique(query)]
-    weight = np.log(held.sum() / np.maximum(held.sum(axis=0), 1))
-    np.testing.assert_allclose(score, held @ weight, rtol=1e-9)
-    index.update(np.zeros(slots, bool), ids, kf_point, words_of(substrings))
-    assert not index.score(ids, words_of(query))[0].any()
-
-
 def test_a_keyframe_is_indexed_again_when_many_of_its_points_changed():
-    words, ids, alive = words_of(np.arange(100).reshape(1, 100)), np.zeros(1, np.int64), np.ones(1, bool)
+    words, ids, alive = np.arange(100, dtype=np.uint64).reshape(1, 100, 1), np.zeros(1, np.int64), np.ones(1, bool)
     index, kf_point = DescriptorIndex(), np.full((1, 100), 3, np.int32)
     most = round(100 * CHANGED)
     for removed, counted in ((0, 100), (most, 100), (most + 1, 99 - most), (60, 40)):
