@@ -158,8 +158,8 @@ class RgbdBackend:
         assert self._ready, "reset() comes before track()"
         begin = perf_counter()
         self.resume()
-        seen = observe(frame, keep, weight, self.camera, self._features.scales)
-        result = self._track(frame, seen) if self.world.next_keyframe else self._initialise(frame, seen)
+        observations = observe(frame, keep, weight, self.camera, self._features.scales)
+        result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
         tracking = perf_counter() - begin - sum(result.timings.values())
         stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
         return replace(result, timings={**stages, **result.timings})
@@ -167,9 +167,9 @@ class RgbdBackend:
     def _track(self, frame: FrameBundle, raw: Observations) -> BackendResult:
         """Predict, match the last frame or relocalise, track the local map, insert a keyframe."""
         last, stamp = self._last_frame(frame, raw), frame.timestamp
-        seen = self.shutter.predicted(raw, last, stamp) if self._rolling else raw
+        observations = self.shutter.predicted(raw, last, stamp) if self._rolling else raw
         prediction = self.motion.predicted(last, stamp)
-        search = self._search(frame, raw, seen, last, prediction)
+        search = self._search(frame, raw, observations, last, prediction)
         root = search.in_root_map()
         initial = search.run()
         if initial is None and root is not None:  # the camera is lost in the submap, and found in the root map
@@ -180,18 +180,18 @@ class RgbdBackend:
             return self._lose(frame, raw, last, prediction)
         _, points = self._local_map.around(initial.keyframe)
         tracking = self.settings.tracking
-        fit = track_local_map(self.world, seen, initial.matches, initial.T_cam_world, points, tracking)
+        fit = track_local_map(self.world, observations, initial.matches, initial.T_cam_world, points, tracking)
         velocity = None
         if self._rolling:
             force = self._first is not None
-            seen, fit, velocity = self.shutter.refitted(raw, seen, fit, last, stamp, force=force)
+            observations, fit, velocity = self.shutter.refitted(raw, observations, fit, last, stamp, force=force)
         if self._grows:
             self.world.visible[fit.in_view] += 1
         required = tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
         if fit.count < required or not np.isfinite(fit.estimate.T_cam_world).all():
             result = self._lose(frame, raw, last, prediction)
         else:
-            tracked = self._accept(frame, seen, fit, last)
+            tracked = self._accept(frame, observations, fit, last)
             self.shutter.velocity = velocity
             first, self._first = self._first, None
             if first is not None and velocity is not None:
@@ -200,7 +200,7 @@ class RgbdBackend:
         return replace(result, matches=len(fit.matches), inliers=fit.count, relocalised=initial.relocalised)
 
     def _search(
-        self, frame: FrameBundle, raw: Observations, seen: Observations, last: TrackedFrame, prediction: Array
+        self, frame: FrameBundle, raw: Observations, observations: Observations, last: TrackedFrame, prediction: Array
     ) -> PoseSearch:
         """The search for the frame's initial pose: what the camera can see, and where it can be."""
         bound: partial[MotionBound]
@@ -212,18 +212,18 @@ class RgbdBackend:
             keyframes = keyframes[np.isin(self.world.kf_map[keyframes], (0, self.atlas.active))]
             bound = partial(self._gate.while_lost, last, raw, frame.timestamp)
         return PoseSearch(
-            self.atlas, seen, last, prediction, self._reference, keyframes, not self._tracked, cache(bound),
+            self.atlas, observations, last, prediction, self._reference, keyframes, not self._tracked, cache(bound),
             self.settings, self.seed, frame.index,
         )  # fmt: skip
 
-    def _last_frame(self, frame: FrameBundle, seen: Observations) -> TrackedFrame:
+    def _last_frame(self, frame: FrameBundle, observations: Observations) -> TrackedFrame:
         """The last tracked frame; an empty one before the camera is found in a loaded map."""
         if self._last is not None:
             return self._last
-        if len(seen) and 8 * seen.words.shape[1] != self.world.descriptor_bytes:
+        if len(observations) and 8 * observations.words.shape[1] != self.world.descriptor_bytes:
             raise TrackerError(
                 f"the map's descriptors have {self.world.descriptor_bytes} bytes, frame {frame.index}'s "
-                f"{8 * seen.words.shape[1]}",
+                f"{8 * observations.words.shape[1]}",
                 "make the map with the same features",
             )
         none = observe(
@@ -231,35 +231,37 @@ class RgbdBackend:
         )
         return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
-    def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:
+    def _accept(self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:
         """The frame is tracked: its pose is weighed against the motion model, its inliers count as found."""
         points = fit.matches.point[fit.inliers]
         if self._grows:
             self.world.found[points] += 1
-        point = np.full(len(seen), -1, np.int64)
+        point = np.full(len(observations), -1, np.int64)
         point[fit.matches.feature[fit.inliers]] = points
         pose = self.motion.filtered(last, frame.timestamp, fit.estimate.T_cam_world, fit.estimate.information)
         self._tracked, self._unrecognised = True, 0
-        self._last = tracked = TrackedFrame(seen, point, pose, frame.timestamp)
+        self._last = tracked = TrackedFrame(observations, point, pose, frame.timestamp)
         near, _ = self.world.covisible_of(points)
         if len(near):
             self._reference = int(near[0])
         self._update_state()
         return tracked
 
-    def _lose(self, frame: FrameBundle, seen: Observations, last: TrackedFrame, prediction: Array) -> BackendResult:
+    def _lose(
+        self, frame: FrameBundle, observations: Observations, last: TrackedFrame, prediction: Array
+    ) -> BackendResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
         self.state, self._first = "lost", None
-        textured = self._usable_features(seen) >= MIN_INITIAL
+        textured = self._usable_features(observations) >= MIN_INITIAL
         if self._tracked:
-            self._gate.lose(last, seen, textured=textured)
+            self._gate.lose(last, observations, textured=textured)
         self._tracked = False
         self._forget_motion()
         self._unrecognised = self._unrecognised + 1 if textured else 0
         enough = self._unrecognised >= self.settings.relocalisation.new_map_after
         begun = None
         if enough and self._grows and self.settings.loop_closing.enabled:
-            begun = self._begin_submap(frame, seen, last)
+            begun = self._begin_submap(frame, observations, last)
         return begun or self._result(None if self._last is None else prediction)
 
     def _forget_motion(self) -> None:
@@ -291,22 +293,24 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ beginning a map
 
-    def _initialise(self, frame: FrameBundle, seen: Observations) -> BackendResult:
+    def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
-        if np.count_nonzero(seen.z > 0) < MIN_INITIAL:
+        if np.count_nonzero(observations.z > 0) < MIN_INITIAL:
             return self._result(None)
-        result = self._begin_map(frame, seen, np.eye(4))
-        self._first = (frame, seen) if self._rolling else None
+        result = self._begin_map(frame, observations, np.eye(4))
+        self._first = (frame, observations) if self._rolling else None
         return result
 
-    def _usable_features(self, seen: Observations) -> int:
+    def _usable_features(self, observations: Observations) -> int:
         """How many features a map could begin with."""
-        return int(np.count_nonzero(seen.z > 0))
+        return int(np.count_nonzero(observations.z > 0))
 
-    def _begin_map(self, frame: FrameBundle, seen: Observations, T_cam_world: Array) -> BackendResult:
+    def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> BackendResult:
         """The frame becomes the first keyframe of the active map."""
         self._tracked = True
-        self._last = tracked = TrackedFrame(seen, np.full(len(seen), -1, np.int64), T_cam_world, frame.timestamp)
+        self._last = tracked = TrackedFrame(
+            observations, np.full(len(observations), -1, np.int64), T_cam_world, frame.timestamp
+        )
         timings = self._insert_keyframe(frame, tracked)
         self._update_state()
         self.history.append(frame.timestamp, self._reference, np.eye(4), KNOWN_POSE)
@@ -328,17 +332,17 @@ class RgbdBackend:
         for assumed in (velocity, None):
             self.reset(self.camera, self.seed)
             self.shutter.velocity = assumed
-            seen = first[1] if assumed is None else compensate_rolling_shutter(first[1], self.camera, assumed)
-            self._begin_map(first[0], seen, np.eye(4))
+            observations = first[1] if assumed is None else compensate_rolling_shutter(first[1], self.camera, assumed)
+            self._begin_map(first[0], observations, np.eye(4))
             result = self._track(frame, raw)
             if result.state == "ok" and result.inliers >= MIN_AGREEING * inliers:
                 break
         return result
 
-    def _begin_submap(self, frame: FrameBundle, seen: Observations, last: TrackedFrame) -> BackendResult | None:
+    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
         """Begin a submap where the camera was lost, rotated as the images tell; None if not yet."""
         self._note_submap(last, frame.timestamp)
-        return self._begin_map(frame, seen, self._gate.rotated(last))
+        return self._begin_map(frame, observations, self._gate.rotated(last))
 
     def _note_submap(self, last: TrackedFrame, timestamp: float) -> None:
         """A submap begins with the frame of this stamp."""
@@ -368,7 +372,7 @@ class RgbdBackend:
         # the camera is in the root map, too: there its pose counts, and it may continue there
         self.history.reanchor_newest(self.world, root.keyframe, root.T_cam_world)
         if self.loops.leaves_submap:
-            point = np.full(len(tracked.seen), -1, np.int64)
+            point = np.full(len(tracked.observations), -1, np.int64)
             point[root.matches.feature] = np.where(self.world.alive[root.matches.point], root.matches.point, -1)
             self._last, self._reference = replace(tracked, point=point, T_cam_world=root.T_cam_world), root.keyframe
             self._forget_motion()
@@ -381,7 +385,7 @@ class RgbdBackend:
         """Make a tracked frame a keyframe, with bundle adjustment and loop closing; returns seconds by stage."""
         world, mapper = self.world, self.mapper
         slot, timings = mapper.insert(
-            tracked.seen, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp, self.atlas.active
+            tracked.observations, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp, self.atlas.active
         )
         self._reference = slot
         for culled, replacement, relative in mapper.culled:
@@ -389,14 +393,14 @@ class RgbdBackend:
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             before = world.kf_pose[slot].copy()
-            self.loops.close(slot, tracked.seen, root)
+            self.loops.close(slot, tracked.observations, root)
             self.history.rescale(self.loops.rescaled)
             if slot in self.loops.rescaled:  # the rotation by a loop with depth is within the motion's noise
                 self.motion.transformed(before, world.kf_pose[slot], self.loops.rescaled[slot])
             timings["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
         self._views.add_keyframe(slot, frame.depth)
-        tracked.point = world.kf_point[slot, : len(tracked.seen)].astype(np.int64)
+        tracked.point = world.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = world.kf_pose[slot].copy()
         world.release()
         return timings
@@ -494,23 +498,23 @@ class MonocularBackend(RgbdBackend):
         super().reset(camera, seed)
         self._initialiser = TwoViewInitialiser()
 
-    def _initialise(self, frame: FrameBundle, seen: Observations) -> BackendResult:
+    def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
         """Frames are ``initialising`` until one determines the motion together with an earlier one."""
         begin = perf_counter()
-        initial = self._initialiser.add(View(frame, seen), self.camera, self.settings.two_views)
+        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
         if initial is None:
             return self._result(None)
         return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
 
-    def _usable_features(self, seen: Observations) -> int:
-        return len(seen)
+    def _usable_features(self, observations: Observations) -> int:
+        return len(observations)
 
-    def _begin_submap(self, frame: FrameBundle, seen: Observations, last: TrackedFrame) -> BackendResult | None:
+    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
         """Begin a submap as the root map began; its unit of length is the median depth of its own views."""
         begin = perf_counter()
         if self._unrecognised == self.settings.relocalisation.new_map_after:
             self._initialiser = TwoViewInitialiser()
-        initial = self._initialiser.add(View(frame, seen), self.camera, self.settings.two_views)
+        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
         if initial is None:
             return None
         seconds = perf_counter() - begin
@@ -522,11 +526,11 @@ class MonocularBackend(RgbdBackend):
     def _begin_from_two(self, initial: InitialMap, T_first_world: Array, seconds: float) -> BackendResult:
         """The two views become keyframes; the second, which is the current frame, is tracked."""
         first, second = initial.insert_into(self.world, T_first_world, self.atlas.active)
-        frame, seen, pose = initial.second.frame, initial.second.seen, self.world.kf_pose[second].copy()
+        frame, observations, pose = initial.second.frame, initial.second.observations, self.world.kf_pose[second].copy()
         self._initialiser = TwoViewInitialiser()
         self._tracked = True
-        point = self.world.kf_point[second, : len(seen)].astype(np.int64)
-        self._last = TrackedFrame(seen, point, pose, frame.timestamp)
+        point = self.world.kf_point[second, : len(observations)].astype(np.int64)
+        self._last = TrackedFrame(observations, point, pose, frame.timestamp)
         self._reference = second
         self._keyframes.made(frame.index)
         self._views.add_keyframe(first, initial.first.frame.depth)

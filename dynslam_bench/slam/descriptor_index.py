@@ -64,7 +64,7 @@ class DescriptorIndex:
         for substrings in keyframes:
             _count(substrings, counts)
         total = np.maximum(counts, 0).sum()
-        weight = np.where(counts > 0, np.log(total / np.maximum(counts, 1)), 0.0)
+        weight = np.where(counts > 0, np.log(max(total, 1) / np.maximum(counts, 1)), 0.0)
         scores = [_sum(substrings, counts, weight) for substrings in keyframes]
         return np.array(scores), np.array([substrings.shape[1] for substrings in keyframes], np.int64)
 

@@ -82,7 +82,7 @@ class Pair:
 class LaterView:
     """A view after the first, and its matches with that one."""
 
-    seen: Observations
+    observations: Observations
     pair: Pair
 
 
@@ -173,7 +173,7 @@ def possible_motions(
     Returns:
         Each refined with its points, lowest cost first; none where too few matches agree with any.
     """
-    second, pair = later[-1].seen, later[-1].pair
+    second, pair = later[-1].observations, later[-1].pair
     xy_first, xy_second = first.xy[pair.first], second.xy[pair.second]
     info = np.minimum(first.info[pair.first], second.info[pair.second])
     of_homography, on_plane = _homography(xy_first, xy_second, info, camera)
@@ -312,13 +312,13 @@ def _adjusted(
     point_of_feature = np.full(len(first), -1, np.int64)
     point_of_feature[pair.first] = np.arange(len(pair))
     columns = []
-    for number, (seen, of_first, feature) in enumerate(
-        [(first, pair.first, pair.first), *((view.seen, view.pair.first, view.pair.second) for view in later)]
+    for number, (observations, of_first, feature) in enumerate(
+        [(first, pair.first, pair.first), *((view.observations, view.pair.first, view.pair.second) for view in later)]
     ):
         point = point_of_feature[of_first]
         rows = feature[point >= 0]
         point = point[point >= 0]
-        columns.append((np.full(len(rows), number), point, seen.xy[rows], seen.info[rows]))
+        columns.append((np.full(len(rows), number), point, observations.xy[rows], observations.info[rows]))
     view, point, xy, info = (np.concatenate(column) for column in zip(*columns, strict=True))
     order = np.lexsort((view, point))
     view, point, xy, info = view[order], point[order], xy[order], info[order]
@@ -342,7 +342,7 @@ class View:
     """A frame, and its features as the back end uses them."""
 
     frame: FrameBundle
-    seen: Observations
+    observations: Observations
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,11 +363,11 @@ class InitialMap:
         """
         pair = self.motion.pair
         slots = [
-            world.add_keyframe(view.seen, pose, view.frame.index, view.frame.timestamp, submap)
+            world.add_keyframe(view.observations, pose, view.frame.index, view.frame.timestamp, submap)
             for view, pose in ((self.first, T_first_world), (self.second, self.motion.T_second_first @ T_first_world))
         ]
         position = se3.transform(se3.inverse(T_first_world), self.motion.points)
-        points = world.add_points(position, self.first.seen.rgb[pair.first], slots[0], pair.first)
+        points = world.add_points(position, self.first.observations.rgb[pair.first], slots[0], pair.first)
         world.observe(slots[1], pair.second, points)
         world.refresh(points)
         return slots[0], slots[1]
@@ -395,19 +395,23 @@ class TwoViewInitialiser:
             settings: Thresholds of the two views.
         """
         first = self._first
-        pair = None if first is None else match_views(first.seen, view.seen, self._expected, settings.radius_px)
+        pair = (
+            None
+            if first is None
+            else match_views(first.observations, view.observations, self._expected, settings.radius_px)
+        )
         if first is None or pair is None or len(pair) < settings.min_matches:
-            self._first = view if len(view.seen) >= settings.min_matches else None
-            self._expected = view.seen.xy.copy()
+            self._first = view if len(view.observations) >= settings.min_matches else None
+            self._expected = view.observations.xy.copy()
             self.later, self._motions = [], []
             return None
-        self._expected[pair.first] = view.seen.xy[pair.second]
+        self._expected[pair.first] = view.observations.xy[pair.second]
         if len(self.later) >= 2 * VIEWS:
             del self.later[::2]
-        self.later.append(LaterView(view.seen, pair))
+        self.later.append(LaterView(view.observations, pair))
         if len(self.later) < MIN_VIEWS:
             return None
-        motions = possible_motions(first.seen, self.later, camera, settings, self._motions)
+        motions = possible_motions(first.observations, self.later, camera, settings, self._motions)
         self._motions = distinct_motions(motions)[:CARRIED]
         motion = accepted_motion(motions, settings)
         if motion is None:

@@ -63,7 +63,7 @@ class KeyframePolicy:
         s, gap = self.settings, frame - self._last
         if gap <= 0:
             return False
-        close = (tracked.seen.z > 0) & (tracked.seen.z < self._close_m)
+        close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
         matched = tracked.point >= 0
         inliers = int(np.count_nonzero(matched))
         self._most_inliers = max(self._most_inliers, inliers)

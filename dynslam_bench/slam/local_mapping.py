@@ -71,12 +71,12 @@ class LocalMapper:
         self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < YOUNG]
 
     def insert(
-        self, seen: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
+        self, observations: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
     ) -> tuple[int, dict[str, float]]:
         """Make a frame a keyframe: new points, fusion, bundle adjustment, culling.
 
         Args:
-            seen: The frame's features.
+            observations: The frame's features.
             point: Map slot that each feature observes, or -1.
             T_cam_world: The frame's pose.
             frame: Index of the frame.
@@ -90,19 +90,19 @@ class LocalMapper:
         world, s = self.world, self.settings.mapping
         self.culled.clear()
         first = not world.submap(submap).size
-        slot = world.add_keyframe(seen, T_cam_world, frame, stamp, submap)
+        slot = world.add_keyframe(observations, T_cam_world, frame, stamp, submap)
         features = np.flatnonzero(point >= 0)
         world.observe(slot, features, point[features])
         world.refresh(world.points_of(slot))
         self._cull_points()
-        self._points_from_depth(slot, seen, everything=first)
+        self._points_from_depth(slot, observations, everything=first)
         adjusted = 0.0
         if not first:
             neighbours, _ = world.covisible(slot)
             neighbours = neighbours[: s.neighbours]
-            close = np.count_nonzero((seen.z > 0) & (seen.z < self.close_m)) / max(len(seen), 1)
+            close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m)) / max(len(observations), 1)
             if close < s.triangulate_below:
-                self._points_from_views(slot, seen, neighbours)
+                self._points_from_views(slot, observations, neighbours)
             self._fuse(slot, neighbours)
             start = perf_counter()
             self.adjust(slot)
@@ -112,31 +112,38 @@ class LocalMapper:
 
     # ------------------------------------------------------------------ points
 
-    def _points_from_depth(self, slot: int, seen: Observations, *, everything: bool) -> None:
+    def _points_from_depth(self, slot: int, observations: Observations, *, everything: bool) -> None:
         """Points for features without one: all close ones, and the nearest hundred in any case."""
         world = self.world
-        free = np.flatnonzero((world.kf_point[slot, : len(seen)] < 0) & (seen.z > 0))
+        free = np.flatnonzero((world.kf_point[slot, : len(observations)] < 0) & (observations.z > 0))
         if not len(free):
             return
-        free = free[np.argsort(seen.z[free], kind="stable")]
+        free = free[np.argsort(observations.z[free], kind="stable")]
         if not everything:
-            close = int(np.count_nonzero(seen.z[free] < self.close_m))
+            close = int(np.count_nonzero(observations.z[free] < self.close_m))
             free = free[: max(close, MIN_DEPTH_POINTS)]
-        position = se3.transform(world.T_world_cam(slot), world.camera.unproject(seen.xy[free], seen.z[free]))
-        self._add_points(slot, free, position, seen)
+        position = se3.transform(
+            world.T_world_cam(slot), world.camera.unproject(observations.xy[free], observations.z[free])
+        )
+        self._add_points(slot, free, position, observations)
 
-    def _points_from_views(self, slot: int, seen: Observations, neighbours: Slots) -> None:
+    def _points_from_views(self, slot: int, observations: Observations, neighbours: Slots) -> None:
         """Points for features that have no point yet, by triangulation with the neighbours."""
         for other in neighbours.tolist():
             features, others, position = triangulate(self.world, slot, other, self.settings.mapping.min_parallax_sigmas)
             if len(features):
-                self._add_points(slot, features, position, seen, (other, others))
+                self._add_points(slot, features, position, observations, (other, others))
 
     def _add_points(
-        self, slot: int, features: Slots, position: Array, seen: Observations, second: tuple[int, Slots] | None = None
+        self,
+        slot: int,
+        features: Slots,
+        position: Array,
+        observations: Observations,
+        second: tuple[int, Slots] | None = None,
     ) -> None:
         """New points that features of a keyframe observe, and those of a `second` one, if there is one."""
-        created = self.world.add_points(position, seen.rgb[features], slot, features)
+        created = self.world.add_points(position, observations.rgb[features], slot, features)
         if second is not None:
             self.world.observe(*second, created)
         self.world.refresh(created)

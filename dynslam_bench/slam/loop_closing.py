@@ -191,12 +191,12 @@ class LoopCloser:
         self._met_at: int | None = None
         self._loop_edges: list[Edge] = []
 
-    def close(self, slot: int, seen: Observations, root: InitialPose | None = None) -> bool:
+    def close(self, slot: int, observations: Observations, root: InitialPose | None = None) -> bool:
         """Look for a loop at a new keyframe; correct and fuse the map if enough consecutive keyframes agree on one.
 
         Args:
             slot: The keyframe.
-            seen: Its features.
+            observations: Its features.
             root: Its pose in the root map, if the camera is in a submap and was found there.
 
         Returns:
@@ -207,7 +207,7 @@ class LoopCloser:
         for culled, replacement, relative in self.mapper.culled if self._loop_edges else ():
             ids = int(self.world.kf_id[culled]), int(self.world.kf_id[replacement])
             self._loop_edges = transferred_edges(self._loop_edges, *ids, relative)
-        loop = self._verified(slot, seen) if root is None else self._loop_to_root(slot, seen, root)
+        loop = self._verified(slot, observations) if root is None else self._loop_to_root(slot, observations, root)
         self._met_at = self._met_at if self.in_root_map else None
         if loop is None:
             self._row.clear()
@@ -223,7 +223,7 @@ class LoopCloser:
         if not loop.fits:
             self.leaves_submap = self.in_root_map = root is not None
             return False
-        if loop.merges and root is None and self._aliased(slot, seen, loop):
+        if loop.merges and root is None and self._aliased(slot, observations, loop):
             return False
         if loop.merges:
             self._merge(slot, loop)
@@ -248,7 +248,7 @@ class LoopCloser:
         self._last_pose = pose
         self._path[number] = self._path_length
 
-    def _verified(self, slot: int, seen: Observations) -> Loop | None:
+    def _verified(self, slot: int, observations: Observations) -> Loop | None:
         """The first of the best-ranked candidates that is verified."""
         world = self.world
         old = weakly_connected(world, slot)
@@ -257,44 +257,44 @@ class LoopCloser:
         if not len(old):
             return None
         near = np.setdiff1d(around(world, slot)[1:], old)
-        score = recognition_scores(world, np.concatenate([near, old]), seen)
+        score = recognition_scores(world, np.concatenate([near, old]), observations)
         least, score = score[: len(near)].min(initial=np.inf), score[len(near) :]
         rng = stream(self._seed, "loop", int(world.kf_id[slot]))
         for row in np.argsort(-score, kind="stable")[:CANDIDATES]:
             if score[row] < least:
                 continue
-            matches = match_keyframe(world, int(old[row]), seen)
+            matches = match_keyframe(world, int(old[row]), observations)
             if len(matches) < MIN_MATCHES:
                 continue
-            loop = self._verified_candidate(slot, int(old[row]), seen, matches, rng)
+            loop = self._verified_candidate(slot, int(old[row]), observations, matches, rng)
             if loop is not None:
                 return loop
         return None
 
     def _verified_candidate(
-        self, slot: int, candidate: int, seen: Observations, matches: Matches, rng: np.random.Generator
+        self, slot: int, candidate: int, observations: Observations, matches: Matches, rng: np.random.Generator
     ) -> Loop | None:
         """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
         s = self.settings.loop_closing
-        ransac = ransac_matches(matches, seen, self.world.camera, rng, MIN_MATCHES // 2)
+        ransac = ransac_matches(matches, observations, self.world.camera, rng, MIN_MATCHES // 2)
         if ransac is None:
             return None
         pose, inliers = ransac
-        place = verify_place(self.world, candidate, seen, inliers, pose, self.settings.tracking)
+        place = verify_place(self.world, candidate, observations, inliers, pose, self.settings.tracking)
         if len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
             return None
         loop = self._loop(slot, candidate, place)
-        if loop is None or (loop.merges and pose_uncertainty(self.world, seen, place, rng) > MERGE_UNCERTAINTY):
+        if loop is None or (loop.merges and pose_uncertainty(self.world, observations, place, rng) > MERGE_UNCERTAINTY):
             return None
         return loop if self._within_drift(slot, loop) else None
 
-    def _loop_to_root(self, slot: int, seen: Observations, root: InitialPose) -> Loop | None:
+    def _loop_to_root(self, slot: int, observations: Observations, root: InitialPose) -> Loop | None:
         """The loop to the place in the root map where a submap's camera is, if it determines the merge well enough."""
         s, world, frame = self.settings.loop_closing, self.world, int(self.world.kf_frame[slot])
         loop = self._loop(slot, root.keyframe, PlaceMatch(root.T_cam_world, root.matches, root.share))
         if loop is None or not world.kf_alive[root.keyframe]:
             return None
-        if (loop.fits or self._scale_is_known) and self._aliased(slot, seen, loop):
+        if (loop.fits or self._scale_is_known) and self._aliased(slot, observations, loop):
             return None
         precise = root.uncertainty <= MERGE_UNCERTAINTY
         well = loop.inliers >= s.min_inliers and loop.share >= MERGE_SHARE and precise
@@ -351,7 +351,7 @@ class LoopCloser:
         path = correction.scale * on_younger + on_older  # from the meeting place back to where the older was left
         return self.atlas.admits_start(younger, correction.moved, share * path)
 
-    def _aliased(self, slot: int, seen: Observations, loop: Loop) -> bool:
+    def _aliased(self, slot: int, observations: Observations, loop: Loop) -> bool:
         """Whether the keyframe fits two places: nothing but what is seen tells how two maps lie to each other."""
         world = self.world
         here, there = (int(world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
@@ -360,7 +360,7 @@ class LoopCloser:
         hypotheses = {here: PlaceHypothesis(world.kf_pose[slot], loop.share, depth)}
         hypotheses[there] = PlaceHypothesis(loop.T_cam_world, loop.share, depth * loop.scale)
         old = weakly_connected(world, slot)
-        return is_aliased(world, seen, hypotheses, old, self.settings.tracking, self._seed)
+        return is_aliased(world, observations, hypotheses, old, self.settings.tracking, self._seed)
 
     def _path_since(self, slot: int) -> float:
         """The path whose drift adds up since a keyframe: the length since then, or over a closed loop."""

@@ -151,14 +151,16 @@ class Map:
         """Number of maps: the root map, and the submaps that were not merged with it."""
         return len(set(self.kf_map[self.kf_alive].tolist()))
 
-    def add_keyframe(self, seen: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0) -> int:
+    def add_keyframe(
+        self, observations: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
+    ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
-        if seen.words.shape[1] != self._words:
+        if observations.words.shape[1] != self._words:
             if self.next_keyframe:
-                raise ValueError(f"descriptors changed from {self._words} to {seen.words.shape[1]} words")
-            self._words = seen.words.shape[1]
+                raise ValueError(f"descriptors changed from {self._words} to {observations.words.shape[1]} words")
+            self._words = observations.words.shape[1]
             self._allocate()
-        n = len(seen)
+        n = len(observations)
         if n > self._features:
             for name in (*self._FEATURE_TABLES, "kf_point"):
                 self._grow(name, n, axis=1)
@@ -179,9 +181,10 @@ class Map:
         self.kf_stamp[slot] = stamp
         self.kf_count[slot] = n
         self.set_pose(slot, T_cam_world)
+        raw = observations.keypoints
         features = (
-            seen.keypoints.xy, seen.keypoints.response, seen.xy, seen.right, seen.z, seen.octave, seen.angle, seen.info,
-            seen.info_right, seen.words,
+            raw.xy, raw.response, observations.xy, observations.right, observations.z, observations.octave,
+            observations.angle, observations.info, observations.info_right, observations.words,
         )  # fmt: skip
         for name, values in zip(self._FEATURE_TABLES, features, strict=True):
             getattr(self, name)[slot, :n] = values

@@ -273,8 +273,8 @@ def _references(arrays: Arrays) -> Iterator[tuple[Any, str]]:
     yield agree, "observations do not agree with 'kf_point'"
     once = len(np.unique(point * len(arrays["kf_id"]) + keyframe)) == len(row)
     yield once, "a keyframe observes a point with two features"
-    known = np.count_nonzero(arrays["kf_point"] >= 0) == len(row)
-    yield known, "'kf_point' names points that have no such observation"
+    matched = np.count_nonzero(arrays["kf_point"] >= 0) == len(row)
+    yield matched, "'kf_point' names points that have no such observation"
 
 
 # ---------------------------------------------------------------------- keyframes.csv and map.ply

@@ -76,43 +76,43 @@ MIN_ALIASING_MATCHES = 30
 # ---------------------------------------------------------------------- rank
 
 
-def top_candidates(world: Map, keyframes: Slots, seen: Observations, count: int) -> list[int]:
+def top_candidates(world: Map, keyframes: Slots, observations: Observations, count: int) -> list[int]:
     """The keyframes with the highest place-recognition scores.
 
     Args:
         world: The map.
         keyframes: Slots to choose from, ``[S]``.
-        seen: The frame's features.
+        observations: The frame's features.
         count: How many to choose at most.
 
     Returns:
         Slots, best first; of equal scores the newer keyframe. All, in the order given, if there are at most `count`.
     """
-    if len(keyframes) <= count or not len(seen):
+    if len(keyframes) <= count or not len(observations):
         return [int(slot) for slot in keyframes[:count]]
-    order = np.lexsort((-world.kf_id[keyframes], -recognition_scores(world, keyframes, seen)))
+    order = np.lexsort((-world.kf_id[keyframes], -recognition_scores(world, keyframes, observations)))
     return [int(slot) for slot in keyframes[order[:count]]]
 
 
-def recognition_scores(world: Map, keyframes: Slots, seen: Observations) -> Array:
+def recognition_scores(world: Map, keyframes: Slots, observations: Observations) -> Array:
     """Place-recognition scores ``[S]`` of keyframes; comparable within one call alone.
 
     The weights of the shared substrings over the root of the number of points: many points share more by chance.
     """
     world.index.update(world.kf_alive, world.kf_id, world.kf_point, world.kf_words)
-    score, points = world.index.score(keyframes, seen.words)
+    score, points = world.index.score(keyframes, observations.words)
     return np.asarray(score / np.sqrt(np.maximum(points, 1)))
 
 
 # ---------------------------------------------------------------------- pose
 
 
-def match_keyframe(world: Map, keyframe: int, seen: Observations) -> Matches:
+def match_keyframe(world: Map, keyframe: int, observations: Observations) -> Matches:
     """Match a frame's features to those of a keyframe that observe map points, by descriptor alone."""
     point = world.kf_point[keyframe, : world.kf_count[keyframe]]
     rows = np.flatnonzero(point >= 0)
     feature, row, _ = match_brute_force(
-        seen.words, world.kf_words[keyframe, rows], max_distance=MAX_DISTANCE, ratio=RATIO
+        observations.words, world.kf_words[keyframe, rows], max_distance=MAX_DISTANCE, ratio=RATIO
     )
     slots = point[rows[row]].astype(np.int64)
     return Matches(feature, slots, world.position[slots])
@@ -183,14 +183,14 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
 
 
 def ransac_matches(
-    matches: Matches, seen: Observations, camera: Camera, rng: np.random.Generator, min_inliers: float
+    matches: Matches, observations: Observations, camera: Camera, rng: np.random.Generator, min_inliers: float
 ) -> tuple[Array, Matches] | None:
     """The RANSAC pose of matches and the matches that fit it; None where these are fewer than `min_inliers`."""
     f = matches.feature
-    found = ransac_pose(matches.position, seen.xy[f], seen.info[f], camera, rng)
-    if found is None or np.count_nonzero(found[1]) < min_inliers:
+    ransac = ransac_pose(matches.position, observations.xy[f], observations.info[f], camera, rng)
+    if ransac is None or np.count_nonzero(ransac[1]) < min_inliers:
         return None
-    return found[0], matches.select(found[1])
+    return ransac[0], matches.select(ransac[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,30 +203,30 @@ class PnpPose:
 
 
 def pnp_poses(
-    world: Map, keyframes: list[int], seen: Observations, rng: np.random.Generator, min_inliers: int
+    world: Map, keyframes: list[int], observations: Observations, rng: np.random.Generator, min_inliers: int
 ) -> Iterator[PnpPose]:
     """Poses by descriptor matches: a good one at once, the others after all candidates, the best first.
 
     Args:
         world: The map.
         keyframes: Slots to match against; the ones with the most matches are tried first.
-        seen: The frame's features.
+        observations: The frame's features.
         rng: Draws RANSAC's samples.
         min_inliers: Inliers that the optimised pose needs.
     """
-    if len(seen) < min_inliers:
+    if len(observations) < min_inliers:
         return
-    matched = [(match_keyframe(world, keyframe, seen), keyframe) for keyframe in keyframes]
+    matched = [(match_keyframe(world, keyframe, observations), keyframe) for keyframe in keyframes]
     matched.sort(key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
     others: list[PnpPose] = []
     for matches, keyframe in matched[:PNP_CANDIDATES]:
         if len(matches) < max(MIN_PNP_INLIERS, min_inliers // 3):
             break
-        ransac = ransac_matches(matches, seen, world.camera, rng, MIN_PNP_INLIERS)
+        ransac = ransac_matches(matches, observations, world.camera, rng, MIN_PNP_INLIERS)
         if ransac is None:
             continue
         pose, inliers = ransac
-        candidate = PnpPose(keyframe, inliers, solve(world.camera, seen, inliers, pose))
+        candidate = PnpPose(keyframe, inliers, solve(world.camera, observations, inliers, pose))
         if candidate.estimate.count >= 2 * min_inliers:
             yield candidate
         else:
@@ -280,39 +280,44 @@ class PlaceMatch:
 
 
 def verify_place(
-    world: Map, keyframe: int, seen: Observations, matches: Matches, T_cam_world: Array, settings: TrackingSettings
+    world: Map,
+    keyframe: int,
+    observations: Observations,
+    matches: Matches,
+    T_cam_world: Array,
+    settings: TrackingSettings,
 ) -> PlaceMatch:
     """Match all points around a keyframe, and fit the pose to them, again while that gives more matches.
 
     Args:
         world: The map.
         keyframe: Slot of the keyframe.
-        seen: The frame's features.
+        observations: The frame's features.
         matches: Matches that agree on an initial pose.
         T_cam_world: That pose.
         settings: Radius and descriptor distances.
     """
-    estimate, points = solve(world.camera, seen, matches, T_cam_world), world.points_of(around(world, keyframe))
+    estimate, points = solve(world.camera, observations, matches, T_cam_world), world.points_of(around(world, keyframe))
     for _ in range(ROUNDS):
         before = len(matches)
-        more, _ = match_map(world, seen, estimate.T_cam_world, matches, points, settings, WIDEN)
+        more, _ = match_map(world, observations, estimate.T_cam_world, matches, points, settings, WIDEN)
         joined = matches.joined(more)
-        estimate = solve(world.camera, seen, joined, estimate.T_cam_world)
+        estimate = solve(world.camera, observations, joined, estimate.T_cam_world)
         matches = joined.select(estimate.inliers)
         if len(matches) <= before:
             break
     own = world.kf_point[keyframe]
     in_view, uv, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
-    if seen.mask is not None:  # the distortion is less than what masks are dilated by
-        height, width = seen.mask.shape
+    if observations.mask is not None:  # the distortion is less than what masks are dilated by
+        height, width = observations.mask.shape
         column, row = np.rint(uv).astype(np.int64).T
-        in_view = in_view[~seen.mask[row.clip(0, height - 1), column.clip(0, width - 1)]]
+        in_view = in_view[~observations.mask[row.clip(0, height - 1), column.clip(0, width - 1)]]
     share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
     share = share if np.isfinite(estimate.T_cam_world).all() else 0.0
     return PlaceMatch(estimate.T_cam_world, matches, share)
 
 
-def pose_uncertainty(world: Map, seen: Observations, place: PlaceMatch, rng: np.random.Generator) -> float:
+def pose_uncertainty(world: Map, observations: Observations, place: PlaceMatch, rng: np.random.Generator) -> float:
     """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
 
     The number of matches says nothing of that: errors of the map are common to all of them. So they have to be well
@@ -320,22 +325,22 @@ def pose_uncertainty(world: Map, seen: Observations, place: PlaceMatch, rng: np.
 
     Args:
         world: The map.
-        seen: The frame's features.
+        observations: The frame's features.
         place: The place, with matches and pose.
         rng: Draws the halves.
     """
     matches, T_cam_world = place.matches, place.T_cam_world
-    xy, count = seen.xy[matches.feature], len(matches)
+    xy, count = observations.xy[matches.feature], len(matches)
     if count < MIN_MATCHES or not np.isfinite(T_cam_world).all():
         return np.inf
     off = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
-    inner = solve(world.camera, seen, matches.select(off <= np.quantile(off, INNER_SHARE)), T_cam_world)
+    inner = solve(world.camera, observations, matches.select(off <= np.quantile(off, INNER_SHARE)), T_cam_world)
     if inner.count < MIN_MATCHES // 2 or not np.isfinite(inner.T_cam_world).all():
         return np.inf
     covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
     dilution = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(SPLITS)]
-    poses = np.array([solve(world.camera, seen, half, T_cam_world).T_cam_world for half in halves])
+    poses = np.array([solve(world.camera, observations, half, T_cam_world).T_cam_world for half in halves])
     centres = se3.inverse(poses)[:, :3, 3]
     spread = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
     worst = float(max(dilution / MAX_DILUTION, spread / MAX_SPLIT_SPREAD) / place.hypothesis.depth)
@@ -353,7 +358,7 @@ def around(world: Map, keyframe: int) -> Slots:
 
 def is_aliased(
     world: Map,
-    seen: Observations,
+    observations: Observations,
     hypotheses: dict[int, PlaceHypothesis],
     keyframes: Slots,
     settings: TrackingSettings,
@@ -364,7 +369,7 @@ def is_aliased(
 
     Args:
         world: The map.
-        seen: The features.
+        observations: The features.
         hypotheses: The frame's pose by submap, as far as it is known.
         keyframes: Slots of the keyframes whose places may be others.
         settings: Of tracking.
@@ -375,8 +380,8 @@ def is_aliased(
     for submap in np.unique(world.kf_map[keyframes]).tolist():
         places = [hypotheses[submap]] if submap in hypotheses else []
         slots = keyframes[world.kf_map[keyframes] == submap]
-        for slot in top_candidates(world, slots, seen, ALIASING_CANDIDATES):
-            other = _place_of(world, slot, seen, settings, seed)
+        for slot in top_candidates(world, slots, observations, ALIASING_CANDIDATES):
+            other = _place_of(world, slot, observations, settings, seed)
             if other is None or other.share < min_share or not possible(submap, other.T_cam_world):
                 continue
             if any(place.contradicts(other) for place in places):
@@ -386,16 +391,16 @@ def is_aliased(
 
 
 def _place_of(
-    world: Map, slot: int, seen: Observations, settings: TrackingSettings, seed: int
+    world: Map, slot: int, observations: Observations, settings: TrackingSettings, seed: int
 ) -> PlaceHypothesis | None:
     """The pose at a keyframe's place, if enough of it is seen."""
-    matches = match_keyframe(world, slot, seen)
+    matches = match_keyframe(world, slot, observations)
     if len(matches) < MIN_ALIASING_MATCHES // 2:
         return None
     rng = stream(seed, "lookalikes", int(world.kf_id[slot]))
-    ransac = ransac_matches(matches, seen, world.camera, rng, MIN_ALIASING_MATCHES // 3)
+    ransac = ransac_matches(matches, observations, world.camera, rng, MIN_ALIASING_MATCHES // 3)
     if ransac is None:
         return None
     pose, inliers = ransac
-    place = verify_place(world, slot, seen, inliers, pose, settings)
+    place = verify_place(world, slot, observations, inliers, pose, settings)
     return place.hypothesis if len(place.matches) >= MIN_ALIASING_MATCHES else None

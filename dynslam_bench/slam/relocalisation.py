@@ -79,32 +79,36 @@ class RotationEstimate:
     """The rotation since the last tracked frame, by images alone.
 
     Attributes:
-        seen: Features of the newest image.
+        observations: Features of the newest image.
         R_now_last: From the camera's axes in the last tracked frame to those of now, ``[3, 3]``.
         apparent: Sum of the rotations between consecutive images, radians.
     """
 
-    seen: Observations
+    observations: Observations
     R_now_last: Array
     apparent: float = 0.0
 
-    def advanced(self, seen: Observations, camera: Camera) -> RotationEstimate | None:
+    def advanced(self, observations: Observations, camera: Camera) -> RotationEstimate | None:
         """The rotation up to the next image; None where that is not connected with the one before.
 
         Args:
-            seen: Its features.
+            observations: Its features.
             camera: Intrinsics without distortion.
         """
-        before, now, _ = match_brute_force(self.seen.words, seen.words, max_distance=MAX_DISTANCE, ratio=RATIO)
+        before, now, _ = match_brute_force(
+            self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        )
         if len(before) < CONNECTED:
             return None
-        xy_before, xy_now = self.seen.xy[before], seen.xy[now]
+        xy_before, xy_now = self.observations.xy[before], observations.xy[now]
         homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
         fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
         if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
             return None
         step, _ = Rotation.align_vectors(_bearings(xy_now[fits], camera), _bearings(xy_before[fits], camera))
-        return RotationEstimate(seen, step.as_matrix() @ self.R_now_last, self.apparent + float(step.magnitude()))
+        return RotationEstimate(
+            observations, step.as_matrix() @ self.R_now_last, self.apparent + float(step.magnitude())
+        )
 
     @property
     def slack(self) -> float:
@@ -177,41 +181,43 @@ class RelocalisationGate:
         self._kidnapped = anywhere
         self.rotation: RotationEstimate | None = None
 
-    def lose(self, last: TrackedFrame, seen: Observations, *, textured: bool) -> None:
+    def lose(self, last: TrackedFrame, observations: Observations, *, textured: bool) -> None:
         """The first frame that is not tracked any more.
 
         Args:
             last: The last tracked frame.
-            seen: The new one's features.
+            observations: The new one's features.
             textured: Whether it shows more than a blank wall or a covered lens.
         """
         self.start(last)
-        self._advance(seen)
+        self._advance(observations)
         many_points = np.count_nonzero(last.point >= 0) >= KIDNAP_POINTS
         self._kidnapped = self.rotation is None and textured and bool(many_points)
 
     def start(self, last: TrackedFrame) -> None:
         """The camera counts as lost from the next frame on; `last` is the last tracked one."""
-        self.rotation, self._kidnapped = RotationEstimate(last.seen, np.eye(3)), False
+        self.rotation, self._kidnapped = RotationEstimate(last.observations, np.eye(3)), False
 
-    def while_lost(self, last: TrackedFrame, seen: Observations, timestamp: float) -> MotionBound:
+    def while_lost(self, last: TrackedFrame, observations: Observations, timestamp: float) -> MotionBound:
         """The bound for the next frame of a lost camera; has to be called for every one of them."""
-        self._advance(seen)
+        self._advance(observations)
         return MotionBound(self._atlas, last.T_cam_world, self.distance_m(last, timestamp), self.rotation)
 
-    def while_tracked(self, last: TrackedFrame, seen: Observations, timestamp: float, prediction: Array) -> MotionBound:
+    def while_tracked(
+        self, last: TrackedFrame, observations: Observations, timestamp: float, prediction: Array
+    ) -> MotionBound:
         """The bound for the frame after a tracked one.
 
         A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera `prediction`.
         """
-        rotation = RotationEstimate(last.seen, np.eye(3)).advanced(seen, self._atlas.world.camera)
+        rotation = RotationEstimate(last.observations, np.eye(3)).advanced(observations, self._atlas.world.camera)
         centres = [se3.inverse(pose)[:3, 3] for pose in (last.T_cam_world, prediction)]
         step = float(np.linalg.norm(centres[1] - centres[0]))
         return MotionBound(self._atlas, last.T_cam_world, step + self._distance(last, timestamp), rotation)
 
-    def _advance(self, seen: Observations) -> None:
+    def _advance(self, observations: Observations) -> None:
         if self.rotation is not None:
-            self.rotation = self.rotation.advanced(seen, self._atlas.world.camera)
+            self.rotation = self.rotation.advanced(observations, self._atlas.world.camera)
 
     @property
     def slack(self) -> float:
@@ -265,7 +271,7 @@ class PoseSearch:
 
     Attributes:
         atlas: The maps.
-        seen: The frame's features.
+        observations: The frame's features.
         last: The last tracked frame.
         prediction: World-to-camera pose by the motion model.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
@@ -278,7 +284,7 @@ class PoseSearch:
     """
 
     atlas: Atlas
-    seen: Observations
+    observations: Observations
     last: TrackedFrame
     prediction: Array
     reference: int
@@ -304,19 +310,19 @@ class PoseSearch:
             verified = self._verified(PnpPose(self.reference, *weak))
             if verified is not None:
                 return verified
-        found = self._relocalise(MIN_MATCHES if weak is None or self.lost else weak[1].count + 1)
-        if found is None and weak is not None and not self.lost and self._within_bound(weak[1]):
+        pose = self._relocalise(MIN_MATCHES if weak is None or self.lost else weak[1].count + 1)
+        if pose is None and weak is not None and not self.lost and self._within_bound(weak[1]):
             return InitialPose.of(*weak, self.reference, relocalised=False)
-        return found
+        return pose
 
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
         world = self.atlas.world
         if self.lost or not world.kf_map[self.reference]:
             return None
-        found = replace(self, keyframes=world.submap(0), lost=True)._relocalise(MIN_MATCHES)
+        pose = replace(self, keyframes=world.submap(0), lost=True)._relocalise(MIN_MATCHES)
         enough = self.settings.relocalisation.min_inliers
-        return found if found is not None and len(found.matches) >= enough else None
+        return pose if pose is not None and len(pose.matches) >= enough else None
 
     def _match_last_frame(self) -> tuple[tuple[Matches, PoseEstimate] | None, bool]:
         """The best pose from the last frame, and whether it is trusted; each search is wider than the one before."""
@@ -329,10 +335,12 @@ class PoseSearch:
             (WIDEN, close_m, ENOUGH_MATCHES),
         ):
             radius = widen * s.radius_px
-            matches = match_last_frame(world, self.last, self.seen, self.prediction, radius, depth_m, s.max_distance)
+            matches = match_last_frame(
+                world, self.last, self.observations, self.prediction, radius, depth_m, s.max_distance
+            )
             if len(matches) < enough:
                 continue
-            estimate = solve(world.camera, self.seen, matches, self.prediction, rounds=3)
+            estimate = solve(world.camera, self.observations, matches, self.prediction, rounds=3)
             if estimate.count >= MIN_MATCHES and (best is None or estimate.count > best[1].count):
                 best = matches, estimate
             if best is not None and estimate.count >= max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)):
@@ -344,11 +352,11 @@ class PoseSearch:
         world, rng = self.atlas.world, stream(self.seed, "relocalisation", self.frame)
         least = self.settings.tracking.min_inliers
         if not self.lost:
-            for candidate in pnp_poses(world, [self.reference], self.seen, rng, least):
+            for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
                 if candidate.estimate.count >= min_inliers and self._within_bound(candidate.estimate):
                     return InitialPose.of(candidate.matches, candidate.estimate, candidate.keyframe, relocalised=True)
-        keyframes = top_candidates(world, self.keyframes, self.seen, CANDIDATES)
-        for candidate in pnp_poses(world, keyframes, self.seen, rng, least):
+        keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
+        for candidate in pnp_poses(world, keyframes, self.observations, rng, least):
             if candidate.estimate.count >= min_inliers:
                 verified = self._verified(candidate)
                 if verified is not None:
@@ -357,20 +365,24 @@ class PoseSearch:
 
     def _verified(self, candidate: PnpPose) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
-        world, seen, s = self.atlas.world, self.seen, self.settings
+        world, observations, s = self.atlas.world, self.observations, self.settings
         submap, admits = int(world.kf_map[candidate.keyframe]), self.bound().admits
         if not admits(submap, candidate.estimate.T_cam_world):
             return None
         inliers = candidate.matches.select(candidate.estimate.inliers)
-        place = verify_place(world, candidate.keyframe, seen, inliers, candidate.estimate.T_cam_world, s.tracking)
+        place = verify_place(
+            world, candidate.keyframe, observations, inliers, candidate.estimate.T_cam_world, s.tracking
+        )
         many = len(place.matches) >= MANY_POINTS
         if place.share < (MANY_POINTS_SHARE if many else 1.0) * s.relocalisation.min_share:
             return None
         uncertainty = 0.0
         if self.lost:
-            uncertainty = pose_uncertainty(world, seen, place, stream(self.seed, "halves", self.frame))
+            uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
             hypotheses = {submap: place.hypothesis}
-            if uncertainty > 1 or is_aliased(world, seen, hypotheses, self.keyframes, s.tracking, self.seed, admits):
+            if uncertainty > 1 or is_aliased(
+                world, observations, hypotheses, self.keyframes, s.tracking, self.seed, admits
+            ):
                 return None
         return InitialPose(place.T_cam_world, place.matches, candidate.keyframe, True, place.share, uncertainty)
 

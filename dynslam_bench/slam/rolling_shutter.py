@@ -49,32 +49,32 @@ class CameraVelocity:
         return cls(now[:3, :3] @ back / seconds, angular)
 
 
-def compensate_rolling_shutter(seen: Observations, camera: Camera, velocity: CameraVelocity) -> Observations:
+def compensate_rolling_shutter(observations: Observations, camera: Camera, velocity: CameraVelocity) -> Observations:
     """The features as a global shutter would have seen them at the frame's stamp, the time of the middle row.
 
     Where a feature has no depth, only the rotation is undone.
 
     Args:
-        seen: The measured features; their raw keypoints tell the rows.
+        observations: The measured features; their raw keypoints tell the rows.
         camera: Intrinsics without distortion, and `readout_s`.
         velocity: The motion during the frame.
 
     Returns:
         New observations; a feature that such a motion would put behind the camera stays where it is.
     """
-    if not len(seen):
-        return seen
-    row = seen.keypoints.xy[:, 1].astype(np.float64)
+    if not len(observations):
+        return observations
+    row = observations.keypoints.xy[:, 1].astype(np.float64)
     late = (((row + 0.5) / camera.height - 0.5) * camera.readout_s)[:, None]
-    has_depth = seen.z > 0
-    points = camera.unproject(seen.xy, np.where(has_depth, seen.z, 1.0))
+    has_depth = observations.z > 0
+    points = camera.unproject(observations.xy, np.where(has_depth, observations.z, 1.0))
     points = points - np.where(has_depth[:, None], late, 0.0) * velocity.linear
     points = Rotation.from_rotvec(-late * velocity.angular).apply(points)
     ahead = points[:, 2] > 0
-    xy = np.where(ahead[:, None], camera.project(points), seen.xy)
-    z = np.where(ahead & has_depth, points[:, 2], seen.z)
+    xy = np.where(ahead[:, None], camera.project(points), observations.xy)
+    z = np.where(ahead & has_depth, points[:, 2], observations.z)
     grid = CellGrid.of(xy, camera.width, camera.height)
-    return replace(seen, xy=xy, z=z, right=right_coordinates(xy, z, camera), grid=grid)
+    return replace(observations, xy=xy, z=z, right=right_coordinates(xy, z, camera), grid=grid)
 
 
 class RollingShutter:
@@ -103,7 +103,14 @@ class RollingShutter:
         return compensate_rolling_shutter(raw, self._camera, self.velocity)
 
     def refitted(
-        self, raw: Observations, seen: Observations, fit: MapFit, last: TrackedFrame, timestamp: float, *, force: bool
+        self,
+        raw: Observations,
+        observations: Observations,
+        fit: MapFit,
+        last: TrackedFrame,
+        timestamp: float,
+        *,
+        force: bool,
     ) -> tuple[Observations, MapFit, CameraVelocity | None]:
         """The features compensated by the motion to the frame's pose, the pose fitted to them, and that motion.
 
@@ -111,20 +118,20 @@ class RollingShutter:
 
         Args:
             raw: The measured features.
-            seen: The features as `predicted` gave them.
-            fit: The pose so far, fitted to `seen`.
+            observations: The features as `predicted` gave them.
+            fit: The pose so far, fitted to `observations`.
             last: The last tracked frame.
             timestamp: The frame's stamp, seconds.
             force: Whether fewer points may agree, as before the first frame is compensated.
         """
         pose = fit.estimate.T_cam_world
         if not self._follows(last, timestamp) or not np.isfinite(pose).all():
-            return seen, fit, None
+            return observations, fit, None
         velocity = CameraVelocity.between(last.T_cam_world, pose, self._exposure_interval(timestamp - last.timestamp))
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
         refit = fit.refit(compensated, self._camera)
         if refit.count < MIN_AGREEING * fit.count and not force:
-            return seen, fit, None
+            return observations, fit, None
         return compensated, refit, velocity
 
     def _follows(self, last: TrackedFrame, timestamp: float) -> bool:

@@ -39,13 +39,13 @@ class TrackedFrame:
     """A frame with a pose, kept until the next one was tracked.
 
     Attributes:
-        seen: Its features.
+        observations: Its features.
         point: int64 ``[N]``, slot of the map point that each feature observes (inliers only), or -1.
         T_cam_world: World-to-camera pose.
         timestamp: Seconds.
     """
 
-    seen: Observations
+    observations: Observations
     point: Slots
     T_cam_world: Array
     timestamp: float
@@ -82,7 +82,7 @@ class Matches:
 def match_last_frame(
     world: Map,
     last: TrackedFrame,
-    seen: Observations,
+    observations: Observations,
     T_cam_world: Array,
     radius_px: float,
     close_m: float,
@@ -95,7 +95,7 @@ def match_last_frame(
     Args:
         world: The map.
         last: The last tracked frame.
-        seen: The new frame's features.
+        observations: The new frame's features.
         T_cam_world: Predicted pose of the new frame.
         radius_px: Half side of the window at octave 0; it grows with the feature's scale.
         close_m: Depth below which the last frame's own depth is used, metres; 0 to use map points alone.
@@ -103,14 +103,14 @@ def match_last_frame(
     """
     camera = world.camera
     from_map = last.point >= 0
-    from_depth = ~from_map & (last.seen.z > 0) & (last.seen.z < close_m)
+    from_depth = ~from_map & (last.observations.z > 0) & (last.observations.z < close_m)
     rows = np.flatnonzero(from_map | from_depth)
     position = np.zeros((len(rows), 3))
     mapped = from_map[rows]
     position[mapped] = world.position[last.point[rows[mapped]]]
     unmapped = rows[~mapped]
     position[~mapped] = se3.transform(
-        se3.inverse(last.T_cam_world), camera.unproject(last.seen.xy[unmapped], last.seen.z[unmapped])
+        se3.inverse(last.T_cam_world), camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
     )
     local = se3.transform(T_cam_world, position)
     ahead = local[:, 2] > 0.05
@@ -121,22 +121,29 @@ def match_last_frame(
         & (uv < (camera.width + MARGIN_PX, camera.height + MARGIN_PX)).all(axis=1)
     )
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
-    octave = last.seen.octave[rows]
-    free, words = np.ones(len(seen), bool), last.seen.words[rows]
+    octave = last.observations.octave[rows]
+    free, words = np.ones(len(observations), bool), last.observations.words[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
     windows, octaves = (uv, right, radius_px * world.scales[octave]), (octave - 1, octave + 1)
     feature, _ = search_in_radius(
-        seen.grid, seen.arrays, free, windows, octaves, words, max_distance=max_distance, ratio=LAST_FRAME_RATIO
+        observations.grid,
+        observations.arrays,
+        free,
+        windows,
+        octaves,
+        words,
+        max_distance=max_distance,
+        ratio=LAST_FRAME_RATIO,
     )
     hit = feature >= 0
     rows, position, feature = rows[hit], position[hit], feature[hit]
-    consistent = rotation_consistent(last.seen.angle[rows], seen.angle[feature])
+    consistent = rotation_consistent(last.observations.angle[rows], observations.angle[feature])
     return Matches(feature[consistent], last.point[rows[consistent]], position[consistent])
 
 
 def match_map(
     world: Map,
-    seen: Observations,
+    observations: Observations,
     T_cam_world: Array,
     matches: Matches,
     candidates: Slots,
@@ -147,7 +154,7 @@ def match_map(
 
     Args:
         world: The map.
-        seen: The new frame's features.
+        observations: The new frame's features.
         T_cam_world: Its pose so far.
         matches: Matches so far; their features and points are left alone.
         candidates: Slots of the points to match.
@@ -160,7 +167,7 @@ def match_map(
     points, uv, right, octave, cosine = world.project(T_cam_world, candidates)
     matched = np.zeros(world.alive.size, bool)
     matched[matches.point[matches.point >= 0]] = True
-    free = np.ones(len(seen), bool)
+    free = np.ones(len(observations), bool)
     free[matches.feature] = False
     rest = ~matched[points]
     radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
@@ -168,16 +175,18 @@ def match_map(
     windows, octaves = (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1)
     words, bits = world.words[wanted], settings.max_distance
     feature, _ = search_in_radius(
-        seen.grid, seen.arrays, free, windows, octaves, words, max_distance=bits, ratio=MAP_RATIO
+        observations.grid, observations.arrays, free, windows, octaves, words, max_distance=bits, ratio=MAP_RATIO
     )
     hit = feature >= 0
     return Matches(feature[hit], wanted[hit], world.position[wanted[hit]]), points
 
 
-def solve(camera: Camera, seen: Observations, matches: Matches, T_cam_world: Array, *, rounds: int = 4) -> PoseEstimate:
+def solve(
+    camera: Camera, observations: Observations, matches: Matches, T_cam_world: Array, *, rounds: int = 4
+) -> PoseEstimate:
     """The pose that fits the matches, starting from a given one."""
     f = matches.feature
-    measured = seen.xy[f], seen.right[f], seen.info[f], seen.info_right[f]
+    measured = observations.xy[f], observations.right[f], observations.info[f], observations.info_right[f]
     return optimise_pose(T_cam_world, matches.position, *measured, camera, rounds=rounds)
 
 
@@ -205,13 +214,18 @@ class MapFit:
         """Number of inliers."""
         return int(np.count_nonzero(self.inliers))
 
-    def refit(self, seen: Observations, camera: Camera) -> MapFit:
+    def refit(self, observations: Observations, camera: Camera) -> MapFit:
         """The pose fitted anew to the same matches, the features of which have moved a little."""
-        return replace(self, estimate=solve(camera, seen, self.matches, self.estimate.T_cam_world))
+        return replace(self, estimate=solve(camera, observations, self.matches, self.estimate.T_cam_world))
 
 
 def track_local_map(
-    world: Map, seen: Observations, matches: Matches, T_cam_world: Array, candidates: Slots, settings: TrackingSettings
+    world: Map,
+    observations: Observations,
+    matches: Matches,
+    T_cam_world: Array,
+    candidates: Slots,
+    settings: TrackingSettings,
 ) -> MapFit:
     """Match the rest of the local map around an initial pose, and fit the pose to all matches.
 
@@ -219,18 +233,18 @@ def track_local_map(
 
     Args:
         world: The map.
-        seen: The frame's features.
+        observations: The frame's features.
         matches: Matches of the initial pose.
         T_cam_world: The initial pose.
         candidates: Slots of the points of the local map.
         settings: Radius, descriptor distance and number of inliers.
     """
-    more, in_view = match_map(world, seen, T_cam_world, matches, candidates, settings)
+    more, in_view = match_map(world, observations, T_cam_world, matches, candidates, settings)
     matches = matches.joined(more)
     mapped = matches.select(matches.point >= 0)
     if len(mapped) >= 2 * settings.min_inliers:
         matches = mapped
-    return MapFit(matches, solve(world.camera, seen, matches, T_cam_world), in_view)
+    return MapFit(matches, solve(world.camera, observations, matches, T_cam_world), in_view)
 
 
 # ---------------------------------------------------------------------- the local map

@@ -24,9 +24,9 @@ CLOSING = {"loop_closing__enabled": True}
 
 def test_a_submap_is_merged_when_the_camera_comes_round():
     backend, results, truth = drive(RingWorld(), AROUND, STEP, **CLOSING)
-    found, errors = np.array(states(results)), position_errors(results, AROUND, truth)
-    merged = int(np.flatnonzero(found[45:] == "ok")[0]) + 45
-    assert merged > 100 and (found[25:merged] == "lost").all() and (found[merged:] == "ok").all()
+    tracking, errors = np.array(states(results)), position_errors(results, AROUND, truth)
+    merged = int(np.flatnonzero(tracking[45:] == "ok")[0]) + 45
+    assert merged > 100 and (tracking[25:merged] == "lost").all() and (tracking[merged:] == "ok").all()
     assert errors[merged:].max() < 0.2
     final = backend.finalize()
     assert 20 <= len(AROUND) - len(final) <= 20 + 11, "frames of the submap are in the final trajectory"
@@ -40,13 +40,13 @@ def test_a_submap_that_is_not_merged_is_left_where_the_camera_is_in_the_root_map
     monkeypatch.setattr(loop_closing, "PATIENCE", patience)
     monkeypatch.setattr(loop_closing, "MERGE_SHARE", 1.0)
     backend, results, truth = drive(RingWorld(), AROUND, STEP, **CLOSING)
-    found, errors = np.array(states(results)), position_errors(results, AROUND, truth)
-    back = 45 + int(np.flatnonzero(found[45:] == "ok")[0])
-    assert AROUND[back] == pytest.approx(LAP, abs=15) and (found[back:] == "ok").all() and errors[back:].max() < 0.2
+    tracking, errors = np.array(states(results)), position_errors(results, AROUND, truth)
+    back = 45 + int(np.flatnonzero(tracking[45:] == "ok")[0])
+    assert AROUND[back] == pytest.approx(LAP, abs=15) and (tracking[back:] == "ok").all() and errors[back:].max() < 0.2
     assert not backend.loops.closed and backend.world.map_count == 2
     assert backend.outputs().keyframes[-1].map == (1 if patience > 100 else 0)
     final = backend.finalize()
-    assert len(final) == np.count_nonzero(found == "ok"), "no frame of the submap"
+    assert len(final) == np.count_nonzero(tracking == "ok"), "no frame of the submap"
     true = truth[[AROUND[round(stamp * 10)] for stamp in final.timestamps]]
     assert np.linalg.norm(final.positions - true[:, :3, 3], axis=1).max() < 0.3
 
@@ -58,9 +58,9 @@ def monocular_lap():
     path = [*range(60), *[None] * 20, *range(100, lap + 60)]
     noise = {"noise_px": 0.5, "limit": 700}
     backend, results, _ = drive(world, path, 0.07, rate=30.0, monocular=True, noise=noise, **CLOSING)
-    found = np.array(states(results))
-    back = 80 + int(np.flatnonzero(found[80:] == "ok")[0])
-    assert path[back] == pytest.approx(lap, abs=20) and (found[back:] == "ok").all()
+    tracking = np.array(states(results))
+    back = 80 + int(np.flatnonzero(tracking[80:] == "ok")[0])
+    assert path[back] == pytest.approx(lap, abs=20) and (tracking[back:] == "ok").all()
     return path, backend, results, back, world.lap(lap + 60, 0.07)
 
 

@@ -22,11 +22,11 @@ def test_black_frames_and_a_kidnapped_camera_cost_what_they_hide():
     states, errors = [], []
     for number, index in enumerate(way):
         frame = replace(dark if index is None else shown[index], index=number, timestamp=number / 30)
-        found = tracker.track(frame)
-        states.append(found.state)
-        if found.state == "ok" and index is not None:
+        result = tracker.track(frame)
+        states.append(result.state)
+        if result.state == "ok" and index is not None:
             truth = sequence.ground_truth.T_world_cam
             true = se3.inverse(truth[way[0]]) @ truth[index]
-            errors.append(np.linalg.norm((se3.inverse(true) @ found.T_world_cam)[:3, 3]))
+            errors.append(np.linalg.norm((se3.inverse(true) @ result.T_world_cam)[:3, 3]))
     assert states == ["ok"] * 2 + ["lost"] * 20 + ["ok"] * 2 + ["lost"] * 2 + ["ok"] * 2
     assert len(errors) == 6 and max(errors) < 0.02

@@ -15,10 +15,10 @@ SHARED = 10
 @pytest.fixture
 def chain(room):
     """Six keyframes in a row; each shares ten points with the next, and with no other."""
-    world, seen = Map(room.camera, np.ones(1)), observed(room.see(np.eye(4), 0), room.camera, levels=1)
+    world, observations = Map(room.camera, np.ones(1)), observed(room.see(np.eye(4), 0), room.camera, levels=1)
     last = np.zeros(0, np.int64)
     for index in range(6):
-        slot = world.add_keyframe(seen, np.eye(4), index, float(index))
+        slot = world.add_keyframe(observations, np.eye(4), index, float(index))
         world.observe(slot, np.arange(len(last)), last)
         fresh = np.arange(SHARED, 2 * SHARED)
         last = world.add_points(np.ones((SHARED, 3)), np.zeros((SHARED, 3), np.uint8), slot, fresh)

@@ -14,8 +14,10 @@ from dynslam_bench.slam.map_kernels import distinct
 
 def keyframe_of(room, world, pose, index, octave=0):
     frame = without_depth(room.see(pose, index, noise_px=0.0))
-    seen = observed(frame, room.camera, levels=len(world.scales))
-    return world.add_keyframe(replace(seen, octave=seen.octave + octave), se3.inverse(pose), index, index / 30)
+    observations = observed(frame, room.camera, levels=len(world.scales))
+    return world.add_keyframe(
+        replace(observations, octave=observations.octave + octave), se3.inverse(pose), index, index / 30
+    )
 
 
 def observers(world, point):

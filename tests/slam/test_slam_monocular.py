@@ -180,8 +180,8 @@ def test_follows_a_smooth_path_to_millimetres_up_to_scale(room):
 def test_is_relocalised_after_blind_frames(room):
     frames = see(room, room.path(60))
     frames[40:45] = [room.blind(i) for i in range(40, 45)]
-    found = states(track_all(make(room), frames))
-    assert found[39] == "ok" and set(found[40:45]) == {"lost"} and set(found[50:]) == {"ok"}
+    tracking = states(track_all(make(room), frames))
+    assert tracking[39] == "ok" and set(tracking[40:45]) == {"lost"} and set(tracking[50:]) == {"ok"}
 
 
 def test_keyframes_without_depth_are_culled_and_the_baseline_changes_nothing(room):

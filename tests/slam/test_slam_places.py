@@ -12,7 +12,7 @@ from dynslam_bench.slam.place_recognition import recognition_scores, top_candida
 ANGLES = np.deg2rad(np.arange(0, 360, 30))
 
 
-def seen(room, angle, index):
+def observations(room, angle, index):
     """The features of a camera that looks in a direction, radians about the vertical."""
     return observed(room.see(se3.exp(np.array([0, 0, 0, 0, angle, 0])), index), room.camera, levels=1)
 
@@ -22,7 +22,7 @@ def world(room):
     """A map of twelve keyframes around a room, every feature a point of its own."""
     world = Map(room.camera, np.ones(1))
     for index, angle in enumerate(ANGLES):
-        features = seen(room, angle, index)
+        features = observations(room, angle, index)
         slot = world.add_keyframe(features, np.eye(4), index, index / 30)
         world.add_points(np.ones((len(features), 3)), features.rgb, slot, np.arange(len(features)))
     return world
@@ -30,24 +30,24 @@ def world(room):
 
 @pytest.mark.parametrize("place", [0, 5, 11])
 def test_the_keyframe_of_the_same_place_is_ranked_first(room, world, place):
-    best = top_candidates(world, world.keyframes, seen(room, ANGLES[place] + 0.02, 100), 3)
+    best = top_candidates(world, world.keyframes, observations(room, ANGLES[place] + 0.02, 100), 3)
     assert len(best) == 3 and world.kf_frame[best[0]] == place
-    neighbours = top_candidates(world, world.keyframes, seen(room, ANGLES[4], 100), 11)
+    neighbours = top_candidates(world, world.keyframes, observations(room, ANGLES[4], 100), 11)
     assert [int(world.kf_frame[slot]) for slot in neighbours[:1]] == [4]
     assert {int(world.kf_frame[slot]) for slot in neighbours[1:3]} == {3, 5}
 
 
 def test_only_the_keyframes_given_are_chosen(room, world):
     given = world.keyframes[[1, 2, 8, 9]]
-    best = top_candidates(world, given, seen(room, ANGLES[5], 100), 2)
+    best = top_candidates(world, given, observations(room, ANGLES[5], 100), 2)
     assert len(best) == 2 and set(best) <= set(given.tolist())
-    assert top_candidates(world, given, seen(room, 0.0, 100), 4) == given.tolist()
+    assert top_candidates(world, given, observations(room, 0.0, 100), 4) == given.tolist()
     assert top_candidates(world, world.keyframes, observed(room.blind(0), room.camera), 2) == [0, 1]
 
 
 def test_of_equal_scores_the_newer_keyframe_is_first(room, world):
     """A frame whose substrings no keyframe has scores zero everywhere."""
-    stranger = seen(PointWorld(seed=9), 0.0, 100)
+    stranger = observations(PointWorld(seed=9), 0.0, 100)
     stored = world.kf_words[world.keyframes].view(np.uint16)[:, :, ::STRIDE]
     used = np.concatenate([stored[row, : world.kf_count[slot]] for row, slot in enumerate(world.keyframes)])
     stranger.words.view(np.uint16)[:] = np.setdiff1d(np.arange(1 << 16), used)[0]
@@ -81,7 +81,7 @@ def test_the_index_follows_keyframes_that_come_and_go(room, seed):
     world, rng, compared = Map(room.camera, np.ones(1)), np.random.default_rng(seed), 0
     for number in range(40):
         if world.keyframe_count < 4 or rng.random() < 0.6:
-            features = seen(room, rng.uniform(0, 6), number)
+            features = observations(room, rng.uniform(0, 6), number)
             slot = world.add_keyframe(features, np.eye(4), number, number / 30)
             some = np.flatnonzero(rng.random(len(features)) < 0.6)
             world.add_points(np.ones((len(some), 3)), features.rgb[some], slot, some)
@@ -89,7 +89,7 @@ def test_the_index_follows_keyframes_that_come_and_go(room, seed):
             world.remove_keyframe(int(rng.choice(world.keyframes)))
         asked = world.keyframes[rng.random(world.keyframe_count) < 0.8]
         if number % 3 == 0 and len(asked):  # not each time: several come and go in between
-            features, compared = seen(room, rng.uniform(0, 6), 1000 + number), compared + 1
+            features, compared = observations(room, rng.uniform(0, 6), 1000 + number), compared + 1
             expected = reference_scores(world, asked, features)
             np.testing.assert_allclose(recognition_scores(world, asked, features), expected, rtol=1e-9)
     assert compared > 8

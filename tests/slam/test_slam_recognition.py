@@ -31,20 +31,20 @@ def mapped():
     return room, backend
 
 
-def verified(backend, seen, patch, T_cam_world):
+def verified(backend, observations, patch, T_cam_world):
     """The verified place, from matches in a part of the image and from a pose."""
-    every = match_keyframe(backend.world, 0, seen)
-    few = every.select(patch(seen.xy[every.feature]))
+    every = match_keyframe(backend.world, 0, observations)
+    few = every.select(patch(observations.xy[every.feature]))
     assert 8 <= len(few) < len(every) / 4
-    return verify_place(backend.world, 0, seen, few, T_cam_world, TrackingSettings())
+    return verify_place(backend.world, 0, observations, few, T_cam_world, TrackingSettings())
 
 
 def test_a_pose_grows_from_a_patch():
     room, backend = mapped()
     pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
     frame = room.see(pose, 1, noise_px=1.5)
-    seen = observed(frame, room.camera)
-    place = verified(backend, seen, lambda xy: np.abs(xy - 120).max(axis=1) < 70, se3.inverse(pose))
+    observations = observed(frame, room.camera)
+    place = verified(backend, observations, lambda xy: np.abs(xy - 120).max(axis=1) < 70, se3.inverse(pose))
     assert place.share > 0.7 and len(place.matches) > 150
     assert np.linalg.norm(se3.inverse(place.T_cam_world)[:3, 3] - pose[:3, 3]) < 0.03
 
@@ -72,24 +72,26 @@ def test_one_patch_does_not_determine_the_pose_nor_do_a_few_matches_beside_it(ha
     track_all(backend, [room.see(FIRST, 0, depthless=0.0, limit=4000)])
     pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
     frame = room.see(pose, 1, noise_px=1.0, limit=4000)
-    seen = observed(frame, room.camera)
-    every, rng = match_keyframe(backend.world, 0, seen), np.random.default_rng(seed)
-    off = np.abs(seen.xy[every.feature] - [260, 200]).max(axis=1)
+    observations = observed(frame, room.camera)
+    every, rng = match_keyframe(backend.world, 0, observations), np.random.default_rng(seed)
+    off = np.abs(observations.xy[every.feature] - [260, 200]).max(axis=1)
     patch, beside_it = rng.permutation(np.flatnonzero(off < half)), rng.permutation(np.flatnonzero(off > 150))
     few = every.select(np.sort(np.concatenate([patch[: 80 - beside], beside_it[:beside]])))
-    fitted = solve(room.camera, seen, few, se3.inverse(pose))
+    fitted = solve(room.camera, observations, few, se3.inverse(pose))
     place = PlaceMatch(fitted.T_cam_world, few.select(fitted.inliers), 0.5)
     assert len(place.matches) > 60
-    assert (pose_uncertainty(backend.world, seen, place, np.random.default_rng(0)) <= 1) == precise
+    assert (pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) <= 1) == precise
 
 
 @pytest.mark.parametrize("count", [0, 4, 6, 11])
 def test_a_few_matches_determine_no_pose(count):
     room, backend = mapped()
     frame = room.see(FIRST, 1)
-    seen = observed(frame, room.camera)
-    few = match_keyframe(backend.world, 0, seen).select(np.arange(count))
-    assert pose_uncertainty(backend.world, seen, PlaceMatch(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf
+    observations = observed(frame, room.camera)
+    few = match_keyframe(backend.world, 0, observations).select(np.arange(count))
+    assert (
+        pose_uncertainty(backend.world, observations, PlaceMatch(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf
+    )
 
 
 CAMERA = Camera(640, 480, 535.0, 539.0, 320.0, 247.0)
@@ -110,15 +112,15 @@ def true_and_false_matches(seed, count, right):
 @pytest.mark.parametrize("seed", range(10))
 def test_half_of_the_matches_may_be_wrong(seed):
     world, xy, pose = true_and_false_matches(seed, 80, 40)
-    found, inliers = ransac_pose(world, xy, np.ones(80), CAMERA, np.random.default_rng(seed))
+    estimate, inliers = ransac_pose(world, xy, np.ones(80), CAMERA, np.random.default_rng(seed))
     _, rotation, translation, theirs = cv2.solvePnPRansac(
         world, xy, CAMERA.matrix, None, iterationsCount=150, reprojectionError=np.sqrt(2 * 5.991), confidence=0.999
     )
     assert inliers[:40].sum() >= 30 and inliers[40:].sum() <= 3
     assert inliers.sum() >= len(theirs) - 8, "before any refinement, which theirs has"
-    assert np.linalg.norm(found[:3, 3] - pose[:3, 3]) < 0.15
-    assert np.linalg.norm(found[:3, 3] - translation.ravel()) < 0.15
-    assert np.linalg.norm(Rotation.from_matrix(found[:3, :3] @ cv2.Rodrigues(rotation)[0].T).as_rotvec()) < 0.05
+    assert np.linalg.norm(estimate[:3, 3] - pose[:3, 3]) < 0.15
+    assert np.linalg.norm(estimate[:3, 3] - translation.ravel()) < 0.15
+    assert np.linalg.norm(Rotation.from_matrix(estimate[:3, :3] @ cv2.Rodrigues(rotation)[0].T).as_rotvec()) < 0.05
 
 
 def test_coarse_features_may_be_farther_off():
@@ -138,5 +140,5 @@ def test_too_few_or_degenerate_points_give_no_pose():
     line = np.linspace([-1.0, 0.0, 3.0], [1.0, 0.0, 3.0], 30)
     for world in (same, line):
         xy = np.random.default_rng(0).uniform([0, 0], [640, 480], (30, 2))
-        found = ransac_pose(world, xy, np.ones(30), CAMERA, np.random.default_rng(0))
-        assert found is None or found[1].sum() < 15
+        estimate = ransac_pose(world, xy, np.ones(30), CAMERA, np.random.default_rng(0))
+        assert estimate is None or estimate[1].sum() < 15

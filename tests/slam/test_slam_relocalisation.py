@@ -34,46 +34,46 @@ def run(world, path, **settings):
     ],
 )  # fmt: skip
 def test_a_place_out_of_reach_or_only_similar_is_not_recognised(alike, path, lost_from, settings, believing):
-    _, found, _ = run(RingWorld(alike=alike), path, **settings)
-    assert (found[:lost_from] == "ok").all() and (found[lost_from:] == "lost").all()
-    _, found, _ = run(RingWorld(alike=alike), path, **believing)
-    assert (found[lost_from + 2 :] == "ok").any(), "without the rule it would be recognised"
+    _, recognised, _ = run(RingWorld(alike=alike), path, **settings)
+    assert (recognised[:lost_from] == "ok").all() and (recognised[lost_from:] == "lost").all()
+    _, recognised, _ = run(RingWorld(alike=alike), path, **believing)
+    assert (recognised[lost_from + 2 :] == "ok").any(), "without the rule it would be recognised"
 
 
 def test_a_kidnapped_camera_is_relocalised_at_once_in_a_known_place():
-    _, found, errors = run(RingWorld(), [*range(50), *range(10, 18)])
-    assert (found[52:] == "ok").all() and errors[52:].max() < 0.1
+    _, recognised, errors = run(RingWorld(), [*range(50), *range(10, 18)])
+    assert (recognised[52:] == "ok").all() and errors[52:].max() < 0.1
 
 
 @pytest.mark.parametrize(
-    ("alike", "blind", "more", "found"),
+    ("alike", "blind", "more", "recognised"),
     [
         *((alike, 30, more, alike < 0.5) for alike in (0.0, 0.2, 0.5, 0.9) for more in (0, 10)),
         *((alike, 0, 0, alike < 0.5) for alike in (0.0, 0.5, 1.0)),
     ],
 )
-def test_a_frame_of_two_places_tells_nothing(alike, blind, more, found):
+def test_a_frame_of_two_places_tells_nothing(alike, blind, more, recognised):
     """Blind for three seconds, in which both can be reached, or kidnapped from one frame to the next."""
     path = [*range(2 * QUARTER + more), *[None] * blind, *range(10, 18)]
-    _, tracked, errors = run(RingWorld(alike=alike), path)
-    assert (tracked[-7:] == ("ok" if found else "lost")).all()
-    assert not found or errors[-7:].max() < 0.1
-    assert blind or tracked[2 * QUARTER] == "lost", "too far for a tenth of a second"
+    _, tracking, errors = run(RingWorld(alike=alike), path)
+    assert (tracking[-7:] == ("ok" if recognised else "lost")).all()
+    assert not recognised or errors[-7:].max() < 0.1
+    assert blind or tracking[2 * QUARTER] == "lost", "too far for a tenth of a second"
 
 
 @pytest.mark.parametrize(("alike", "aliased"), [(0.0, False), (0.2, False), (0.6, True), (1.0, True)])
 def test_perceptual_aliasing(alike, aliased):
     world, settings = RingWorld(alike=alike), TrackingSettings()
-    backend, tracked, _ = run(world, [*range(2 * QUARTER)])
+    backend, tracking, _ = run(world, [*range(2 * QUARTER)])
     lap = world.lap(2 * QUARTER, STEP)
-    seen = observed(world.see(lap[10], 999), world.camera)
+    observations = observed(world.see(lap[10], 999), world.camera)
     here = PlaceHypothesis(se3.inverse(lap[10]) @ lap[0], 1.0, 3.0)
     everywhere = backend.world.keyframes
-    assert (tracked == "ok").all()
-    assert is_aliased(backend.world, seen, {0: here}, everywhere, settings, 0) is aliased
-    assert not is_aliased(backend.world, seen, {0: here}, everywhere[:4], settings, 0)
+    assert (tracking == "ok").all()
+    assert is_aliased(backend.world, observations, {0: here}, everywhere, settings, 0) is aliased
+    assert not is_aliased(backend.world, observations, {0: here}, everywhere[:4], settings, 0)
     near = lambda submap, T_cam_world: not here.contradicts(PlaceHypothesis(T_cam_world, 1.0, 3.0))  # noqa: E731
-    assert not is_aliased(backend.world, seen, {0: here}, everywhere, settings, 0, near)
+    assert not is_aliased(backend.world, observations, {0: here}, everywhere, settings, 0, near)
 
 
 def test_a_lost_camera_predicts_nothing_and_its_rotation_is_followed_in_every_frame(monkeypatch):
@@ -81,8 +81,8 @@ def test_a_lost_camera_predicts_nothing_and_its_rotation_is_followed_in_every_fr
     monkeypatch.setattr(
         RelocalisationGate, "while_lost", lambda self, *args: (calls.append(args), while_lost(self, *args))[1]
     )
-    backend, found, _ = run(RingWorld(), [*range(15), *range(60, 70)])
-    assert (found[15:] == "lost").all() and len(calls) == 9, "the first of the ten is compared by tracking"
+    backend, recognised, _ = run(RingWorld(), [*range(15), *range(60, 70)])
+    assert (recognised[15:] == "lost").all() and len(calls) == 9, "the first of the ten is compared by tracking"
     assert backend.predict(2.6) is None and backend.motion_covariance(2.6) is None
 
 

@@ -28,12 +28,12 @@ def rolling(room, pose_at, index, **how):
     exact = {"noise_px": 0.0, "depth_noise": 0.0, "depthless": 0.0, "limit": 10**6} | how
     at_once = room.see(pose_at(index / 30), index, **exact)
     camera = room.camera
-    seen = se3.transform(pose_at(index / 30), camera.unproject(at_once.xy, at_once.z))
+    observations = se3.transform(pose_at(index / 30), camera.unproject(at_once.xy, at_once.z))
     xy, z = at_once.xy.copy(), at_once.z.copy()
-    for row in range(len(seen)):
+    for row in range(len(observations)):
         for _ in range(4):  # the row that a point is seen by depends on where that row sees it
             late = ((xy[row, 1] + 0.5) / camera.height - 0.5) * READOUT_S
-            local = se3.transform(se3.inverse(pose_at(index / 30 + late)), seen[row])
+            local = se3.transform(se3.inverse(pose_at(index / 30 + late)), observations[row])
             xy[row], z[row] = camera.project(local), local[2]
     inside = (xy[:, 1] > 0) & (xy[:, 1] < camera.height - 1)
     keypoints = replace(at_once.keypoints, xy=xy.astype(np.float32))
@@ -70,14 +70,16 @@ def test_a_constant_motion_is_undone_to_a_tenth_of_a_pixel(room, has_depth):
     measured = measured if has_depth else without_depth(measured)
     camera = replace(room.camera, readout_s=READOUT_S)
     velocity = CameraVelocity.between(*(se3.inverse(moving(t)) for t in (0.15, 0.2)), 0.05)
-    seen = compensate_rolling_shutter(observed(measured, camera), camera, velocity)
+    observations = compensate_rolling_shutter(observed(measured, camera), camera, velocity)
     assert np.percentile(np.linalg.norm(measured.xy - at_once.xy, axis=1), 90) > 5
-    assert np.linalg.norm(seen.xy - at_once.xy, axis=1).max() < 0.1
+    assert np.linalg.norm(observations.xy - at_once.xy, axis=1).max() < 0.1
     if has_depth:
-        np.testing.assert_allclose(seen.z, at_once.z, rtol=2e-3)
-        np.testing.assert_allclose(seen.right, seen.xy[:, 0] - camera.fx * camera.baseline_m / seen.z, rtol=1e-12)
+        np.testing.assert_allclose(observations.z, at_once.z, rtol=2e-3)
+        np.testing.assert_allclose(
+            observations.right, observations.xy[:, 0] - camera.fx * camera.baseline_m / observations.z, rtol=1e-12
+        )
     else:
-        assert not seen.z.any() and np.isnan(seen.right).all()
+        assert not observations.z.any() and np.isnan(observations.right).all()
 
 
 def test_the_velocity_is_that_of_the_points():
@@ -91,12 +93,12 @@ def test_the_velocity_is_that_of_the_points():
 
 def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
     frame, camera = room.see(np.eye(4), 0), replace(room.camera, readout_s=READOUT_S)
-    seen = observed(frame, camera)
-    wild = compensate_rolling_shutter(seen, camera, CameraVelocity(np.array([0.0, 0.0, 400.0]), np.zeros(3)))
-    behind = (frame.keypoints.xy[:, 1] > 420) & (seen.z > 0) & (seen.z < 3)
+    observations = observed(frame, camera)
+    wild = compensate_rolling_shutter(observations, camera, CameraVelocity(np.array([0.0, 0.0, 400.0]), np.zeros(3)))
+    behind = (frame.keypoints.xy[:, 1] > 420) & (observations.z > 0) & (observations.z < 3)
     assert behind.any() and np.isfinite(wild.xy).all()
-    np.testing.assert_array_equal(wild.xy[behind], seen.xy[behind])
-    np.testing.assert_array_equal(wild.z[behind], seen.z[behind])
+    np.testing.assert_array_equal(wild.xy[behind], observations.xy[behind])
+    np.testing.assert_array_equal(wild.z[behind], observations.z[behind])
     blind = observed(room.blind(1), camera)
     assert len(compensate_rolling_shutter(blind, camera, CameraVelocity(np.ones(3), np.ones(3)))) == 0
 
