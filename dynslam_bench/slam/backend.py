@@ -89,6 +89,7 @@ class RgbdBackend:
 
     uses_depth = True
     """Whether depth is read; where it is not, the pipeline hides it."""
+    settings_type: type[BackendSettings] = BackendSettings
 
     def __init__(
         self,
@@ -98,7 +99,7 @@ class RgbdBackend:
         levels: int = 8,
         extractor: str = "orb",
     ) -> None:
-        self.settings = settings or BackendSettings()
+        self.settings = settings or self.settings_type()
         self._features = MapFeatures(extractor=extractor, levels=max(levels, 1), scale_factor=scale_factor)
         self._ready = False
 
@@ -171,7 +172,7 @@ class RgbdBackend:
         prediction = self.motion.predicted(last, stamp)
         search = self._search(frame, raw, observations, last, prediction)
         root = search.in_root_map()
-        initial = search.run()
+        initial = search.from_last_frame() or search.relocalised()
         if initial is None and root is not None:  # the camera is lost in the submap, and found in the root map
             initial, root, self._tracked = root, None, False
             self._gate.start(last)
@@ -303,7 +304,7 @@ class RgbdBackend:
 
     def _usable_features(self, observations: Observations) -> int:
         """How many features a map could begin with."""
-        return int(np.count_nonzero(observations.z > 0))
+        return int(np.count_nonzero(observations.z > 0)) if self.uses_depth else len(observations)
 
     def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> BackendResult:
         """The frame becomes the first keyframe of the active map."""
@@ -480,18 +481,8 @@ class MonocularBackend(RgbdBackend):
     """
 
     uses_depth = False
+    settings_type = MonocularBackendSettings
     settings: MonocularBackendSettings
-
-    def __init__(
-        self,
-        settings: MonocularBackendSettings | None = None,
-        *,
-        scale_factor: float = 1.2,
-        levels: int = 8,
-        extractor: str = "orb",
-    ) -> None:
-        settings = settings or MonocularBackendSettings()
-        super().__init__(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)
 
     def reset(self, camera: Camera, seed: int) -> None:
         """Forget everything: a new sequence begins."""
@@ -505,9 +496,6 @@ class MonocularBackend(RgbdBackend):
         if initial is None:
             return self._result(None)
         return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
-
-    def _usable_features(self, observations: Observations) -> int:
-        return len(observations)
 
     def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
         """Begin a submap as the root map began; its unit of length is the median depth of its own views."""
@@ -550,6 +538,5 @@ def build_backend(settings: BackendSettings, scale_factor: float, levels: int, e
         levels: Number of pyramid levels of the features.
         extractor: Id of the feature extractor.
     """
-    if isinstance(settings, MonocularBackendSettings):
-        return MonocularBackend(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)
-    return RgbdBackend(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)
+    kind = MonocularBackend if isinstance(settings, MonocularBackendSettings) else RgbdBackend
+    return kind(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)

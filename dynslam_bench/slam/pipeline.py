@@ -138,44 +138,39 @@ class SlamPipeline:
             frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
         clock = StageClock(self._cached)
         self._backend.resume()  # filters read the map as it was before a `finalize`
-        bundle = self._extract(frame, camera, clock)
+        gray, depth = _prepare(frame)
+        instances, mask = self._segment(frame, gray, depth, clock)
+        keypoints = self._extract(gray, mask, clock)
+        xy, z = _undistorted(keypoints, depth, camera)
+        bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
         static = self._cull(bundle, state, clock)
         result = self._backend.track(bundle, static.keep, static.weight)
         self._remember(bundle, static, result)
+        timings = clock.seconds | dict(result.timings)
+        stats = self._stats(bundle, state, static, result)
         return TrackResult(
-            result.T_world_cam,
-            result.state,
-            self._stats(bundle, state, static, result),
-            clock.seconds | dict(result.timings),
-            static.mask,
-            bundle.keypoints.xy,
-            static.keep,
+            result.T_world_cam, result.state, stats, timings, static.mask, bundle.keypoints.xy, static.keep
         )
 
-    def _extract(self, frame: Frame, camera: Camera, clock: StageClock) -> FrameBundle:
-        """Segment the image, and extract keypoints with their depth, enough of them outside the dynamic mask."""
-        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        depth = np.array(frame.depth, dtype=np.float32)  # a copy: the caller may reuse its buffer
-        if not np.isfinite(depth).all():
-            depth[~np.isfinite(depth)] = 0
-        instances = mask = None
-        if self._masks is not None:
-            with clock("segmentation"):
-                instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
-                if self._segmentation is not None and len(instances):
-                    mask = dynamic_mask(instances, self._segmentation, depth)
-        with clock("features"):
-            keypoints = self._keypoints(gray, mask)
-        column, row = np.rint(keypoints.xy).astype(np.intp).T
-        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
-        xy = camera.undistort_points(keypoints.xy)
-        return FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
+    def _segment(
+        self, frame: Frame, gray: NDArray[np.uint8], depth: NDArray[np.float32], clock: StageClock
+    ) -> tuple[Instances | None, NDArray[np.bool_] | None]:
+        """The objects in the image, and the mask of those that are dynamic because of their class."""
+        if self._masks is None:
+            return None, None
+        with clock("segmentation"):
+            instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
+            if self._segmentation is None or not len(instances):
+                return instances, None
+            return instances, dynamic_mask(instances, self._segmentation, depth)
 
-    def _keypoints(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
-        if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
-            return self._extractor.extract(gray)
-        return self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+    def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None, clock: StageClock) -> Keypoints:
+        """Keypoints, enough of them outside the dynamic mask."""
+        with clock("features"):
+            if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
+                return self._extractor.extract(gray)
+            return self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
 
     def _filter_state(self, bundle: FrameBundle, camera: Camera) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
@@ -316,3 +311,21 @@ class SlamPipeline:
 def groups_of(dynamic_filter: DynamicFilter) -> tuple[str, ...]:
     """The groups of settings that a filter takes; its name alone where it does not say."""
     return tuple(getattr(dynamic_filter, "groups", (dynamic_filter.name,)))
+
+
+def _prepare(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The grey image, and a copy of the depth image in metres, 0 where depth is missing or not finite."""
+    gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    depth = np.array(frame.depth, dtype=np.float32)
+    if not np.isfinite(depth).all():
+        depth[~np.isfinite(depth)] = 0
+    return gray, depth
+
+
+def _undistorted(
+    keypoints: Keypoints, depth: NDArray[np.float32], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Undistorted pixels of keypoints, and the depth there."""
+    column, row = np.rint(keypoints.xy).astype(np.intp).T
+    z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
+    return camera.undistort_points(keypoints.xy), z

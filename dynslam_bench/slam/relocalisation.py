@@ -294,18 +294,25 @@ class PoseSearch:
     settings: BackendSettings
     seed: int
     frame: int
+    _weak: tuple[Matches, PoseEstimate] | None = None
 
-    def run(self) -> InitialPose | None:
-        """The pose from the last frame, else by relocalisation; None if neither gives one.
-
-        A pose that few matches agree on, as by chance after a gap or a sudden rotation, has to compete with those of
-        keyframes, and has to be within the motion bound. After a loss it counts only if the place is verified.
-        """
+    def from_last_frame(self) -> InitialPose | None:
+        """The pose from the last frame, if enough of its points agree and the camera was not lost."""
         if self.lost:
             self.bound()  # advances the rotation from image to image, whatever is recognised
-        weak, trusted = self._match_last_frame()
-        if weak is not None and trusted and not self.lost:
-            return InitialPose.of(*weak, self.reference, relocalised=False)
+        self._weak, trusted = self._match_last_frame()
+        if self._weak is None or not trusted or self.lost:
+            return None
+        return InitialPose.of(*self._weak, self.reference, relocalised=False)
+
+    def relocalised(self) -> InitialPose | None:
+        """The pose from keyframes; called after `from_last_frame`.
+
+        A pose from the last frame that few matches agree on, as by chance after a gap or a sudden rotation, competes
+        with those of keyframes, and has to be within the motion bound. After a loss it counts only if the place is
+        verified.
+        """
+        weak = self._weak
         if weak is not None and self.lost:
             verified = self._verified(PnpPose(self.reference, *weak))
             if verified is not None:
