@@ -308,7 +308,7 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
         tables[name] = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
         tables[name][in_use] = rows
     tables["kf_point"][~in_use] = -1
-    tables["obs_at"], tables["obs_room"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
+    tables["obs_at"], tables["obs_capacity"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
     tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)

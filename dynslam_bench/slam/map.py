@@ -35,9 +35,9 @@ class Map:
 
     Attributes (points, by slot):
         alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
-        the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible, found (frames that should
-        have and did see it), born (id of the keyframe that made it), n_obs, obs_at and obs_room (how many observations
-        it has, where they begin in obs_kf and obs_ft, and how many it has room for there).
+        the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible and found (frames that
+        should have and did observe it), born (id of the keyframe that made it), n_obs, obs_at and obs_capacity (how
+        many observations it has, where they begin in obs_kf and obs_ft, and how many fit there).
 
     Attributes (others):
         index: Sorted substrings of the keyframes' descriptors.
@@ -102,7 +102,7 @@ class Map:
         self.born = np.zeros(m, np.int64)
         self.n_obs = np.zeros(m, np.int32)
         self.obs_at = np.zeros(m, np.int64)
-        self.obs_room = np.zeros(m, np.int32)
+        self.obs_capacity = np.zeros(m, np.int32)
         self.obs_kf = np.zeros(0, np.int32)
         self.obs_ft = np.zeros(0, np.int32)
 
@@ -116,7 +116,7 @@ class Map:
     )  # fmt: skip
     _POINT_TABLES = (
         "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_at",
-        "obs_room",
+        "obs_capacity",
     )  # fmt: skip
 
     # ------------------------------------------------------------------ keyframes
@@ -342,11 +342,11 @@ class Map:
 
     def _reserve(self, points: Slots, more: int) -> None:
         """Make room for so many more observations of each of the points; the room that they leave is used again."""
-        full = self.n_obs[points] + more > self.obs_room[points]
+        full = self.n_obs[points] + more > self.obs_capacity[points]
         if not full.any():
             return
         short = np.unique(points[full])
-        capacities = np.maximum(2 * self.obs_room[short], MIN_CAPACITY)
+        capacities = np.maximum(2 * self.obs_capacity[short], MIN_CAPACITY)
         if more > 1:
             capacities = np.maximum(capacities, self.n_obs[short] + more)
         for capacity in np.unique(capacities).tolist():
@@ -359,9 +359,9 @@ class Map:
                 length = max(self._observations, self.obs_kf.size + self.obs_kf.size // 2)
                 self._grow("obs_kf", length)
                 self._grow("obs_ft", length)
-            left = zip(self.obs_room[moving].tolist(), self.obs_at[moving].tolist(), strict=True)
+            left = zip(self.obs_capacity[moving].tolist(), self.obs_at[moving].tolist(), strict=True)
             kernels.move(*self._observed, moving, np.concatenate([np.array(reused, np.int64), fresh]))
-            self.obs_room[moving] = capacity
+            self.obs_capacity[moving] = capacity
             for size, begin in left:
                 if size:
                     self._vacant.setdefault(size, []).append(begin)

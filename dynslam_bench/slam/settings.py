@@ -1,6 +1,6 @@
 """Settings of the back end; importing this loads neither OpenCV nor numba.
 
-Thresholds that nobody needs to change are constants beside the rule that uses them.
+Thresholds that few users need to change are constants beside the rule that uses them.
 """
 
 from __future__ import annotations

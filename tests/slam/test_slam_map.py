@@ -36,9 +36,9 @@ def test_points_and_keyframes_agree_on_their_observations(room):
     pairs = zip(world.obs_kf[rows], world.obs_ft[rows], strict=True)
     by_point = dict(zip(pairs, np.repeat(points, world.n_obs[points]), strict=True))
     assert by_feature == by_point and len(by_point) > 1000
-    begin, end = world.obs_at[points], world.obs_at[points] + world.obs_room[points]
+    begin, end = world.obs_at[points], world.obs_at[points] + world.obs_capacity[points]
     order = np.argsort(begin)
-    assert (end[order][:-1] <= begin[order][1:]).all() and (world.n_obs[points] <= world.obs_room[points]).all()
+    assert (end[order][:-1] <= begin[order][1:]).all() and (world.n_obs[points] <= world.obs_capacity[points]).all()
 
 
 @pytest.mark.parametrize("largest", [0, 1, 50, 400])
