@@ -45,7 +45,7 @@ class DescriptorIndex:
             count = self._substrings[slot].shape[1] if self._ids.get(slot) == ids[slot] else -1
             if count < 0 or abs(observed[slot] - count) > CHANGED * count:
                 substrings = words[slot, kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE]
-                self._ids[slot], self._substrings[slot] = int(ids[slot]), np.sort(substrings.T, axis=1)
+                self._ids[slot], self._substrings[slot] = int(ids[slot]), np.sort(np.ascontiguousarray(substrings.T))
 
     def score(self, slots: Slots, words: NDArray[Any]) -> tuple[NDArray[np.float64], Slots]:
         """For each of the keyframes ``[K]`` the sum of the weights of the shared substrings, and its number of points.
