@@ -79,7 +79,6 @@ reward_m  # a column of frames.csv
 _.append_logs  # Optuna calls it: a backend of its journal
 _.tempdir  # tempfile reads it: where a run's temporary files go
 _.row_poses  # rendered sequences: the exact pose of every row
-_.bytes_in_files  # on a map's TableSpace: what of it lies in files (tests/benchmarks/backend_territory.py)
 pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
 _.runtest  # pytest calls it

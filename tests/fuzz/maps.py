@@ -20,7 +20,7 @@ FEATURES = MapFeatures(extractor="orb", levels=8, scale_factor=1.2)
 
 
 def _sound() -> dict[str, Any]:
-    """Two keyframes of three and two features, two points that both see, an island."""
+    """Two keyframes of three and two features, two points that both see, a submap."""
     header = MapHeader(
         sensors="rgbd", camera=described(CAMERA), features=FEATURES, next_keyframe=4, next_point=9, made_by="nobody"
     )
@@ -37,7 +37,7 @@ def _sound() -> dict[str, Any]:
         "visible": np.ones(2, np.int32), "found": np.ones(2, np.int32), "born": np.array([0, 1]),
         "n_obs": np.array([2, 2], np.int32), "obs_kf": np.array([0, 1, 0, 1], np.int32),
         "obs_ft": np.array([2, 0, 0, 1], np.int32), "submap_start": np.zeros((1, 3)),
-        "submap_anchor": np.zeros((1, 3)), "submap_reach": np.array([np.inf]),
+        "submap_anchor": np.zeros((1, 3)), "submap_bound": np.array([np.inf]),
     }  # fmt: skip
 
 
@@ -63,12 +63,13 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 def _read(data: bytes | None, folder: Path) -> None:
     """What is read is worked on as a run does, whose compiled loops check no index."""
-    world, submaps = map_store.begin_map(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    atlas = open_atlas(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    world = atlas.world
     world.refresh(world.points)
     for slot in world.keyframes.tolist():
         world.covisible(slot)
         world.project(world.kf_pose[slot], world.points)
-    map_store.packed(world, submaps)
+    packed(atlas)
     world.remove_keyframe(int(world.keyframes[0]))
 
 

@@ -37,21 +37,13 @@ def offered() -> dict[str, tuple[str, Parameter]]:
 
 
 OFFERED = offered()
-MANY = {
-    "backend.keyframes.tracked_share": 0.95,
-    "backend.keyframes.established": 1,
-    "backend.keyframes.moved_share": 1.0,
-    "backend.keyframes.view_share": 0.98,
-}
+MANY = {"backend.keyframes.tracked_share": 1.0}
 """A keyframe nearly every frame."""
 JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
 """F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.keyframes.redundant_share": ("orb-slam2", MANY),
-    "backend.mapping.neighbours": ("orb-slam2", MANY),
-    "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
-    "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
     "multiview.order": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
@@ -67,11 +59,10 @@ SHOWN_ALONE = frozenset({
     "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
     "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
     "backend.keyframes.max_gap", "backend.bundle_adjustment.window",
-    *(f"backend.relocalisation.{name}" for name in ("candidates", "iterations", "max_distance")),
 })  # fmt: skip
 """Settings that change nothing on these few frames: most ask for long maps, for long ages, or for being lost.
 
-`test_culling_settings_act` and `test_slam_settings_act` show each of them on a scene made for it.
+`test_culling_settings_act` and `test_slam_backend` show each of them on a scene made for it.
 """
 
 

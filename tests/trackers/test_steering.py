@@ -38,14 +38,6 @@ def online() -> dict[str, tuple[str, Parameter]]:
 ONLINE = online()
 KEYFRAMES = {"backend.keyframes.tracked_share": 1.0, "free_space.min_share": 0.0}
 CASES: dict[str, tuple[str, dict[str, object]]] = {
-    "backend.keyframes.view_share": ("orb-slam2", {
-        "backend.keyframes.tracked_share": 0.4, "backend.keyframes.new_close": 400,
-        "backend.keyframes.moved_share": 0.8,
-    }),
-    "backend.keyframes.moved_share": ("orb-slam2", {
-        "backend.keyframes.tracked_share": 0.95, "backend.keyframes.new_close": 400,
-        "backend.keyframes.established": 5, "backend.keyframes.view_share": 0.5,
-    }),
     "epipolar.threshold_px": ("emfoa-oft-object", {}),
     "epipolar.min_share": ("emfoa-oft-paper-no-masks", {}),
     "free_space.threshold_m": ("emfoa-oft-no-masks", {
@@ -62,7 +54,7 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
     "segmentation.max_carry": ("detect-slam", {
-        "backend.keyframes.tracked_share": 0.4, "backend.keyframes.new_close": 1000, "probability.threshold": 0.99,
+        "backend.keyframes.tracked_share": 0.4, "probability.threshold": 0.99,
     }),
     "class_rule.depth_m": ("seg-slam", {"segmentation.classes": "chair", "class_rule.movable": "person"}),
 }  # fmt: skip
