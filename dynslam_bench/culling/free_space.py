@@ -24,13 +24,13 @@ PATCH = np.ones((7, 7), np.uint8)
 class FreeSpaceFilter(Rule[FreeSpaceSettings]):
     """Drops points that violate the free space of several keyframes.
 
-    Stats: ``dropped``, ``keyframes`` (compared), ``tested`` (points in the view of at least one of them).
+    Stats: ``dropped``, ``asked`` (keyframes compared), ``tested`` (points in the view of at least one of them).
     """
 
     name = "free_space"
     needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
     provenance: Provenance = "assumed"
-    stats_names = ("dropped", "keyframes", "tested")
+    stats_names = ("dropped", "asked", "tested")
 
     def __init__(self, settings: FreeSpaceSettings) -> None:
         super().__init__(settings)
@@ -46,7 +46,7 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         keyframes = [view for view in recent if view.depth is not None][:KEYFRAMES]
         rows = np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(rows):
-            return FilterResult.of(np.ones(len(frame), dtype=bool), {"keyframes": 0.0, "tested": 0.0})
+            return FilterResult.of(np.ones(len(frame), dtype=bool), {"asked": 0.0, "tested": 0.0})
         points = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
         votes = np.zeros(len(frame), dtype=int)
         tested = np.zeros(len(frame), dtype=bool)
@@ -58,7 +58,7 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         self._nearest = {image: depths for image, depths in self._nearest.items() if image in compared}
         violating = votes >= min(self.settings.min_votes, len(keyframes))
         moving = coherent(violating, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
-        return FilterResult.of(~moving, {"keyframes": float(len(keyframes)), "tested": float(np.count_nonzero(tested))})
+        return FilterResult.of(~moving, {"asked": float(len(keyframes)), "tested": float(np.count_nonzero(tested))})
 
     def _violations(
         self, view: KeyframeView, points: NDArray[np.float64], camera: Camera
