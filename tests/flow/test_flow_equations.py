@@ -8,7 +8,6 @@ import numpy as np
 import optuna
 import pytest
 import torch
-from moth_flame_minimiser import emfoa_minimise
 
 from dynslam_bench.flow import moth_flame as rules
 from dynslam_bench.flow.matching_cost import tables_for
@@ -81,7 +80,9 @@ def test_numpy_torch_and_the_kernel_follow_the_equations(family, iteration):
     box = np.full(4, 1e9, np.float32)
     flying, steps = moths.copy(), scale.astype(np.float32)
     state = np.uint64(iteration + 77)
-    move_moths(flying, flames, -box, box, iteration - 1, table, rules.spiral_table(), rules.cauchy_table(), steps, state)
+    move_moths(
+        flying, flames, -box, box, iteration - 1, table, rules.spiral_table(), rules.cauchy_table(), steps, state
+    )
     # the spiral is looked up in steps of 1/1024: its slope is at most 2 pi e^2 outside, 2 pi e inside t <= 1
     looked_up = abs(flames - moths) * 2 * np.pi * np.exp(2 if family.as_printed else 1) / 1024 + 1e-3
     assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all()
