@@ -26,9 +26,7 @@ class FeatureSettings(Settings):
         meaning="FAST contrast accepted in cells where the first threshold gives no corner",
     )  # fmt: skip
     levels: int = Field(8, ge=1, le=16, description="levels of the image pyramid")
-    scale_factor: float = Field(
-        1.2, ge=1.01, le=3.0, description="ratio of the sizes of consecutive pyramid levels"
-    )
+    scale_factor: float = Field(1.2, ge=1.01, le=3.0, description="ratio of the sizes of consecutive pyramid levels")
     cell_px: int = Field(
         30, ge=4, le=1000, description="side of the cells over which keypoints are spread, in pixels of each level"
     )
