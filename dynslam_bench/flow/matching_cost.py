@@ -87,7 +87,7 @@ class Reference(NamedTuple):
 
 
 class MatchingCosts(NamedTuple):
-    """What the searches compute costs from: points, the image they are sought in, tables."""
+    """Arguments of the cost: points, target image, tables."""
 
     reference: Reference
     target: Side
@@ -327,9 +327,9 @@ def parabola(
         stop: One past the last.
         labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
         step: Pixels.
-        reference: `cost.Reference`.
-        target: `cost.Side`.
-        tables: `cost.CostTables`.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
         used: int64 ``[N]``, cost evaluations, counted on.
     """
     far = np.int64(1 << 40)

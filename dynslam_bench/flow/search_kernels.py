@@ -129,10 +129,10 @@ def moth_flame_phase(
     Args:
         start: First point.
         stop: One past the last.
-        reference: `cost.Reference`.
-        target: `cost.Side`.
-        tables: `cost.CostTables`.
-        state: `common.SearchState`, changed in place.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
+        state: `search_kernels.SearchState`, changed in place.
         candidates: float32 ``[N, C, 4]``, labels to try first (neighbours', the guess, ...); not finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 initialises the population.
@@ -286,10 +286,10 @@ def shrinking_window_phase(
     Args:
         start: First point.
         stop: One past the last.
-        reference: `cost.Reference`.
-        target: `cost.Side`.
-        tables: `cost.CostTables`.
-        state: `common.SearchState`, changed in place; only the best label is used.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
+        state: `search_kernels.SearchState`, changed in place; only the best label is used.
         candidates: float32 ``[N, C, 4]``, labels to try first; not finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase.

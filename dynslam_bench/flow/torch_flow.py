@@ -80,7 +80,7 @@ def label_costs(points: Tensor, labels: Tensor, descriptors: Tensor, histograms:
 
     Args:
         points: float32 ``[N, 2]``.
-        labels: float32 ``[N, L, 4]``; labels that are not finite or leave the image cost `cost.OUTSIDE`.
+        labels: float32 ``[N, L, 4]``; labels that are not finite or leave the image cost `matching_cost.OUTSIDE`.
         descriptors: uint8 ``[N, S, ROTATIONS, 17, 8]``.
         histograms: uint8 ``[total, 8]`` of the target.
         tables: Of the image size.
@@ -108,7 +108,7 @@ def label_costs(points: Tensor, labels: Tensor, descriptors: Tensor, histograms:
 
 
 class TorchState:
-    """The batched counterpart of `searches.common.SearchState`."""
+    """The batched counterpart of `search_kernels.SearchState`."""
 
     def __init__(
         self, points: Tensor, descriptors: Tensor, histograms: Tensor, tables: TorchTables, lower: Tensor,
@@ -142,14 +142,14 @@ class TorchState:
         self.flames = everything.gather(1, best[..., None].expand(-1, -1, 4))
 
     def widen(self) -> None:
-        """Let each box contain the surroundings of the best displacement (see `searches.common.widen`)."""
+        """Extend the bounds to 8 px around the best displacement (see `search_kernels.widen`)."""
         best = self.flames[:, :1, :2]
         self.lower[..., :2] = self.lower[..., :2].minimum(best - 8)
         self.upper[..., :2] = self.upper[..., :2].maximum(best + 8)
 
 
 def random_phase(state: TorchState, candidates: Tensor, end: int, shrink: float) -> None:
-    """The batched counterpart of `searches.patchmatch.shrinking_window_phase`."""
+    """The batched counterpart of `search_kernels.shrinking_window_phase`."""
     state.evaluate(candidates, end)
     state.widen()
     window, extent = 0.5, state.upper - state.lower
@@ -169,7 +169,7 @@ def moth_flame_phase(
     state: TorchState, candidates: Tensor, end: int, phase: int, rules: MothFlameRules, iterations: int,
     steps: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """The batched counterpart of `searches.moth_flame_kernel.moth_flame_phase` (Eq. 4-22)."""
+    """The batched counterpart of `search_kernels.moth_flame_phase` (Eq. 4-22)."""
     count, population = state.costs.shape
     device = state.points.device
     state.evaluate(candidates, end)
@@ -178,8 +178,8 @@ def moth_flame_phase(
         placed = min(candidates.shape[1], population)
         state.moths = state.lower + (state.upper - state.lower) * state.random((count, population, 4))
         state.evaluate(state.moths[:, placed:], end)
-        known = candidates[:, :placed].isfinite().all(-1, keepdim=True)
-        state.moths[:, :placed] = torch.where(known, candidates[:, :placed], state.moths[:, :placed])
+        finite = candidates[:, :placed].isfinite().all(-1, keepdim=True)
+        state.moths[:, :placed] = torch.where(finite, candidates[:, :placed], state.moths[:, :placed])
         if rules.opposition:
             least, greatest = state.moths.amin(1, keepdim=True), state.moths.amax(1, keepdim=True)  # Eq. 20
             state.evaluate(opposites(torch, state.moths, least, greatest, state.lower, state.upper, state.random), end)
