@@ -7,7 +7,6 @@ relative_to_first  # on a Trajectory, for users who compare with systems that st
 of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
-emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
 compile_kernels  # cli.kernels: .ci/run calls it, before the tests

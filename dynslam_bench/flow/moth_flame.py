@@ -1,9 +1,9 @@
 """The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-All searches take them from here: the batched torch search (`torch_flow`), the compiled label search
-(`search_kernels`, which reads `flight_table`, `spiral_table` and `cauchy_table`), the Optuna sampler
-(`dynslam_bench.tuning.samplers`) and the tests' minimiser of benchmark functions. `xp` is numpy or torch; moths
-and flames are arrays of any leading shape with the dimensions of the problem last; `uniform(shape)` draws from [0, 1).
+All searches take them from here: the batched torch search (`torch_flow`), the compiled label search (`search_kernels`,
+which reads `flight_table`, `spiral_table` and `cauchy_table`) and the Optuna sampler (`dynslam_bench.tuning.samplers`).
+`xp` is numpy or torch. Moths and flames are arrays of any leading shape with the dimensions of the problem last;
+`uniform(shape)` draws from [0, 1).
 """
 
 from __future__ import annotations

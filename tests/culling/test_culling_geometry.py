@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import ACROSS, CAMERA, ROTATION, SIDEWAYS, Scene, box_instance, bundle, keyframe, on_rectangle, scene, splat
+from scenes import ACROSS, CAMERA, ROTATION, SIDEWAYS, Scene, box_instance, keyframe, on_rectangle, scene
 
-from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FilterState
 from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_variance, point_covariance
 from dynslam_bench.culling.ego_motion import CORRELATION, coherent, depth_sigma, prior_information, refine_prediction
@@ -24,7 +23,6 @@ from dynslam_bench.culling.settings import (
     RigidMotionSettings,
 )
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.backend import RgbdBackend
 
 FORWARD = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
 
@@ -168,25 +166,6 @@ def test_information_is_rotated_with_the_camera() -> None:
     np.testing.assert_allclose(np.diag(information)[:3], expected, rtol=1e-6)
     assert information == pytest.approx(information.T)
     assert prior_information(FilterState(CAMERA, np.ones(0, bool)), np.eye(4)) is None
-
-
-def test_the_back_end_s_motion_covariance_shrinks_once_it_knows_the_speed_and_ends_when_lost() -> None:
-    rng = np.random.default_rng(0)
-    points = CAMERA.unproject(rng.uniform((60, 60), (580, 420), (400, 2)), rng.uniform(1.5, 3.5, 400))
-    backend = RgbdBackend()
-    backend.reset(CAMERA, seed=0)
-    assert backend.motion_covariance(0.0) is None
-    descriptors, widths = rng.integers(0, 256, (2, 400, 32), dtype=np.uint8), []
-    for i in range(7):
-        local = se3.transform(se3.inverse(se3.exp(np.array([0.003 * i, 0, 0, 0, 0, 0]))), points)
-        xy = CAMERA.project(local)
-        frame = bundle(xy, local[:, 2], splat(xy, local[:, 2], 5.0), i / 30)
-        frame.keypoints = Keypoints(*list(vars(frame.keypoints).values())[:4], descriptors[int(i == 6)])
-        result = backend.track(frame, np.ones(400, bool), np.ones(400, np.float32))
-        assert result.state == ("lost" if i == 6 else "ok")
-        covariance = backend.motion_covariance((i + 1) / 30)
-        widths.append(np.nan if covariance is None else float(np.sqrt(covariance[:3, :3].trace())))
-    assert widths[5] < 0.5 * np.nanmax(widths) and widths[5] < 0.01 and np.isnan(widths[6])
 
 
 def test_epipolar_distance_agrees_with_the_definition() -> None:
