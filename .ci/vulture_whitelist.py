@@ -7,9 +7,6 @@ relative_to_first  # on a Trajectory, for users who compare with systems that st
 of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
-BoxFilter  # a rejection rule for systems of one's own, held to its paper by tests/culling
-emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
-hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
 compile_kernels  # cli.kernels: .ci/run calls it, before the tests
@@ -18,8 +15,6 @@ exact_depth  # on rendered sequences: depth without the sensor's noise, to judge
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
 build_daisy  # flow.registry
-build_lucas_kanade  # flow.registry
-build_dis  # flow.registry
 build_recorded  # segmentation.registry
 build_onnx  # segmentation.registry
 build_embedded  # segmentation.registry

@@ -72,8 +72,8 @@ ROWS: dict[str, tuple[str, dict[str, object]]] = {
     "emfoa-oft-no-masks-no-depth-test": ("emfoa-oft-no-masks-no-depth-test", {}),
     "emfoa-oft-paper-no-masks": ("emfoa-oft-paper-no-masks", {}),
     "emfoa-oft-paper-no-masks with the guard and sparse flow": (
-        "emfoa-oft-paper-no-masks",
-        {**GUARDED, "flow.mode": "sparse", "flow.terms": 1},
+        "emfoa-oft-no-masks-no-depth-test",
+        {"epipolar.parallax_share": 0.0, "epipolar.min_share": 0.0, "epipolar.max_contradiction": 1.0},
     ),
     "orb-slam2": ("orb-slam2", {}),
 }

@@ -28,7 +28,7 @@ from dynslam_bench.tuning.evaluate import evaluate
 from dynslam_bench.tuning.objectives import SPEED
 from dynslam_bench.tuning.summary import compared
 
-UNMASKED = ("features.n_features", "motion.enabled", "motion.threshold_px", "motion.min_share",
+UNMASKED = ("features.n_features", "motion.enabled", "motion.threshold_px", "motion.threshold_sigma",
             "epipolar.threshold_px", "backend.keyframes.max_gap")  # fmt: skip
 MASKED = ("features.n_features", "segmentation.dilation_px", "segmentation.confidence", "segmentation.mask_threshold",
           "backend.keyframes.max_gap")  # fmt: skip

@@ -49,15 +49,11 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     }),
     "segmentation.mask_threshold": NETWORK,
     "segmentation.nms_iou": NETWORK,
-    "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
-    **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
-    **{f"epipolar.{name}": ("emfoa-oft-paper-sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
 }  # fmt: skip
 """Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
 SHOWN_ALONE = frozenset({
-    "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
-    "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
-    "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
+    "correlation.largest", "moving_vote.corners", "class_rule.vote_share", "box_depth.max_cover",
+    "multiview.max_parallax_deg", "depth_ransac.max_draws",
     "backend.keyframes.max_gap", "backend.bundle_adjustment.window",
 })  # fmt: skip
 """Settings that change nothing on these few frames: most ask for long maps, for long ages, or for being lost.

@@ -10,11 +10,11 @@ from pydantic import Field
 
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
-from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.culling.settings import Unmatched
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
@@ -81,7 +81,7 @@ def compose(
     settings: SystemSettings,
     context: TrackerContext,
     filters: Sequence[DynamicFilter] = (),
-    flow: FlowSettings | None = None,
+    flow: FlowMethodSettings | None = None,
 ) -> SlamPipeline:
     """The pipeline of a system.
 
@@ -184,11 +184,11 @@ CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convo
 """The paper's improved mask branch, as far as it is there."""
 
 
-class PublishedFlowSettings(FlowSettings):
+class PublishedFlowSettings(FlowMethodSettings):
     """Lucas-Kanade as published systems use it: no source of theirs names a check on the way back, so there is none."""
 
-    method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
-        "lucas-kanade", meaning="which flow; the published one is Lucas-Kanade"
+    method: Literal["daisy", "lucas-kanade", "dis"] = Field(
+        "lucas-kanade", description="which flow; the published one is Lucas-Kanade"
     )
     forward_backward_px: float = Field(
         0.0,
@@ -224,7 +224,7 @@ def grown_in_words(segmentation: SegmentationSettings) -> str:
     return f"masks grown by {segmentation.dilation_px} px (not stated)"
 
 
-def tracks_in_words(flow: FlowSettings) -> str:
+def tracks_in_words(flow: FlowMethodSettings) -> str:
     """How a system's flow is computed."""
     check = (
         f"a check of {flow.forward_backward_px:g} px on the way back"
@@ -234,12 +234,12 @@ def tracks_in_words(flow: FlowSettings) -> str:
     return f"Lucas-Kanade tracks (window {flow.window_px} px, begun at the motion model's guess, {check})"
 
 
-def matches_in_words(flow: FlowSettings, unmatched: Unmatched) -> str:
+def matches_in_words(flow: FlowMethodSettings, unmatched: Unmatched) -> str:
     """How a system that tests matches finds them, and what becomes of the features that have none."""
     return f"matches are {tracks_in_words(flow)}; {LOST[unmatched]}"
 
 
-def links_in_words(flow: FlowSettings) -> str:
+def links_in_words(flow: FlowMethodSettings) -> str:
     """How a system with a memory of features follows them, and what becomes of those that have no past."""
     return f"features are followed by {tracks_in_words(flow)}, not by descriptors; one without a past begins at 0.5"
 

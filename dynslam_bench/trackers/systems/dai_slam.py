@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.settings import CorrelationSettings
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.trackers.systems.composition import SystemSettings, compose, tracks_in_words
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ class DaiSlamSettings(SystemSettings):
     """The correlation graph on Lucas-Kanade tracks."""
 
     correlation: CorrelationSettings = CorrelationSettings()
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: FlowMethodSettings = FlowMethodSettings(method="lucas-kanade")
 
 
 def build(settings: DaiSlamSettings, context: TrackerContext) -> SlamPipeline:

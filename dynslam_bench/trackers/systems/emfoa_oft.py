@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
 from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, RigidMotionSettings
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 from dynslam_bench.trackers.systems.composition import (
     CFPN,
     FAST_FLOW,
@@ -53,7 +53,7 @@ class MaskedEpipolarTestSettings(EpipolarTestSettings, SemanticSystemSettings):
 class LucasKanadeSettings(EmfoaOftSettings):
     """Lucas-Kanade flow."""
 
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: FlowMethodSettings = FlowMethodSettings(method="lucas-kanade")  # type: ignore[assignment]
 
 
 class PatchMatchSettings(EmfoaOftSettings):
@@ -85,7 +85,7 @@ class ObjectVoteDepthTestSettings(EmfoaOftSettings):
 class PaperTestSettings(EpipolarTestSettings):
     """The paper's flow, dense and with all terms, and its test: F judges every frame, every failing point goes."""
 
-    flow: FlowSettings = FlowSettings(mode="dense", terms=3)
+    flow: DenseFlowSettings = DenseFlowSettings(terms=3)  # type: ignore[assignment]
     epipolar: EpipolarSettings = EpipolarSettings(
         min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
     )
@@ -98,7 +98,7 @@ class PaperSettings(PaperTestSettings, SemanticSystemSettings):
 class PaperSparseSettings(PaperSettings):
     """The paper's test on the flow of our own system."""
 
-    flow: FlowSettings = FlowSettings()
+    flow: FlowSettings = FlowSettings()  # type: ignore[assignment]
 
 
 def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
@@ -160,7 +160,7 @@ def _assumptions(name: str, settings: type[SystemSettings]) -> tuple[str, ...]:
         return (*said, SENSOR)
     said += NOT_STATED
     if defaults.flow.method == "daisy":
-        said += DENSE if defaults.flow.mode == "dense" else [SPARSE]
+        said += DENSE if isinstance(defaults.flow, DenseFlowSettings) else [SPARSE]
     if not issubclass(settings, PaperTestSettings):
         said += [SKIPPED, GUARDS]
     if issubclass(settings, DepthTestSettings):

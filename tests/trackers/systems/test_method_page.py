@@ -11,7 +11,7 @@ from quick_dense import QUICK_DENSE
 import dynslam_bench
 from dynslam_bench.flow import dense_flow as dense
 from dynslam_bench.flow import dense_kernels as aggregation
-from dynslam_bench.flow.dense_flow import DensePointFlow
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow
 from dynslam_bench.flow.sparse import SparseDaisyFlow
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
@@ -54,8 +54,8 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch) 
     monkeypatch.setattr(dense, "aggregate_and_choose", spy)
     assert chosen is aggregation.aggregate_and_choose
     context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
-    quick = QUICK_DENSE | {"flow.dense_second_round": True}
-    for name, kind, terms in (("emfoa-oft", SparseDaisyFlow, 1), ("emfoa-oft-paper", DensePointFlow, 3)):
+    quick = QUICK_DENSE | {"flow.second_round": True}
+    for name, kind, terms in (("emfoa-oft", SparseDaisyFlow, 1), ("emfoa-oft-paper", DenseDaisyFlow, 3)):
         calls.clear()
         tracker = build_tracker(name, {"segmentation.source": "oracle", **(quick if terms == 3 else {})}, context)
         assert isinstance(tracker, SlamPipeline) and isinstance(tracker._flow, kind)

@@ -20,10 +20,12 @@ def textured(n_features: int) -> FrameBundle:
     """A frame full of corners, with the features that the extractor finds in it."""
     noise = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
     gray = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
-    found = OrbExtractor(FeatureSettings(n_features=n_features)).extract(gray)
-    xy = found.xy.astype(np.float64)
+    features = OrbExtractor(FeatureSettings(n_features=n_features)).extract(gray)
+    xy = features.xy.astype(np.float64)
     depth = np.full(gray.shape, 2.0, np.float32)
-    return FrameBundle(0, 0.0, np.zeros((480, 640, 3), np.uint8), gray, depth, found, xy, np.full(len(xy), 2.0, "f4"))
+    return FrameBundle(
+        0, 0.0, np.zeros((480, 640, 3), np.uint8), gray, depth, features, xy, np.full(len(xy), 2.0, "f4")
+    )
 
 
 def ids(frame: FrameBundle, rows: np.ndarray) -> set[tuple[float, float, int]]:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
+from pictures import moved, moved_points, picture
 
 from dynslam_bench.flow.dense_flow import DenseDaisyFlow, consistent
 from dynslam_bench.flow.dense_kernels import filter_patch, superpixels
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import DenseFlowSettings
 
 
 def guided_filter(guide, values, radius, epsilon):
     """`filter_patch` of a whole image."""
-    guide, values = (np.ascontiguousarray(each, np.float32) for each in (guide, values))
+    guide, values = (np.ascontiguousarray(array, np.float32) for array in (guide, values))
     out, work = np.empty_like(guide), np.empty((6, guide.size), np.float32)
     size = guide.shape
     filter_patch(guide.ravel(), values.ravel(), *size, radius, np.float32(epsilon), work, out.reshape(-1))
@@ -92,27 +92,16 @@ def test_consistency_check():
     assert not consistent(forward, backward, 1.0)[5, 3]
 
 
-def scene(seed=0, shape=(120, 160)):
-    rng = np.random.default_rng(seed)
-    layers = [
-        cv2.resize(rng.uniform(0, 1, (shape[0] // k, shape[1] // k)), shape[::-1], interpolation=cv2.INTER_CUBIC)
-        for k in (3, 8, 20)
-    ]
-    return np.clip(sum(layers) * 85, 0, 255).astype(np.uint8)
-
-
 def test_dense_flow_of_a_similarity_and_its_thread_independence():
-    image = scene(1)
-    matrix = cv2.getRotationMatrix2D((80, 60), -6, 1.08)
-    matrix[:, 2] += 7, -5
-    target = cv2.warpAffine(image, matrix, (160, 120), borderMode=cv2.BORDER_REFLECT)
+    image = picture(1, (120, 160))
+    target, matrix = moved(image, 1.08, 6, 7, -5)
     results = []
     for threads in (1, 2):
-        dense = DenseDaisyFlow(FlowSettings(dense_range_px=32), threads=threads)
+        dense = DenseDaisyFlow(DenseFlowSettings(range_px=32), threads=threads)
         results.append(dense.flow(dense.prepare(image), dense.prepare(target), seed=3))
     np.testing.assert_array_equal(results[0].flow, results[1].flow)
     y, x = np.mgrid[:120, :160]
-    truth = np.stack([x, y], -1) @ matrix[:, :2].T + matrix[:, 2] - np.stack([x, y], -1)
+    truth = moved_points(np.stack([x, y], -1), matrix) - np.stack([x, y], -1)
     inner = np.s_[20:-20, 20:-20]
     error = np.linalg.norm(results[0].flow - truth, axis=2)[inner]
     assert np.median(error) < 0.3 and (error > 3).mean() < 0.05
@@ -122,13 +111,13 @@ def test_dense_flow_of_a_similarity_and_its_thread_independence():
 
 @pytest.mark.parametrize("kind", ["identical", "black", "textureless"])
 def test_dense_flow_of_degenerate_images(kind):
-    image = scene(2)
-    pair = {
+    image = picture(2, (120, 160))
+    first, second = {
         "identical": (image, image.copy()),
-        "black": (np.zeros_like(image), np.zeros_like(image) + 1),
+        "black": (np.zeros_like(image), np.ones_like(image)),
         "textureless": (np.full_like(image, 90), np.full_like(image, 120)),
     }[kind]
-    dense = DenseDaisyFlow(FlowSettings(dense_budget=16, dense_sweeps=1))
-    result = dense.flow(dense.prepare(pair[0]), dense.prepare(pair[1]))
+    dense = DenseDaisyFlow()
+    result = dense.flow(dense.prepare(first), dense.prepare(second))
     assert np.isfinite(result.flow).all()
     assert not result.valid.any() and result.stats["degenerate"] == 1
