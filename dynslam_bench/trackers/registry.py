@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from hashlib import sha256
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -130,3 +132,17 @@ _SINGLE = [import_module(f".systems.{name}", __package__).SPEC for name in _SYST
 def all_specs() -> list[TrackerSpec]:
     """Every built-in tracker's spec."""
     return [*emfoa_oft.SPECS, emfoa_oft_mono.SPEC, *dynaslam.SPECS, *chen_slam.SPECS, *_SINGLE, *adapter_specs()]
+
+
+# What was measured of the built-in trackers with their default settings and is shown where they are described.
+
+FILE = "epipolar_skipped.json"
+
+
+def epipolar_skipped(tracker: str) -> dict[str, float]:
+    """Share of the tracked frames on which no fundamental matrix judged, by sequence; empty where nothing was measured.
+
+    Written by ``tests/benchmarks/epipolar_share.py --write``; a run's own share is `RunRecord.epipolar_skipped`.
+    """
+    table = json.loads((files("dynslam_bench.trackers") / FILE).read_text(encoding="utf-8"))
+    return {sequence: float(share) for sequence, share in table.get(tracker, {}).items()}

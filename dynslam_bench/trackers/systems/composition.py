@@ -67,7 +67,7 @@ class SemanticSystemSettings(SystemSettings):
         if self.segmentation.source == "none" != default.source:
             raise SettingsError(
                 "this system needs masks, but segmentation.source is 'none'",
-                f"sources: {SOURCES}; without masks run dynaslam-g, emfoa-oft-no-masks, opf-slam or orb-slam2",
+                f"sources: {SOURCES}; without masks run dynaslam-g, emfoa-oft?masks=none, opf-slam or orb-slam2",
             )
 
 
