@@ -79,7 +79,8 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     except Exception as error:  # torch raises many types for a damaged file
         reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
         raise SegmentationError(
-            f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}", "it is truncated or of another format"
+            f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}",
+            "it is truncated or of another format",
         ) from error
     if not isinstance(content, Mapping):
         raise SegmentationError(f"{path} holds a {type(content).__name__}, not a table of weights")
@@ -227,7 +228,10 @@ def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     if half:
         state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
     content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}
-    with replacing(path) as temporary, temporary.open("wb") as file:  # an open file: torch.save writes no file name into it
+    with (
+        replacing(path) as temporary,
+        temporary.open("wb") as file,
+    ):  # an open file: torch.save writes no file name into it
         torch.save(content, file)
 
 
