@@ -26,7 +26,7 @@ from dynslam_bench.segmentation.networks.onnx_export import (
     write_onnx,
 )
 from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 
 SETTINGS = SegmentationSettings(network_side=0)
@@ -71,7 +71,7 @@ def test_fixed_shapes_give_the_same_objects(exact: bool) -> None:
     image = noise(120, 160)
     expected = MaskRCNNSegmenter(network, settings).segment(Frame(0, 0.0, image, np.zeros((120, 160), np.float32)))
     with torch.no_grad():
-        found = StaticMaskRCNN(network, 120, 160, score=0.1, iou=settings.nms_iou)(
+        found = StaticMaskRCNN(network, 120, 160, score=0.1, iou=NMS_IOU)(
             torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         )
     rows = objects(found, settings.mask_threshold)
@@ -106,7 +106,7 @@ def test_the_embedded_network_with_fixed_shapes() -> None:
     frame = open_sequence("synthetic/walking_static?scene=101&frames=40")[20]
     segmenter = MaskRCNNSegmenter.from_file(weights, SETTINGS)
     expected = segmenter.segment(frame)
-    network = StaticMaskRCNN(segmenter.network, *frame.rgb.shape[:2], score=0.1, iou=SETTINGS.nms_iou)
+    network = StaticMaskRCNN(segmenter.network, *frame.rgb.shape[:2], score=0.1, iou=NMS_IOU)
     with torch.no_grad():
         boxes, _, scores, masks = network(torch.from_numpy(frame.rgb).permute(2, 0, 1)[None].float() / 255)
     count = len(expected.scores)
@@ -141,7 +141,7 @@ def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_what_cannot_be_exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with pytest.raises(SegmentationError, match=r"'yolo' is no network of ours \(export embedded, coco or"):
+    with pytest.raises(SegmentationError, match=r"'yolo' is no network of this project \(export embedded, coco or"):
         weights_of("yolo")
     with pytest.raises(SegmentationError, match=r"'640' is no size of an image \(for example 640x480"):
         parse_size("640")

@@ -216,10 +216,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     first, second = (torch.load(tmp_path / run / "last.pt", weights_only=True) for run in ("whole", "parts"))
     assert first["step"] == second["step"] == 3
     assert all(torch.equal(value, second["network"][key]) for key, value in first["network"].items())
-    assert json.loads(first["rows"]) == json.loads(second["rows"])
-    for name in ("curve.csv", "curve.png", "best.pt", "settings.json"):
+    assert first["rows"] == second["rows"]
+    for name in ("curve.csv", "curve.html", "best.pt", "settings.json"):
         assert (tmp_path / "whole" / name).stat().st_size > 0
-    assert cv2.imread(str(tmp_path / "whole" / "curve.png")).shape[2] == 3
     assert (tmp_path / "whole" / "curve.csv").read_text().startswith("step,objectness,anchor,class,box,mask,loss,iou")
     assert load_network(whole.best).config == network_config(settings_for(data))
     with pytest.raises(SegmentationError, match="another learning_rate"):

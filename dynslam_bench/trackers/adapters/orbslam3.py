@@ -1,4 +1,4 @@
-"""The real ORB-SLAM3, through the PyPI package pyorbslam3, in a process of its own; its vocabulary and settings file."""
+"""The real ORB-SLAM3 (PyPI package pyorbslam3) in a process of its own; its vocabulary and settings file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An external program that answers JSON lines: start, ask with a time limit, end; its death becomes one clear error."""
+"""An external program that answers JSON lines; a fault or its death becomes one clear error."""
 
 from __future__ import annotations
 

@@ -11,14 +11,9 @@ from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.trackers import TRACKERS, TrackerSpec
 from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import (
-    LOST,
     PublishedFlowSettings,
     SemanticSystemSettings,
     SystemSettings,
-    grown_in_words,
-    links_in_words,
-    masks_in_words,
-    matches_in_words,
 )
 
 PUBLISHED = [
@@ -66,27 +61,6 @@ def told(spec: TrackerSpec) -> str:
     return "; ".join((*spec.assumptions, spec.remarks))
 
 
-@pytest.mark.parametrize("spec", WITH_MASKS, ids=lambda spec: spec.id)
-def test_every_masked_system_says_how_its_masks_are_selected_and_bridged(spec: TrackerSpec) -> None:
-    segmentation = spec.settings().segmentation
-    sentences = (masks_in_words(segmentation), masks_in_words(segmentation, boxes=True))
-    assert any(sentence in told(spec) for sentence in sentences), sentences[0]
-    assert f"{segmentation.confidence:g}" in sentences[0] and f"for {segmentation.compensate} " in sentences[0]
-
-
-@pytest.mark.parametrize("spec", WITH_FLOW, ids=lambda spec: spec.id)
-def test_every_system_with_flow_says_how_it_matches_and_what_becomes_of_the_rest(spec: TrackerSpec) -> None:
-    settings = spec.settings()
-    block = getattr(settings, "box_epipolar", None) or getattr(settings, "class_rule", None)
-    if spec.provenance == "assumed":
-        assert "everything" in told(spec)
-    elif block is not None:
-        assert matches_in_words(settings.flow, block.unmatched) in told(spec)
-        assert LOST[block.unmatched] in told(spec)
-    else:
-        assert links_in_words(settings.flow) in told(spec)
-
-
 def test_no_published_system_has_a_check_on_its_flow_unless_its_spec_says_so() -> None:
     checked = []
     for spec in PUBLISHED:
@@ -95,19 +69,6 @@ def test_no_published_system_has_a_check_on_its_flow_unless_its_spec_says_so() -
             assert f"a check of {flow.forward_backward_px:g} px on the way back" in told(spec), spec.id
             checked.append(spec.id)
     assert checked == ["dai-slam"]
-
-
-@pytest.mark.parametrize("name", GROW_UNSTATED)
-def test_masks_that_are_grown_without_a_source_are_named(name: str) -> None:
-    spec = TRACKERS.get(name)
-    segmentation = spec.settings().segmentation
-    assert segmentation.dilation_px > 0 and grown_in_words(segmentation) in told(spec)
-
-
-@pytest.mark.parametrize("name", sorted(NAMED))
-def test_deviations_found_by_reading_are_named(name: str) -> None:
-    for words in NAMED[name]:
-        assert words in told(TRACKERS.get(name)), words
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -122,15 +83,6 @@ def test_masks_that_depth_completes_are_grown_and_not_repaired() -> None:
     assert "segmentation.dilation_px" in tunable and "segmentation.repair" not in tunable
     with pytest.raises(SettingsError, match="repair"):
         build(TRACKERS.get("blitz-slam").settings, {"segmentation": {"repair": "depth"}})
-
-
-def test_words_follow_the_settings() -> None:
-    segmentation = TRACKERS.get("huai-slam").settings().segmentation
-    assert "for 5 segmented frames" in masks_in_words(segmentation)
-    assert "not bridged" in masks_in_words(segmentation.model_copy(update={"compensate": 0}))
-    flow = PublishedFlowSettings()
-    assert "no check" in links_in_words(flow)
-    assert "2 px on the way back" in links_in_words(flow.model_copy(update={"forward_backward_px": 2.0}))
 
 
 def test_the_page_shows_the_table_of_the_specs() -> None:
