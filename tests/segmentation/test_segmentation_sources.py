@@ -199,9 +199,7 @@ def test_auto(monkeypatch, tmp_path):
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "embedded"
     monkeypatch.setattr(building, "embedded_weights", lambda: None)
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "oracle"
-    with pytest.raises(
-        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*without masks: a system"
-    ):
+    with pytest.raises(building.NetworkNotFetched, match="'bonn/crowd'"):
         resolve_source(auto, "bonn/crowd")
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
     assert resolve_source(auto, "bonn/crowd") == "coco"

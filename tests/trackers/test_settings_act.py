@@ -56,7 +56,6 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
     "segmentation.mask_threshold": NETWORK,
-    "segmentation.nms_iou": NETWORK,
     "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
     **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
     **{f"epipolar.{name}": ("emfoa-oft-paper?flow=sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},

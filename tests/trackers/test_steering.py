@@ -57,12 +57,8 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "free_space.min_votes": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
     }),
-    "segmentation.min_area_px": ("mask-rcnn", {"segmentation.classes": "all"}),
     "multiview.tau_m": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
-    }),
-    "segmentation.max_carry": ("detect-slam", {
-        "backend.keyframes.tracked_share": 0.4, "backend.keyframes.new_close": 1000, "probability.threshold": 0.99,
     }),
     "class_rule.depth_m": ("seg-slam", {"segmentation.classes": "chair", "class_rule.movable": "person"}),
 }  # fmt: skip

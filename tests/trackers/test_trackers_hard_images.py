@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -75,20 +74,6 @@ def test_without_depth_for_a_while_it_tracks_on_or_says_lost(sequence) -> None:
     states, error = track(sequence, lambda frame: replace(frame, depth=np.zeros_like(frame.depth)))
     assert states[BAD.stop + 2 :].count("ok") == END - BAD.stop - 2
     assert max(error.values()) < 0.05
-
-
-def test_a_gap_of_a_second(sequence) -> None:
-    tracker = build_tracker("orb-slam2", {}, TrackerContext(sequence_id=sequence.id))
-    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
-    kept = [*range(10), *range(40, FRAMES)]
-    states = [tracker.track(sequence[index]).state for index in kept]
-    assert states[:10] == ["ok"] * 10
-    assert "ok" in states[10:12], "the scene after the gap is in the map"
-
-
-def test_black_from_the_beginning_never_initialises_and_raises_nothing(sequence, tmp_path: Path) -> None:
-    states, _ = track(sequence, painted(0), bad=range(END))
-    assert "ok" not in states
 
 
 @pytest.mark.parametrize("degrees", [3, 5, 7])
