@@ -27,7 +27,6 @@ from dynslam_bench.segmentation.networks.onnx_export import (
 )
 from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
 from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
-from dynslam_bench.sequences.catalogue import open_sequence
 
 SETTINGS = SegmentationSettings(network_side=0)
 CLASSES = ("person", "chair", "dog")
@@ -98,21 +97,6 @@ def test_suppression_in_rounds_is_the_greedy_one() -> None:
     valid[0] = 0
     without = unsuppressed(overlap(boxes) > 0.3, valid)
     assert torch.nonzero(without)[:, 0].tolist() == [1 + i for i in nms(boxes[1:], scores[1:], 0.3).tolist()]
-
-
-def test_the_embedded_network_with_fixed_shapes() -> None:
-    weights = embedded_weights()
-    assert weights is not None
-    frame = open_sequence("synthetic/walking_static?scene=101&frames=40")[20]
-    segmenter = MaskRCNNSegmenter.from_file(weights, SETTINGS)
-    expected = segmenter.segment(frame)
-    network = StaticMaskRCNN(segmenter.network, *frame.rgb.shape[:2], score=0.1, iou=NMS_IOU)
-    with torch.no_grad():
-        boxes, _, scores, masks = network(torch.from_numpy(frame.rgb).permute(2, 0, 1)[None].float() / 255)
-    count = len(expected.scores)
-    assert count >= 1 and int((scores > 0).sum()) == count
-    assert np.abs(boxes[:count].numpy() - expected.boxes).max() < 1e-2
-    assert np.logical_xor(masks[:count, 0].numpy() >= 0.5, expected.masks).sum() <= 0.01 * expected.masks.sum()
 
 
 def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from dynslam_bench.segmentation import carry, schedule
 from dynslam_bench.segmentation.postprocess import boxes_of, dilate, dynamic_mask, fill_holes, repair, select
 from dynslam_bench.segmentation.schedule import MaskScheduler, MissedDetections
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.training.evaluate_masks import MaskTally, average_precision, mask_iou
+from dynslam_bench.segmentation.training.evaluate_masks import MaskTally, average_precision
 from dynslam_bench.segmentation.training.labelled_images import LabelledImage
 
 H, W = 120, 160
@@ -282,12 +282,6 @@ def test_average_precision_by_hand():
     assert average_precision(np.array([0.9]), np.array([True]), 2) == pytest.approx(51 / 101)
     assert average_precision(np.array([]), np.zeros(0, bool), 3) == 0.0
     assert np.isnan(average_precision(np.array([0.5]), np.array([False]), 0))
-
-
-def test_mask_iou_matrix():
-    a, b = np.stack([walker(0), walker(2)]), np.stack([walker(0), walker(1), block(0, 5, 0, 5)])
-    assert mask_iou(a, b) == pytest.approx(np.array([[iou(x, y) for y in b] for x in a]))
-    assert mask_iou(a[:0], b).shape == (0, 3)
 
 
 def test_quality_of_perfect_shifted_missed_and_false_detections():

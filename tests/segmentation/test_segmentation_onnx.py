@@ -175,21 +175,6 @@ def test_a_written_network_runs_through_opencv(tmp_path):
         assert found.masks.mean() == pytest.approx(20 * 20 / (60 * 80), rel=0.35)
 
 
-def test_a_written_network_with_torchvision_outputs(tmp_path):
-    masks = np.zeros((2, 1, 96, 128), np.float32)
-    masks[0, 0, 10:50, 20:60] = 0.9
-    outputs = {
-        "boxes": np.array([[20, 10, 60, 50], [0, 0, 5, 5]], np.float32),
-        "labels": np.array([1, 3], np.float32),
-        "scores": np.array([0.9, 0.8], np.float32),
-        "masks": masks,
-    }
-    found = OnnxSegmenter(write(tmp_path, (1, 3, 96, 128), outputs), SETTINGS).segment(
-        frame(np.zeros((96, 128, 3), np.uint8))
-    )
-    assert found.class_names == ("person",) and found.masks[0].sum() == 40 * 40
-
-
 def test_unknown_networks_are_refused(tmp_path):
     path = write(tmp_path, (1, 3, 32, 32), {"probabilities": np.zeros((1, 1000), np.float32)})
     with pytest.raises(SegmentationError, match=r"probabilities 1x1000"):

@@ -1,7 +1,6 @@
 """Labelled data from files and sequences, training with resume, evaluation."""
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,14 +18,11 @@ from dynslam_bench.segmentation.training.labelled_images import (
     LabelledImage,
     RenderedFrames,
     YoloImages,
-    decode_runs,
     open_labelled,
 )
 from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
 from dynslam_bench.segmentation.training.train import network_config, train
-
-COCO128 = Path(__file__).resolve().parents[3] / "shared" / "data" / "coco128-seg"
 
 
 def write_yolo(folder, count=6, seed=0):
@@ -93,35 +89,6 @@ def test_coco_polygons_and_run_lengths(tmp_path):
     (tmp_path / "instances.json").write_text('{"images": []}')
     with pytest.raises(SegmentationError, match="not in COCO's annotation format"):
         CocoImages(tmp_path / "instances.json")
-
-
-def encode_runs(runs):
-    """The inverse of `decode_runs`, from the format's description."""
-    text = ""
-    for k, run in enumerate(runs):
-        value = run - (runs[k - 2] if k > 2 else 0)
-        while True:
-            digit, value = value & 0x1F, value >> 5
-            more = not ((value == 0 and not digit & 0x10) or (value == -1 and digit & 0x10))
-            text += chr(48 + (digit | (0x20 if more else 0)))
-            if not more:
-                break
-    return text
-
-
-def test_compressed_run_lengths():
-    assert decode_runs("06") == [0, 6]
-    for seed in range(20):
-        runs = np.random.default_rng(seed).integers(0, 5000, 30).tolist()
-        assert decode_runs(encode_runs(runs)) == runs
-
-
-@pytest.mark.skipif(not COCO128.is_dir(), reason="needs ../shared/data/coco128-seg")
-def test_coco128():
-    images = open_labelled(f"yolo:{COCO128}")
-    assert len(images) == 128
-    persons = sum(name == "person" for k in range(0, 128, 4) for name in images[k].class_names)
-    assert persons > 30
 
 
 def test_rendered_frames_are_a_function_of_their_name():

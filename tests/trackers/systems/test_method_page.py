@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +18,6 @@ from dynslam_bench.trackers import TrackerContext, build_tracker
 
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGE = Path(dynslam_bench.__file__).parent
-
-
-def equation_rows() -> list[list[str]]:
-    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
-    table = page.split("| Eq. |", 1)[1].split("\n\n", 1)[0].splitlines()[2:]
-    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]] for row in table]
 
 
 def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import re
 import sys
 from pathlib import Path
 
@@ -92,24 +90,3 @@ def test_a_store_without_the_yardstick_is_a_clear_error(tmp_path: Path) -> None:
     fake.add_run(RunStore(tmp_path), "orb-slam2", "synthetic/walking_xyz", 0)
     with pytest.raises(DynslamError, match=r"exact masks on synthetic/walking_xyz.*suite 'dynamic'"):
         signatures.report(tmp_path)
-
-
-def test_instances_are_rows_of_their_own_and_repeats_are_one_cell(tmp_path: Path) -> None:
-    store = RunStore(tmp_path)
-    for scene in ("", "?scene=100", "?scene=101&frames=600"):
-        twin = f"synthetic/walking_rpy{scene}"
-        fake.add_run(store, "mask-rcnn", twin, 0, error=0.004, overrides={"segmentation.source": "oracle"})
-        for repeat, error in enumerate((0.4, 0.5, 0.6)):
-            fake.add_run(store, "orb-slam2", twin, repeat, error=error, provenance="faithful-code")
-    text = signatures.report(tmp_path, signatures.instance_range("100:200"))
-    rows = [line.split("|") for line in text.splitlines() if line.startswith("| `orb-slam2` | faithful")]
-    assert sorted(row[3].strip() for row in rows) == ["walking_rpy?scene=100", "walking_rpy?scene=101"]
-    for row in rows:
-        median, low, high = (float(each) for each in re.findall(r"\d\.\d+", row[4]))
-        assert low < median < high
-    assert "| walking_rpy |" in signatures.report(tmp_path)
-    assert "walking_rpy?scene=101" not in signatures.report(tmp_path, signatures.instance_range("100"))
-    with pytest.raises(DynslamError, match=r"no runs on instances 150 to 159.*--instances"):
-        signatures.report(tmp_path, signatures.instance_range("150:160"))
-    with pytest.raises(argparse.ArgumentTypeError, match="'held-out' is no range of instances"):
-        signatures.instance_range("held-out")

@@ -1,7 +1,7 @@
-"""OnlineSettings acts as building with the same value does, ends with the episode, and is refused where nothing takes it.
+"""Every tunable setting acts, and an online one acts in mid-episode as it does from the beginning.
 
-An episode steered from before its first frame is the episode of a tracker built with those settings, bit for bit; one
-after `reset` is that of a fresh tracker. All online settings of a tracker at once, and each by itself where it shows.
+An episode that is configured before its first frame equals, bit for bit, that of a tracker built with those settings.
+After `reset` the settings that the tracker was built with are in force again.
 """
 
 from __future__ import annotations
@@ -9,33 +9,36 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import islice
 
+import numpy as np
 import pytest
 from quick_dense import quick
 from steering_scene import FRAMES, SmallScene, construct, difference, differing, play, settings_for
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
-from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.errors import DynslamError, SettingsError
 from dynslam_bench.core.settings import OnlineSettings, Parameter, Settings, apply_overrides, online_parameters, tunable
 from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
+from dynslam_bench.tuning import SpaceSpec, search_space
 
 SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
 SHORT = 6
-"""Frames of the episodes in which all settings of a tracker are steered at once."""
+"""Frames of the episodes in which all settings of a tracker change at once."""
 AFTER = 3
-"""Frames that an episode goes on for after the first on which a setting has shown."""
+"""Frames that an episode continues after the first on which a setting acts."""
 
 
-def online() -> dict[str, tuple[str, Parameter]]:
-    """Every online setting, with the first tracker in which it has an effect."""
-    found: dict[str, tuple[str, Parameter]] = {}
+def offered() -> dict[str, tuple[str, Parameter]]:
+    """Every setting that a study of some system draws on rendered sequences, with the first such system."""
+    settings: dict[str, tuple[str, Parameter]] = {}
     for spec in SYSTEMS.values():
-        for parameter in online_parameters(spec.settings()):
-            found.setdefault(parameter.name, (spec.id, parameter))
-    return found
+        for parameter in search_space(spec.settings, SpaceSpec(), ["synthetic/walking_xyz"]):
+            settings.setdefault(parameter.name, (spec.id, parameter))
+    return settings
 
 
-ONLINE = online()
+OFFERED = offered()
 KEYFRAMES = {"backend.keyframes.tracked_share": 1.0, "free_space.min_share": 0.0}
 CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.keyframes.view_share": ("orb-slam2", {
@@ -62,16 +65,60 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     }),
     "class_rule.depth_m": ("seg-slam", {"segmentation.classes": "chair", "class_rule.movable": "person"}),
 }  # fmt: skip
-"""Where a setting shows on the excerpt, if not in the first tracker that has it: the tracker and what else is set."""
+"""The tracker in which a setting acts on the excerpt, if not in the first that has it, and what else is set."""
+MANY = {
+    "backend.keyframes.tracked_share": 0.95,
+    "backend.keyframes.established": 1,
+    "backend.keyframes.moved_share": 1.0,
+    "backend.keyframes.view_share": 0.98,
+}
+"""A keyframe nearly every frame."""
+JUDGED = ("emfoa-oft?masks=none&depth=none", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
+"""F judges every frame."""
+NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
+CASES |= {
+    "backend.keyframes.redundant_share": ("orb-slam2", MANY),
+    "backend.mapping.neighbours": ("orb-slam2", MANY),
+    "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
+    "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
+    "multiview.order": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }),
+    "segmentation.mask_threshold": NETWORK,
+    "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
+    **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
+    **{
+        f"epipolar.{name}": ("emfoa-oft-paper?flow=sparse", {})
+        for name in ("estimator", "confidence", "inlier_px", "mode")
+    },
+}  # fmt: skip
+SHOWN_ALONE = frozenset({
+    "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
+    "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
+    "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
+    "backend.keyframes.max_gap", "backend.bundle_adjustment.window",
+    *(f"backend.relocalisation.{name}" for name in ("candidates", "iterations", "max_distance")),
+})  # fmt: skip
+"""Settings that change nothing on these few frames: they act in long maps, at long ages, or when lost."""
+
+
+class Scene(SmallScene):
+    """The small scene with black frames, after which a system has to relocalise."""
+
+    def __init__(self) -> None:
+        super().__init__(frames=FRAMES)
+        for number in (8, 9):
+            frame = self.frames[number]
+            self.frames[number] = Frame(number, frame.timestamp, np.zeros_like(frame.rgb), np.zeros_like(frame.depth))
 
 
 @pytest.fixture(scope="module")
-def scene() -> SmallScene:
-    return SmallScene()
+def scene() -> Scene:
+    return Scene()
 
 
 @pytest.fixture(scope="module")
-def unsteered(scene: SmallScene) -> Callable[..., list[TrackResult]]:
+def unsteered(scene: Scene) -> Callable[..., list[TrackResult]]:
     """The first frames of a tracker that nobody steers, played once for all that compare with them."""
     played: dict[object, tuple[list[TrackResult], Iterator[TrackResult]]] = {}
 
@@ -91,7 +138,7 @@ def at_first(tracker, settings: Settings):
     return lambda number: tracker.configure(settings) if number == 0 else None
 
 
-def until_it_shows(unsteered: list[TrackResult], episode: Iterator[TrackResult]) -> list[TrackResult]:
+def until_it_acts(unsteered: list[TrackResult], episode: Iterator[TrackResult]) -> list[TrackResult]:
     """An episode's results to `AFTER` frames behind the first that is not as unsteered; none if none differs."""
     results = []
     for before, result in zip(unsteered, episode, strict=True):
@@ -102,7 +149,7 @@ def until_it_shows(unsteered: list[TrackResult], episode: Iterator[TrackResult])
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene, unsteered) -> None:
+def test_all_settings_at_once_act_and_are_restored(name: str, scene: Scene, unsteered) -> None:
     spec = SYSTEMS[name]
     tracker = construct(spec, scene)
     settings = settings_for(spec)
@@ -119,33 +166,27 @@ def test_all_settings_at_once_act_and_are_restored(name: str, scene: SmallScene,
     assert not difference(fresh, again), "reset() leaves something of the steered episode"
 
 
-@pytest.mark.parametrize("name", ONLINE)
-def test_each_setting_acts_when_steered_where_it_acts_when_built_with(name: str, scene: SmallScene, unsteered) -> None:
-    parameter = ONLINE[name][1]
-    system, others = CASES.get(name, (ONLINE[name][0], {}))
-    for value in (parameter.low, parameter.high):
-        built = construct(SYSTEMS[system], scene, **others, **{name: value})
-        if not (static := until_it_shows(unsteered(system, FRAMES, others), play(built, scene))):
+@pytest.mark.parametrize("name", [name for name in OFFERED if name not in SHOWN_ALONE and "preprocessing" not in name])
+def test_every_setting_that_a_study_may_draw_acts(name: str, scene: Scene, unsteered) -> None:
+    system, parameter = OFFERED[name]
+    system, others = CASES.get(name, (system, {}))
+    others = {condition: allowed[0] for condition, allowed in parameter.when} | others
+    frames = 3 if quick(SYSTEMS[system].settings) else FRAMES
+    for value in parameter.choices or (parameter.low, parameter.high):
+        try:
+            built = construct(SYSTEMS[system], scene, **others, **{name: value})
+        except DynslamError:
+            continue  # the value does not go with the others
+        expected = until_it_acts(unsteered(system, frames, others), play(built, scene, frames))
+        if not expected:
             continue
-        tracker = construct(SYSTEMS[system], scene, **others)
-        changed = apply_overrides(settings_for(SYSTEMS[system], **others), {name: value})
-        steered = play(tracker, scene, len(static), before=at_first(tracker, changed))
-        assert not difference(static, steered), f"{system}: {name} = {value:g}"
+        if parameter.online:
+            tracker = construct(SYSTEMS[system], scene, **others)
+            changed = apply_overrides(settings_for(SYSTEMS[system], **others), {name: value})
+            steered = play(tracker, scene, len(expected), before=at_first(tracker, changed))
+            assert not difference(expected, steered), f"{system}: {name} = {value}"
         return
-    pytest.fail(f"{name} changes nothing in {system}, at {parameter.low:g} and at {parameter.high:g}")
-
-
-def test_a_setting_is_in_force_from_the_very_next_frame(scene: SmallScene) -> None:
-    """Both ways, in mid-episode: what lies on people is judged by the confidence that was asked for."""
-    tracker = construct(SYSTEMS["mask-rcnn"], scene, **{"segmentation.compensate": 0})
-    settings = settings_for(SYSTEMS["mask-rcnn"], **{"segmentation.compensate": 0})
-    sure, any_ = (apply_overrides(settings, {"segmentation.confidence": c}) for c in (0.9, 0.1))
-    asked = [any_, any_, sure, any_, sure, sure, any_]
-    results = list(play(tracker, scene, len(asked), before=lambda number: tracker.configure(asked[number])))
-    always = {id(each): list(play(tracker, scene, len(asked), before=at_first(tracker, each))) for each in (sure, any_)}
-    counts = [result.stats["semantic_objects"] for result in results]
-    assert counts == [always[id(each)][number].stats["semantic_objects"] for number, each in enumerate(asked)]
-    assert len({tuple(r.stats["semantic_objects"] for r in each) for each in always.values()}) == 2
+    pytest.fail(f"{name} changes nothing in {system}, at any of {parameter.choices or (parameter.low, parameter.high)}")
 
 
 def test_only_what_differs_is_handed_on() -> None:
@@ -166,10 +207,3 @@ def test_only_what_differs_is_handed_on() -> None:
     assert given[1:] == [("one", 1.0), ("two", 1.0)]
     with pytest.raises(SettingsError, match=r"'two.value' of Whole is taken by no part .*configure\(settings\)"):
         OnlineSettings(Whole(), takers[:1])
-
-
-def test_what_is_switched_off_needs_nobody_who_takes_it() -> None:
-    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft?masks=none"].settings())}
-    assert "segmentation" not in names and {"flow", "motion"} <= names
-    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft?depth=none"].settings())}
-    assert not {"motion", "free_space"} & names
