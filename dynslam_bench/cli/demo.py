@@ -210,7 +210,7 @@ def compiled_ahead() -> Iterator[None]:
 # The whole way on rendered sequences: trackers through environments in processes of their own, then the report.
 
 DEFAULT_PROTOCOL = "tum-rgbd/v1"
-STUDIED = "emfoa-oft-no-masks"
+STUDIED = "emfoa-oft?masks=none"
 """Whom the demo's study tunes: without masks, the flow alone says what moves."""
 TUNED = (
     "flow.budget",

@@ -55,7 +55,7 @@ def info(
     """Show a tracker's description, its settings and its published numbers."""
     from dynslam_bench.core.settings import flatten, settings_table
     from dynslam_bench.trackers import TRACKERS
-    from dynslam_bench.trackers.measured import epipolar_skipped
+    from dynslam_bench.trackers.registry import epipolar_skipped
 
     spec = TRACKERS.get(tracker)
     numbers = _published(spec)

@@ -85,7 +85,7 @@ def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_fold
             run_one(spec, store)
         return caught.value.options[-1]
 
-    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft-no-masks" in hint("mask-rcnn")
+    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft?masks=none" in hint("mask-rcnn")
 
 
 def test_a_study_refuses_it_too(toy_folder: str, mistakes, tmp_path: Path) -> None:

@@ -87,7 +87,9 @@ def test_an_edited_plug_in_that_a_setting_names_is_another_run(
 
 
 def test_changed_weights_are_another_run(toy_folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dynslam_bench.segmentation.availability._check_network", lambda *_: None)  # any file will do
+    monkeypatch.setattr(
+        "dynslam_bench.segmentation.build_segmenter._check_network", lambda *_: None
+    )  # any file will do
     weights = tmp_path / "net.onnx"
     weights.write_bytes(b"one")
     spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": f"onnx:{weights}"})
