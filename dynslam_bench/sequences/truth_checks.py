@@ -135,7 +135,8 @@ def _at_rest(
 def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
     motions = motions_of(pairs, stamps)
     readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
-    shifts = np.arange(-LARGEST_SHIFT_S, LARGEST_SHIFT_S + _STEP_S / 2, _STEP_S)
+    steps = round(LARGEST_SHIFT_S / _STEP_S)
+    shifts = _STEP_S * np.arange(-steps, steps + 1)  # exact multiples: the same limits early and late
     matches = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
     matches = [each for each in matches if each.share >= 0.5]
     near = [each for each in matches if each.reading == READINGS[0] and abs(each.shift_s) < LEAST_TIME_S]
