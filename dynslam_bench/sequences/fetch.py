@@ -14,10 +14,10 @@ from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha25
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.sanitise import inside, is_inside
 from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.core.sanitise import inside, is_inside
 from dynslam_bench.sequences.archives import extract
 from dynslam_bench.sequences.cameras import find_camera
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence

@@ -20,7 +20,7 @@ from dynslam_bench.sequences.readers import (
     tartanair_shibuya,
     vslam_lab,
 )
-from dynslam_bench.sequences.readers import images as arrays
+from dynslam_bench.sequences.readers import recorded as arrays
 from dynslam_bench.sequences.readers import tables as bodies
 from dynslam_bench.sequences.readers import tables as nanoseconds
 from dynslam_bench.sequences.readers import tables as yaml_numbers
