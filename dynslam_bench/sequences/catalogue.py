@@ -6,7 +6,7 @@ import fnmatch
 import os
 from collections.abc import Iterator
 from collections.abc import Sequence as PySequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -132,18 +132,6 @@ def public_datasets() -> dict[str, CatalogueEntry]:
 
 # Every sequence by its id: the public data sets, the rendered ones, plug-ins, and folders of the user's own.
 
-__all__ = [
-    "CatalogueEntry",
-    "catalogue",
-    "entry_of",
-    "open_folder",
-    "open_public",
-    "open_rendered",
-    "open_sequence",
-    "parse_frames",
-    "sequence_ids",
-]
-
 
 _OPENED: dict[str, tuple[list[tuple[str, int, int, int, int]], Sequence]] = {}
 """Folders that were opened, with the state of their files then: an unchanged one need not be read again."""
@@ -152,7 +140,7 @@ _MOST_OPENED = 64
 
 def sequence_ids() -> list[str]:
     """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins."""
-    return [name for found in DATASETS.all() for name in found.spec.sequences]
+    return [name for dataset in DATASETS.all() for name in dataset.spec.sequences]
 
 
 def open_sequence(
@@ -252,8 +240,8 @@ def open_folder(
     chosen = chosen_camera(folder, camera)
     wanted = repr((folder.absolute(), entry and entry.id, str(camera), chosen, settings))
     state = _state_of(folder)
-    known, sequence = _OPENED.get(wanted, (None, None))
-    if sequence is None or known != state:
+    earlier, sequence = _OPENED.get(wanted, (None, None))
+    if sequence is None or earlier != state:
         sequence = _open_folder(folder, entry, camera, chosen, settings)
         while len(_OPENED) >= _MOST_OPENED:
             _OPENED.pop(next(iter(list(_OPENED)), ""), None)  # another thread may do the same
@@ -273,10 +261,10 @@ def _open_folder(
     from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
 
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
-    stated = None if chosen is None else chosen[1]
-    contents = layout.read(folder, stated or (None if entry is None else entry.fps))
+    chosen_fps = None if chosen is None else chosen[1]
+    contents = layout.read(folder, chosen_fps or (None if entry is None else entry.fps))
     otherwise = None if entry is None else entry.camera
-    intrinsics, fps = chosen or find_camera(folder, told=contents.camera, otherwise=otherwise)
+    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=otherwise)
     body = MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera)
     if entry is None:
         description = Description(f"folder/{folder.resolve().name}", intrinsics, fps or contents.fps, R_body_cam=body)
@@ -320,7 +308,7 @@ def _open_whole(
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
     prefix = name.partition("/")[0]
-    datasets = {found.spec.id: found.spec for found in DATASETS.all()}
+    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all()}
     if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public_datasets():
         if camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
@@ -334,8 +322,8 @@ def _open_whole(
             f"there is no sequence folder {path.absolute()}",
             "a path names a folder, see docs/sequences.md",
         )
-    known = [*sequence_ids(), *by_folder()]
-    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, known))
+    names = [*sequence_ids(), *by_folder()]
+    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, names))
 
 
 def _is_path(name: str) -> bool:
@@ -383,7 +371,6 @@ def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int 
 
 # Data sets as plug-ins: each serves the sequences below one prefix, ``tum/...`` for example.
 
-__all__ = ["DATASETS", "DatasetSpec"]
 
 OPENERS = "dynslam_bench.sequences.catalogue"
 """The module that opens sequences of the built-in data sets; loaded when the first one is opened."""
@@ -447,26 +434,23 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
     Args:
         data_root: Folder of the sequences.
     """
-    root, entries, found = find_data_root(data_root), catalogue(), []
+    root, rows = find_data_root(data_root), []
     for dataset in DATASETS.all():
         for name in dataset.spec.sequences:
-            entry = entries.get(name)
-            if entry is None:
-                rendered = dataset.spec.id == "synthetic"
-                tags = parse_synthetic_id(name).tags if rendered else ()
-                split = parse_synthetic_id(name).split if rendered else ""
-                size = "rendered" if rendered else ""
-                title, licence = dataset.spec.summary or dataset.spec.id, dataset.spec.license
-                found.append(Summary(name, True, size, tags, split, license=licence, dataset=title))
-                continue
-            layout = "verified" if entry.verified else "not verified"
-            found.append(
-                Summary(
+            entry = catalogue().get(name)
+            if entry is not None:
+                layout = "verified" if entry.verified else "not verified"
+                row = Summary(
                     name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
                     entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
-                )
-            )  # fmt: skip
-    return found
+                )  # fmt: skip
+            else:
+                row = Summary(name, True, license=dataset.spec.license, dataset=dataset.spec.summary or dataset.spec.id)
+                if dataset.spec.id == "synthetic":
+                    parsed = parse_synthetic_id(name)
+                    row = replace(row, size="rendered", tags=parsed.tags, split=parsed.split)
+            rows.append(row)
+    return rows
 
 
 def describe(name: str, *, data_root: str | Path | None = None, camera: str | Path | None = None) -> dict[str, Any]:

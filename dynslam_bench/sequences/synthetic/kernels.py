@@ -29,42 +29,20 @@ def hit_box(
 ) -> tuple[float, int]:
     """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side)."""
     t_in, t_out, face = -1.0e30, 1.0e30, -1
-    if abs(dx) < 1e-12:
-        if abs(ox) > hx:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dx
-        a, b = (-hx - ox) * inv, (hx - ox) * inv
-        side = 0
-        if a > b:
-            a, b, side = b, a, 1
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if abs(dy) < 1e-12:
-        if abs(oy) > hy:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dy
-        a, b = (-hy - oy) * inv, (hy - oy) * inv
-        side = 2
-        if a > b:
-            a, b, side = b, a, 3
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if abs(dz) < 1e-12:
-        if abs(oz) > hz:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dz
-        a, b = (-hz - oz) * inv, (hz - oz) * inv
-        side = 4
-        if a > b:
-            a, b, side = b, a, 5
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
+    origin, direction, half = (ox, oy, oz), (dx, dy, dz), (hx, hy, hz)
+    for axis in range(3):
+        o, d, h = origin[axis], direction[axis], half[axis]
+        if abs(d) < 1e-12:
+            if abs(o) > h:
+                return 1e30, -1
+        else:
+            inv = 1.0 / d
+            a, b, side = (-h - o) * inv, (h - o) * inv, 2 * axis
+            if a > b:
+                a, b, side = b, a, side + 1
+            if a > t_in:
+                t_in, face = a, side
+            t_out = min(t_out, b)
     if t_in > t_out or t_in < NEAR_M or t_in >= t_max:
         return 1e30, -1
     return t_in, face

@@ -197,12 +197,12 @@ def _furnish(b: _Building, x: float, side: int, wide: float, front: float, back:
     """
     yaw = 0.0 if side > 0 else 180.0
     b.bay(office_bay, yaw, (x, side * (back - 0.05)))
-    for hand in (1, -1):
-        beside = x + hand * (wide / 2 - 0.05)
-        b.bay(corridor_bay, -90.0 * hand, (beside, side * (back - 2.6)), alike=1 if hand > 0 else 2)
-        b.bay(notices, -90.0 * hand, (beside, side * (front + 1.5)), alike=3)
-        b.bay(notices, yaw + 180.0, (x + hand * 1.75, side * (front + 0.05)), alike=4)
-        b.bay(notices, yaw, (x + hand * 1.55, side * (front - 0.05)), alike=5)
+    for end in (1, -1):
+        beside = x + end * (wide / 2 - 0.05)
+        b.bay(corridor_bay, -90.0 * end, (beside, side * (back - 2.6)), alike=1 if end > 0 else 2)
+        b.bay(notices, -90.0 * end, (beside, side * (front + 1.5)), alike=3)
+        b.bay(notices, yaw + 180.0, (x + end * 1.75, side * (front + 0.05)), alike=4)
+        b.bay(notices, yaw, (x + end * 1.55, side * (front - 0.05)), alike=5)
     b.piece("chair", yaw, (x + 0.4, side * (back - 1.55)))
     b.piece("box", yaw, (x - 0.1 * wide, side * 3.9))
 
