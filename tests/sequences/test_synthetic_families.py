@@ -140,7 +140,7 @@ def test_light_texture_and_depth_are_little_where_they_should_be() -> None:
     assert dark.rgb.mean() < 0.25 * lit.rgb.mean()
     assert (far.depth > 0).mean() < 0.45 < (lit.depth > 0).mean()
     assert (outdoor.depth > 0).mean() < 0.8 * (lit.depth > 0).mean()
-    names = {name for row in parse_synthetic_id("synthetic/blank_empty").world().room.texture for name in row}
+    names = {name for row in parse_synthetic_id("synthetic/blank_empty").world().static.texture for name in row}
     assert names == {"plain"}
 
 

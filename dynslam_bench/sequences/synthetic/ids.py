@@ -18,9 +18,9 @@ FAMILIES: dict[str, Family] = {
     family.name: family for family in (WALKING, SITTING, LOOP, FAST, OBJECTS, CROWD, SYNCHRONOUS, TRACKING, *CONDITIONS)
 }
 REPLICA_IDS = (*WALKING.ids(), *SITTING.ids())
-"""The eight rendered twins of TUM's fr3 dynamic sequences."""
+"""The eight synthetic replicas of TUM's fr3 dynamic sequences."""
 SYNTHETIC_IDS = tuple(name for family in FAMILIES.values() for name in family.ids())
-"""Every rendered sequence that is listed, instance 0, default length."""
+"""Every rendered sequence that is listed, scene 0, default length."""
 
 
 # Ids of the rendered sequences; light: imports neither numba nor OpenCV.
@@ -36,7 +36,7 @@ class SyntheticId:
 
     Attributes:
         family: For example ``walking`` or ``loop``.
-        variant: For the twins the camera's motion; may be empty.
+        variant: For the replicas of TUM's sequences the camera's motion; may be empty.
         scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held out.
         frames: Length of the sequence; frames are the same whatever the length.
         noise: Seed of the sensors' noise: another draw of the same scene. None is the scene's own draw.

@@ -27,7 +27,7 @@ from dynslam_bench.sequences.synthetic.kernels import NEAR_M
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
 from dynslam_bench.sequences.synthetic.scene import Scene, Snapshot
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
-from dynslam_bench.sequences.synthetic.textures import Atlas
+from dynslam_bench.sequences.synthetic.textures import TextureAtlas
 
 Array = NDArray[np.float64]
 _ROUNDS = 5
@@ -219,7 +219,7 @@ class Renderer:
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 
     @cached_property
-    def atlas(self) -> Atlas:
+    def atlas(self) -> TextureAtlas:
         """The textures; drawn when the first frame is coloured."""
         return self.scene.atlas()
 

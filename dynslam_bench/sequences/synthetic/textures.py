@@ -15,7 +15,7 @@ Image = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Atlas:
+class TextureAtlas:
     """All textures and their mip levels as one array.
 
     Attributes:
@@ -31,7 +31,7 @@ class Atlas:
     names: dict[str, int]
 
 
-def build_atlas(textures: dict[str, Image]) -> Atlas:
+def build_atlas(textures: dict[str, Image]) -> TextureAtlas:
     """Pack textures; each is halved by 2x2 means down to one texel."""
     levels = 12
     offsets = np.zeros((len(textures), levels), np.int64)
@@ -52,7 +52,7 @@ def build_atlas(textures: dict[str, Image]) -> Atlas:
                 offsets[index, level:] = offsets[index, level]
                 break
             current = 0.25 * (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2])
-    return Atlas(np.concatenate(parts), offsets, log2, {name: i for i, name in enumerate(textures)})
+    return TextureAtlas(np.concatenate(parts), offsets, log2, {name: i for i, name in enumerate(textures)})
 
 
 def smooth_noise(rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None) -> NDArray[np.float64]:
