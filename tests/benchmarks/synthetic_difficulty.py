@@ -1,6 +1,6 @@
-"""Judges rendered sequences by an outside system: the real ORB-SLAM3, repeated, with controls.
+"""How hard rendered sequences are for a reference system: ORB-SLAM3, repeated, with controls.
 
-Usage: python tests/benchmarks/synthetic_judge.py [ID ...] [--controls moving none frozen masked persons] [--runs 5]
+Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving none frozen masked persons] [--runs 5]
            [--cache DIR] [--out FILE.jsonl] [--table]
 
 Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
@@ -168,8 +168,8 @@ def main() -> None:
     parser.add_argument("ids", nargs="*", default=list(REPLICA_IDS))
     parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_judge")
-    parser.add_argument("--out", type=Path, default=Path("synthetic_judge.jsonl"))
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_difficulty")
+    parser.add_argument("--out", type=Path, default=Path("synthetic_difficulty.jsonl"))
     parser.add_argument("--table", action="store_true")
     arguments = parser.parse_args()
     rows = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
