@@ -22,7 +22,7 @@ POINTS = 110
 def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> Array:
     """Corners followed from image to image by Lucas and Kanade, pixels ``[L, n, 2]``; NaN where they are not seen.
 
-    A corner whose way back ends more than half a pixel off is lost; new ones are found where few are left, and where
+    A corner whose way back ends more than half a pixel off is lost; new ones are status where few are left, and where
     `allowed` is not 0.
     """
     n, (height, width) = len(images), images[0].shape
@@ -45,14 +45,14 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
         if not len(here):
             continue
         flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
-        known = np.isfinite(flow[:, 0])
-        flow[~known] = np.median(flow[known], axis=0) if known.any() else 0.0
-        guess, start = (each.astype(np.float32).reshape(-1, 1, 2) for each in (here + flow, here))
-        there, found, _ = cv2.calcOpticalFlowPyrLK(images[i], images[i + 1], start, guess, **window)
+        valid = np.isfinite(flow[:, 0])
+        flow[~valid] = np.median(flow[valid], axis=0) if valid.any() else 0.0
+        guess, start = (pixels.astype(np.float32).reshape(-1, 1, 2) for pixels in (here + flow, here))
+        there, status, _ = cv2.calcOpticalFlowPyrLK(images[i], images[i + 1], start, guess, **window)
         back, again, _ = cv2.calcOpticalFlowPyrLK(images[i + 1], images[i], there, start.copy(), **window)
         there, back = np.asarray(there)[:, 0], np.asarray(back)[:, 0]
         good = (
-            (np.asarray(found)[:, 0] > 0) & (np.asarray(again)[:, 0] > 0) & (np.linalg.norm(back - here, axis=1) < 0.5)
+            (np.asarray(status)[:, 0] > 0) & (np.asarray(again)[:, 0] > 0) & (np.linalg.norm(back - here, axis=1) < 0.5)
         )
         good &= (there >= 8).all(axis=1) & (there < (width - 8, height - 8)).all(axis=1)
         tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
@@ -66,16 +66,16 @@ def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, 
     for x, y in taken:
         cv2.circle(free, (int(x), int(y)), 12, 0, -1)
     rows, columns = 4, 5
-    each = int(np.ceil(1.5 * count / (rows * columns)))
-    found = [np.zeros((0, 2), np.float32)]
+    per_cell = int(np.ceil(1.5 * count / (rows * columns)))
+    pixels = [np.zeros((0, 2), np.float32)]
     for r in range(rows):
         for c in range(columns):
             ys = slice(r * height // rows, (r + 1) * height // rows)
             xs = slice(c * width // columns, (c + 1) * width // columns)
-            found_here = cv2.goodFeaturesToTrack(image[ys, xs], each, 0.02, 12, mask=free[ys, xs])
-            if found_here is not None:
-                found.append(np.asarray(found_here.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
-    return np.concatenate(found)
+            in_cell = cv2.goodFeaturesToTrack(image[ys, xs], per_cell, 0.02, 12, mask=free[ys, xs])
+            if in_cell is not None:
+                pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
+    return np.concatenate(pixels)
 
 
 def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
@@ -167,17 +167,17 @@ class Window:
             if usable.sum() < LEAST_POINTS:
                 raise Unusable("too few points with depth can be followed")
             points = self.camera.unproject(self.xy[usable, i], 1 / self.inverse_depth[usable, i])
-            seen = self.xy[usable, i + 1]
-            found, turn, shift, inliers = cv2.solvePnPRansac(
-                points, seen, matrix, None, iterationsCount=200, reprojectionError=3.0, flags=cv2.SOLVEPNP_EPNP
+            pixels = self.xy[usable, i + 1]
+            success, turn, shift, inliers = cv2.solvePnPRansac(
+                points, pixels, matrix, None, iterationsCount=200, reprojectionError=3.0, flags=cv2.SOLVEPNP_EPNP
             )
-            if not found or inliers is None or len(inliers) < max(LEAST_POINTS // 2, 0.4 * len(points)):
+            if not success or inliers is None or len(inliers) < max(LEAST_POINTS // 2, 0.4 * len(points)):
                 raise Unusable("the points do not move as one rigid scene")
             chosen = inliers[:, 0]
-            turn, shift = cv2.solvePnPRefineLM(points[chosen], seen[chosen], matrix, None, turn, shift)
+            turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], matrix, None, turn, shift)
             step = np.eye(4)
             step[:3, :3], step[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            error = np.linalg.norm(self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - seen, axis=1)
+            error = np.linalg.norm(self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - pixels, axis=1)
             moving = np.flatnonzero(usable)[~(error < 6.0)]
             self.xy[moving, i + 1 :] = self.inverse_depth[moving, i + 1 :] = np.nan
             T.append(step @ T[-1])
@@ -220,9 +220,9 @@ class Window:
         """Take the noise of pixels and of inverse depth from the median residuals."""
         residuals = self._residuals(self._seen(self._at(self.late * readout_s)))
         error, depth = np.hypot(residuals[..., 0], residuals[..., 1]), np.abs(residuals[..., 2])
-        seen, deep = np.isfinite(error), np.isfinite(depth)
-        if seen.any() and deep.any():
-            self.noise = max(np.median(error[seen]) / 1.177, 0.05), max(1.4826 * np.median(depth[deep]), 1e-6)
+        valid, deep = np.isfinite(error), np.isfinite(depth)
+        if valid.any() and deep.any():
+            self.noise = max(np.median(error[valid]) / 1.177, 0.05), max(1.4826 * np.median(depth[deep]), 1e-6)
 
     def turning_change(self) -> float:
         """Root mean square change of the turning rate within the window, rad/s."""
@@ -230,7 +230,7 @@ class Window:
         return float(np.sqrt(((rates - rates.mean(0)) ** 2).sum(1).mean()))
 
     def move_depth(self, readout_s: float, delay_s: float) -> None:
-        """Carry each depth from its image's time to its pixel's, with the motion as it is known.
+        """Carry each depth from its image's time to its pixel's, with the motion as it is valid.
 
         Args:
             readout_s: Readout time; the depth image's rows are taken to be read as the colour image's are.

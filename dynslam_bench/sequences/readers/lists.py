@@ -172,17 +172,17 @@ def _number(text: str, where: object) -> int | None:
 
 def _line_of(path: Path, ns: int) -> int | None:
     """The last line of a list that begins with a stamp; None where `path` is no file."""
-    found = None
+    line_number = None
     for number, line in enumerate(read_lines(path, kind=SequenceError) if path.is_file() else (), start=1):
         parts = line.replace(",", " ").split()
         if parts and not parts[0].startswith("#") and _number(parts[0], path) == ns:
-            found = number
-    return found
+            line_number = number
+    return line_number
 
 
 def _count_unsorted(stamps: list[int | None]) -> int:
-    known = [stamp for stamp in stamps if stamp is not None]
-    return sum(later < earlier for earlier, later in pairwise(known))
+    finite = [stamp for stamp in stamps if stamp is not None]
+    return sum(later < earlier for earlier, later in pairwise(finite))
 
 
 # What a reader of recorded sequences finds in a folder; all readers give this, one class makes a sequence of it.
@@ -309,10 +309,10 @@ def find_names(folder: Path, pattern: str) -> list[str]:
     Raises:
         SequenceError: There is none.
     """
-    found = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
-    if not found or len(found) > MOST_LINES:
-        raise SequenceError(f"{folder} holds {len(found)} files {pattern}", "is it the folder of one sequence?")
-    return found
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
+    if not names or len(names) > MOST_LINES:
+        raise SequenceError(f"{folder} holds {len(names)} files {pattern}", "is it the folder of one sequence?")
+    return names
 
 
 def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageList:

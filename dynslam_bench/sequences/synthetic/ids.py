@@ -104,16 +104,16 @@ def parse_synthetic_id(text: str) -> SyntheticId:
 
 def _options(written: Sequence[str], text: str) -> dict[str, int]:
     """The values of options such as ``scene=3``, each at most once."""
-    found: dict[str, int] = {}
+    options: dict[str, int] = {}
     for option in written:
         key, separator, value = option.partition("=")
         if key not in _OPTIONS or not separator:
             forms = "write ?scene=N, ?frames=N, ?noise=SEED, or several, as ?scene=100&frames=60"
             raise SequenceError(f"'{text}' has an unknown option '{option}'", forms)
-        if key in found:
+        if key in options:
             raise SequenceError(f"'{text}' names {key} twice", "leave one out")
-        found[key] = _integer(value, key, text, *_OPTIONS[key])
-    return found
+        options[key] = _integer(value, key, text, *_OPTIONS[key])
+    return options
 
 
 def _integer(value: str, what: str, text: str, low: int, high: int) -> int:

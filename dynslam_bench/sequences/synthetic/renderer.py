@@ -53,18 +53,18 @@ class View:
         """Whether every row has its own pose."""
         return len(self.poses) > 1
 
-    def local(self, seen: NDArray[np.int32]) -> Array:
+    def local(self, visible: NDArray[np.int32]) -> Array:
         """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`.
 
-        Under a rolling shutter those of the primitives `seen` alone are filled in.
+        Under a rolling shutter those of the primitives `visible` alone are filled in.
         """
         if not self.rolling:
             return self.middle.local[None]
-        inverse = np.swapaxes(self.middle.rotation[seen], 1, 2) / self.scale[seen, :, None]
-        poses = np.repeat(self.poses[:, None, :3], len(seen), axis=1)
-        poses[..., 3] -= self.middle.origin[seen]
+        inverse = np.swapaxes(self.middle.rotation[visible], 1, 2) / self.scale[visible, :, None]
+        poses = np.repeat(self.poses[:, None, :3], len(visible), axis=1)
+        poses[..., 3] -= self.middle.origin[visible]
         local = np.empty((len(self.poses), len(self.scale), 12))
-        local[:, seen] = (product(inverse, poses)).reshape(len(poses), -1, 12)
+        local[:, visible] = (product(inverse, poses)).reshape(len(poses), -1, 12)
         return local
 
     def at_row(self, row: int) -> Snapshot:
@@ -281,9 +281,9 @@ class Renderer:
         jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
 
         def work(a: int, b: int) -> None:
-            seen = now.at_row((a + b) // 2)
-            lights = self._lights(seen, time)
-            facets = self._facets(seen, lights)
+            snapshot = now.at_row((a + b) // 2)
+            lights = self._lights(snapshot, time)
+            facets = self._facets(snapshot, lights)
             for first, end, maps in _rows_of(local, a, b):
                 kernels.shade_pixels(
                     first, end, self._intrinsics, *tiles, scene.kind, maps, scene.shape, scene.texture, scene.uv,
@@ -339,12 +339,12 @@ class Renderer:
         )
         chosen = np.linspace(0, len(view.poses) - 1, 9 if view.rolling else 1).astype(int)
         bounds = [bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.poses[chosen]]
-        nearest, low_u, low_v = (np.min([each[k] for each in bounds], axis=0) for k in range(3))
-        high_u, high_v = (np.max([each[k] for each in bounds], axis=0) for k in (3, 4))
+        nearest, low_u, low_v = (np.min([bound[k] for bound in bounds], axis=0) for k in range(3))
+        high_u, high_v = (np.max([bound[k] for bound in bounds], axis=0) for k in (3, 4))
         if view.rolling:
             nearest = nearest - _SLACK_M
         tiles_x, tiles_y = -(-CAMERA.width // kernels.TILE), -(-CAMERA.height // kernels.TILE)
-        seen = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
+        visible = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
         boxes = np.stack(
             [
                 np.clip(low_u, 0, CAMERA.width - 1),
@@ -356,7 +356,7 @@ class Renderer:
         )
         boxes = (boxes // kernels.TILE).astype(np.int32)
         order = np.argsort(nearest, kind="stable")
-        order = order[seen[order]].astype(np.int32)
+        order = order[visible[order]].astype(np.int32)
         start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
         tiles = tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
         return tiles, view.local(order)
@@ -404,8 +404,8 @@ class Renderer:
         facets = np.empty((len(axes), 6, 5))
         facets[:, 0::2, :3], facets[:, 1::2, :3] = -axes, axes
         facets[scene.kind == QUAD, 4:, :3] = axes[scene.kind == QUAD, 2:]
-        seen = snap.T_world_cam[:3, 3] - snap.origin
-        behind = (product(seen[:, None, :], snap.rotation) < 0)[:, 0, 2] & (scene.kind == QUAD)
+        to_camera = snap.T_world_cam[:3, 3] - snap.origin
+        behind = (product(to_camera[:, None, :], snap.rotation) < 0)[:, 0, 2] & (scene.kind == QUAD)
         facets[behind, 4:, :3] *= -1
         facets[:, :, 3] = lights[0, 3] + product(
             np.maximum(product(facets[:, :, :3], lights[1:, :3].T), 0), lights[1:, 3]

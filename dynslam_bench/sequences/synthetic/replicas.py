@@ -89,7 +89,7 @@ def _of(values: Value | dict[str, Value], variant: str) -> Value:
     return values[variant] if isinstance(values, dict) else values
 
 
-# Synthetic replicas of TUM's fr3 dynamic sequences: two people who walk, or sit, in an office, four motions of the camera.
+# Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.
 
 
 def build_replica(people: str, motion: str, scene: int) -> World:
@@ -104,8 +104,7 @@ def build_replica(people: str, motion: str, scene: int) -> World:
             for k, keys in enumerate(script.chairs)
         ),
         actors=tuple(
-            Actor(draw_person(scene, k), partial(posture, keys, script.period))
-            for k, keys in enumerate(script.people)
+            Actor(draw_person(scene, k), partial(posture, keys, script.period)) for k, keys in enumerate(script.people)
         ),
     )
 
