@@ -206,7 +206,7 @@ class Window:
             & (times < 1.5 * self.stamps[-1] - 0.5 * self.stamps[-2]),
         )
 
-    def _seen(self, moment: _Moment) -> Array:
+    def _in_camera(self, moment: _Moment) -> Array:
         """The points ``[L, n, 3]`` in the camera at a moment."""
         return np.asarray((moment.R @ (self.points[:, None] - moment.centre)[..., None])[..., 0])
 
@@ -218,7 +218,7 @@ class Window:
 
     def measure_noise(self, readout_s: float) -> None:
         """Take the noise of pixels and of inverse depth from the median residuals."""
-        residuals = self._residuals(self._seen(self._at(self.late * readout_s)))
+        residuals = self._residuals(self._in_camera(self._at(self.late * readout_s)))
         error, depth = np.hypot(residuals[..., 0], residuals[..., 1]), np.abs(residuals[..., 2])
         valid, deep = np.isfinite(error), np.isfinite(depth)
         if valid.any() and deep.any():
@@ -236,7 +236,7 @@ class Window:
             readout_s: Readout time; the depth image's rows are taken to be read as the colour image's are.
             delay_s: By which the depth images are exposed later than their stamps say.
         """
-        now = self._seen(self._at(self.late * readout_s))
+        now = self._in_camera(self._at(self.late * readout_s))
         self.inverse_depth, before, after = (
             self._depth_at(now, readout_s, delay_s + step) for step in (0.0, -_DIFFERENCE_S, _DIFFERENCE_S)
         )
@@ -247,16 +247,16 @@ class Window:
     def _depth_at(self, now: Array, readout_s: float, delay_s: float) -> Array:
         """Inverse depth ``[L, n]`` at the pixels' time of images exposed `delay_s` after their stamps."""
         moment = self._at(self.late * readout_s + self.offsets + delay_s)
-        then = self._seen(moment)
+        then = self._in_camera(moment)
         inverse_now, inverse_then = 1 / np.maximum(now[..., 2:], 1e-3), 1 / np.maximum(then[..., 2:], 1e-3)
         shift = (then[..., :2] * inverse_then - now[..., :2] * inverse_now) * (self.camera.fx, self.camera.fy)
         place = np.where(moment.within[..., None] & np.isfinite(self.xy), self.raw + shift, np.nan)
-        found = np.stack([inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1)
-        return np.asarray(found - (inverse_then - inverse_now)[..., 0])
+        observed = np.stack([inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1)
+        return np.asarray(observed - (inverse_then - inverse_now)[..., 0])
 
     def depth_cost(self, readout_s: float, delay_s: float) -> tuple[float, int]:
         """Robust cost of the depth images under a delay, and how many depths it sums."""
-        now = self._seen(self._at(self.late * readout_s))
+        now = self._in_camera(self._at(self.late * readout_s))
         error = (1 / np.maximum(now[..., 2], 1e-3) - self._depth_at(now, readout_s, delay_s)) / self.noise[1]
         valid = np.isfinite(error)
         return float(np.log1p((error[valid] / CAUCHY) ** 2).sum()), int(valid.sum())
@@ -265,7 +265,7 @@ class Window:
         """Gauss-Newton's normal equations about the state, the points eliminated."""
         L, n = len(self.xy), len(self.stamps)
         moment = self._at(self.late * readout_s)
-        points = self._seen(moment)
+        points = self._in_camera(moment)
         residuals = self._residuals(points)
         pixels, depth = self.noise
         error = np.hypot(residuals[..., 0], residuals[..., 1]) / pixels

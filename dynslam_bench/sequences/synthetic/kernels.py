@@ -97,6 +97,22 @@ def hit_round_cone(
 
 # The numba kernels of the renderer: ray casting over tile bins and edge antialiasing.
 
+
+@dividing_kernel
+def hit_primitive(
+    kind: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a: float, b: float, c: float,
+    t_max: float,
+) -> tuple[float, int]:  # fmt: skip
+    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
+    if kind == ROUND_CONE:
+        t = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
+        return t, 0 if t < t_max else -1
+    if kind == BOX:
+        return hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t_max)  # type: ignore[no-any-return]
+    t = -oz / dz
+    return t, 4 if NEAR_M < t < t_max and abs(ox + t * dx) <= a and abs(oy + t * dy) <= b else -1
+
+
 TILE = 8
 atan2 = dividing_kernel(_atan2)
 _PER_TURN = 1.0 / (2.0 * math.pi)
@@ -173,18 +189,9 @@ def cast_geometry(
                 dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
                 ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
                 a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
-                if kind[q] == ROUND_CONE:
-                    t_hit = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                    if t_hit < t:
-                        t, p, face = t_hit, q, 0
-                elif kind[q] == BOX:
-                    t_hit, face_hit = hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                    if face_hit >= 0:
-                        t, p, face = t_hit, q, face_hit
-                else:
-                    t_hit = -oz / dz
-                    if NEAR_M < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
-                        t, p, face = t_hit, q, 4
+                t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                if face_hit >= 0:
+                    t, p, face = t_hit, q, face_hit
             last = p
             hit[row, column] = 8 * p + face if p >= 0 else -1
             depth[row, column] = t if p >= 0 else 0.0
@@ -226,7 +233,7 @@ def shade_pixels(
             # Sample -1 is the pixel centre, which the first pass has traced.
             for sample in range(-1, samples if edge else 0):
                 x, y = (column - cx) / fx, (row - cy) / fy
-                seen, t, p, face = key, depth[row, column], centre, key & 7
+                surface, t, p, face = key, depth[row, column], centre, key & 7
                 if sample >= 0:
                     x, y = (column + jitter[sample, 0] - cx) / fx, (row + jitter[sample, 1] - cy) / fy
                     t, p, face = 1e30, -1, 0
@@ -243,28 +250,19 @@ def shade_pixels(
                         dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
                         ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
                         a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
-                        if kind[q] == ROUND_CONE:
-                            t_hit = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                            if t_hit < t:
-                                t, p, face = t_hit, q, 0
-                        elif kind[q] == BOX:
-                            t_hit, face_hit = hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                            if face_hit >= 0:
-                                t, p, face = t_hit, q, face_hit
-                        else:
-                            t_hit = -oz / dz
-                            if NEAR_M < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
-                                t, p, face = t_hit, q, 4
-                    seen = 8 * p + face if p >= 0 else -1
-                    if seen == key:
+                        t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                        if face_hit >= 0:
+                            t, p, face = t_hit, q, face_hit
+                    surface = 8 * p + face if p >= 0 else -1
+                    if surface == key:
                         red, green, blue = red + own_red, green + own_green, blue + own_blue
                         continue
-                if seen == last:
+                if surface == last:
                     red, green, blue = red + new_red, green + new_green, blue + new_blue
                     continue
-                last = seen
+                last = surface
                 new_red, new_green, new_blue, cos = 0.0, 0.0, 0.0, 0.0
-                if seen >= 0:
+                if surface >= 0:
                     su, sv = uv[p, face, 0], uv[p, face, 1]
                     u, v = uv[p, face, 2], uv[p, face, 3]
                     lx = local[p, 3] + t * (local[p, 0] * x + local[p, 1] * y + local[p, 2])
