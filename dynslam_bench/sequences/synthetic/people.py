@@ -65,7 +65,7 @@ class Posture:
 
 
 def draw_person(scene: int, index: int) -> Person:
-    """The `index`-th person (0 or 1) of an scene; the first always wears plaid, the other any pattern."""
+    """The `index`-th person (0 or 1) of a scene; the first always wears plaid, the other any pattern."""
     rng = stream(scene, "synthetic", "person", index)
     skins = np.array(
         [
@@ -402,7 +402,7 @@ class Script:
 
 
 def write_script(people: str, scene: int) -> Script:
-    """The script of an scene."""
+    """The script of a scene."""
     rng = stream(scene, "synthetic", "script", people)
     flip = -1.0 if rng.random() < 0.5 else 1.0
 

@@ -57,7 +57,7 @@ def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
 
 
 def plan_room(scene: int, number: int | None = None) -> Plan:
-    """Draw the plan of an scene's room, or of one of its several rooms."""
+    """Draw the plan of a scene's room, or of one of its several rooms."""
     rng = stream(scene, "synthetic", "room", *(() if number is None else (number,)))
 
     def color(low: float, high: float, spread: float) -> Array:
