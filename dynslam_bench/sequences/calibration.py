@@ -61,7 +61,7 @@ class Quantity:
         low: Lower end of the 95 % interval.
         high: Its upper end.
         written: What a ``camera.toml`` should state; None to leave it as it is.
-        observable: False where the recording does not tell the quantity.
+        observable: False where the recording does not determine the quantity.
         reason: What that rests on, one phrase.
     """
 
@@ -238,7 +238,7 @@ class Estimate:
 
     @property
     def resolved(self) -> bool:
-        """Whether a time in seconds is told well enough to be used."""
+        """Whether a time in seconds is determined well enough to be used."""
         return self.half <= max(RESOLVED_S, RESOLVED_SHARE * abs(self.value))
 
 
@@ -352,7 +352,7 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
     about = Quantity("depth_factor")
     truth = sequence.ground_truth
     if truth is None or len(truth) < 2:
-        return replace(about, reason="there is no ground truth: images alone do not tell the unit of length")
+        return replace(about, reason="there is no ground truth: images alone do not determine the unit of length")
     used, scales, information = [], [], []
     for window in windows:
         stamps = window.start + window.stamps - window.stamps[0]

@@ -212,10 +212,10 @@ def find_camera(
         folder: A sequence's folder.
         choice: See `chosen_camera`; it wins over everything else.
         stated: What the folder's own calibration says; it wins over what its published name implies.
-        otherwise: Name of the camera if nothing else tells it, from the catalogue.
+        otherwise: Name of the camera if nothing else states it, from the catalogue.
 
     Raises:
-        SequenceError: The choice is not understood, or nothing tells the camera.
+        SequenceError: The choice is not understood, or nothing states the camera.
     """
     chosen = chosen_camera(folder, choice)
     if chosen is not None:

@@ -47,7 +47,7 @@ class CatalogueEntry(Settings):
     verified: bool = Field(default=False, description="whether the publisher's own files were read with it")
     more_urls: tuple[str, ...] = Field(default=(), description="further archives that belong to the same folder")
     by_hand: str = Field(default="", description="why this program cannot fetch it; empty where it can")
-    distinctive: bool = Field(default=True, description="whether the folder's name alone tells which sequence it is")
+    distinctive: bool = Field(default=True, description="whether the folder's name alone identifies the sequence")
     title: str = Field(description="name of the data set")
     page: str = Field(default="", description="web page of the data set")
     size_bytes: int | None = Field(default=None, description="exact size of the archive")
@@ -381,7 +381,7 @@ def _builtin() -> Iterator[DatasetSpec]:
     for name, first in public_datasets().items():
         ids = tuple(entry.id for entry in catalogue().values() if entry.dataset == name)
         yield DatasetSpec(name, f"{OPENERS}:open_public", ids, first.title, first.license, first.citation)
-    summary = "rendered rooms with exact poses, masks and flow"
+    summary = "rendered scenes with exact poses, masks and flow"
     yield DatasetSpec("synthetic", f"{OPENERS}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
 
 

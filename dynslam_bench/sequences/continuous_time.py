@@ -22,7 +22,7 @@ POINTS = 110
 def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> Array:
     """Corners followed from image to image by Lucas and Kanade, pixels ``[L, n, 2]``; NaN where they are not seen.
 
-    A corner whose way back ends more than half a pixel off is lost; new ones are status where few are left, and where
+    A corner that is tracked back more than half a pixel off is lost. New ones are detected where few are left and
     `allowed` is not 0.
     """
     n, (height, width) = len(images), images[0].shape

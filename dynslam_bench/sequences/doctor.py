@@ -17,7 +17,7 @@ from dynslam_bench.sequences.truth_checks import RESAVE, truth_findings
 
 MOST_FRAMES = 240
 FEWEST = 10
-"""Frames below which nothing but single images is judged."""
+"""Frames below which only single images are checked."""
 STRETCH = 40
 """Frames that are read one after the other: more than a second, for delays and shifts in time."""
 

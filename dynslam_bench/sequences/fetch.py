@@ -123,7 +123,7 @@ def fetch(
 ) -> Path:
     """Download and extract a public sequence; one that is here already is left alone.
 
-    Whatever goes wrong, no half sequence appears, and the next call goes on where this one stopped.
+    After any failure no partial sequence is left, and the next call resumes where this one stopped.
 
     Args:
         name: Id or published folder name.
@@ -149,7 +149,7 @@ def fetch(
         return folder
     if entry.by_hand:
         raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
-    parts = []
+    parts: list[Download] = []
     for address in (url or entry.url, *entry.more_urls):
         expected = entry.sha256 if checksum and not parts else None  # the catalogue knows the first archive's only
         archive = root / ".downloads" / _archive_name(address, entry)
@@ -331,7 +331,7 @@ def _compare_checksum(root: Path, part: Download) -> None:
         part.archive.unlink(missing_ok=True)  # the next call fetches it again
         raise SequenceError(
             f"{without_passwords(part.address)} has the checksum {part.sha256}, but gave {first} before",
-            f"somebody has changed it; --no-checksum takes it all the same, and {path} says what came first",
+            f"the file has changed; --no-checksum takes it all the same, and {path} says what came first",
         )
 
 

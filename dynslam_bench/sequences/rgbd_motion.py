@@ -152,10 +152,10 @@ def _at(depth: NDArray[np.float32], pixels: Pixels) -> Array:
     return np.asarray(depth[y, x], dtype=np.float64)
 
 
-# The motion that a ground truth tells, read in several conventions, beside the one that was measured.
+# Motions of a ground truth, read in several conventions, compared with the measured ones.
 
 
-READINGS = ("as it stands", "inverted", "w first", "w first, inverted", "rotations inverted")
+READINGS = ("as stored", "inverted", "w first", "w first, inverted", "rotations inverted")
 ROTATION_NOISE = np.radians(0.25)
 TRANSLATION_NOISE = 0.006
 """Of a measured motion: as a part of the median depth."""
@@ -286,7 +286,7 @@ def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Ar
 
 @dataclass(frozen=True)
 class Match:
-    """How well a truth, read in one way and shifted in time, tells the measured motions.
+    """How well a truth, read in one convention and shifted in time, agrees with the measured motions.
 
     Attributes:
         reading: One of `READINGS`.

@@ -1,6 +1,6 @@
-"""Does the ground truth of a recording tell the motion that its images show?
+"""Does the ground truth of a recording agree with the motion that its images show?
 
-The motion between frames (`rgbd_motion`) is compared with that of the truth: as it stands, shifted in time, inverted,
+The motion between frames (`rgbd_motion`) is compared with that of the truth: as stored, shifted in time, inverted,
 with its quaternions read in the other order, in other axes. Where the two agree, camera and depth are measured by them.
 """
 
@@ -41,7 +41,7 @@ LEAST_COVERAGE = 0.15
 LEAST_PAIRS = 8
 REST_PX = 2.0
 GOOD = 0.75
-"""`Match.total` of a truth that tells the motion: healthy recordings have 0.78 to 0.98, other readings up to 0.5."""
+"""`Match.total` of a truth that agrees with the motion; 0.78 to 0.98 in healthy recordings, other readings up to 0.5."""
 SURE = 0.86
 """The same for a shift in time of a recording that is shorter than the range of shifts searched, or has few pairs: one
 of 160 shifts fits by chance to 0.84."""
@@ -171,7 +171,7 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
 def _otherwise(
     motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match, tried: int
 ) -> list[Finding]:
-    """A truth that tells the motion in no reading: in other axes, or not at all."""
+    """A truth that agrees with the motion in no convention: in other axes, or not at all."""
     closest = best.total
     for reading in READINGS[:3]:
         for shift in np.arange(-4, 5) * 0.025 if reading == READINGS[0] else (0.0,):
@@ -409,7 +409,7 @@ def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, fre
     """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
 
     Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.
-    A weak prior keeps what the motion does not tell near what is stated.
+    A weak prior keeps values that the motion does not determine near the stated ones.
 
     Args:
         pairs: Pairs of frames with a motion.

@@ -44,7 +44,7 @@ class SequenceView:
 
     @property
     def depth_timestamps(self) -> NDArray[np.float64]:
-        """Stamps of the selected frames' depth images; the frames' own where the sequence does not tell."""
+        """Stamps of the selected frames' depth images; the frames' own where the sequence does not state them."""
         stamps = getattr(self.base, "depth_timestamps", self.base.timestamps)
         return np.asarray(stamps[self.range.start : self.range.stop : self.range.step])
 

@@ -171,7 +171,7 @@ def test_a_data_set_plugs_in(tmp_path, monkeypatch, vga):
     folder = vga("mine/one")
     plugin = tmp_path / "my_dataset.py"
     plugin.write_text(
-        "from dynslam_bench.sequences.catalogue import DatasetSpec\n"
+        "from dynslam_bench.contracts import DatasetSpec\n"
         "from dynslam_bench.sequences.catalogue import open_folder\n"
         f"SPEC = DatasetSpec('mine', r'{plugin}:load', ('mine/one',))\n"
         "def load(sequence_id, *, data_root):\n"

@@ -215,7 +215,7 @@ class Contents:
     furthest_m: float | None = None
 
 
-# What was dropped on the way from list files to frames, and why.
+# Entries of list files that did not become frames, and why.
 
 
 @dataclass(frozen=True)

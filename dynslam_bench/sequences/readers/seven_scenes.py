@@ -57,7 +57,7 @@ def read(folder: Path, fps: float | None = None) -> Contents:
 
 
 def read_pose(path: Path) -> NDArray[np.float64] | None:
-    """A 4x4 pose, as it stands; None where it is no number, as KinectFusion writes a lost frame.
+    """A 4x4 pose, unchanged; None where it is no number, as KinectFusion writes a lost frame.
 
     Raises:
         SequenceError: The file is missing, or holds no rigid transformation.

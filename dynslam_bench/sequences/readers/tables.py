@@ -159,7 +159,7 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def column(heading: list[str], name: str, path: Path) -> int:
-    """Where a column stands.
+    """Index of a column.
 
     Raises:
         SequenceError: There is none.

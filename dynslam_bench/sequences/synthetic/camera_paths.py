@@ -103,7 +103,7 @@ def rotations(vectors: Array) -> Array:
     return np.asarray(np.eye(3) + s * hat + c * (product(hat, hat)))
 
 
-# Long ways of a hand-held camera: closed walks along way points, at walking pace, exact at any time.
+# Long paths of a hand-held camera: closed loops along way points, at walking pace, exact at any time.
 
 _STEP_M = 0.4
 """Distance of the spline's control points."""
@@ -157,10 +157,10 @@ def walking_camera(walk: Walk, scene: int, name: str, aside_deg: float, times: A
     """Poses ``[N, 4, 4]`` of a camera that is carried along a walk.
 
     Args:
-        walk: The way.
+        walk: The path.
         scene: Seeds the hand's jitter and how each lap strays from the others.
         name: Names that seed.
-        aside_deg: How far the camera looks to the left of where it goes; it looks around by 12 degrees more.
+        aside_deg: How far the camera looks to the left of its direction of motion; it looks around by 12 degrees more.
         times: Seconds from the start.
     """
     rng = stream(scene, "synthetic", "walk", name)

@@ -108,7 +108,7 @@ def hit_primitive(
         t = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
         return t, 0 if t < t_max else -1
     if kind == BOX:
-        return hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t_max)  # type: ignore[no-any-return]
+        return hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
     t = -oz / dz
     return t, 4 if NEAR_M < t < t_max and abs(ox + t * dx) <= a and abs(oy + t * dy) <= b else -1
 

@@ -1,4 +1,4 @@
-"""Long ways that come back: a room circled (20 m), a ring of corridors (60 m), six rooms along a corridor (120 m).
+"""Long paths that return: a room circled (20 m), a ring of corridors (60 m), six rooms along a corridor (120 m).
 
 `moved`: chairs and cartons stand elsewhere whenever the camera comes by again; each is moved while the camera is half a
 lap away, at a sixth of it. `repeated`: every stretch of wall is the same, down to its textures.
@@ -88,7 +88,7 @@ def build_loop(variant: str, scene: int) -> World:
 
 
 def _moves(building: _Building, walk: Walk, moved: bool) -> list[Callable[[float], tuple[Array, Array]]]:
-    """Where each loose piece stands, by lap."""
+    """The place of each loose piece, by lap."""
     paths: list[Callable[[float], tuple[Array, Array]]] = []
     for number, (_, _, yaw, at) in enumerate(building.loose):
         rng = stream(building.scene, "synthetic", "moved", number)
@@ -145,13 +145,13 @@ def _corridor(b: _Building) -> Walk:
     for sign in (1, -1):
         for start, end in _around(x + sign * width, y + sign * width):
             add_wall(b.parts, start, end, plan)
-            way = np.array(end) - start
-            length = float(norm(way))
-            yaw = float(np.degrees(atan2(way[1], way[0]))) + (0 if sign < 0 else 180)
-            inward = sign * np.array([-way[1], way[0]]) / length * 0.05
+            wall = np.array(end) - start
+            length = float(norm(wall))
+            yaw = float(np.degrees(atan2(wall[1], wall[0]))) + (0 if sign < 0 else 180)
+            inward = sign * np.array([-wall[1], wall[0]]) / length * 0.05
             count = int(length / 2.3)
             for k in range(count):
-                at = np.array(start) + way * (k + 0.5) / count + inward
+                at = np.array(start) + wall * (k + 0.5) / count + inward
                 b.bay(corridor_bay, yaw, (float(at[0]), float(at[1])), alike=b.bays % 4)
                 if k % 3 == 1:
                     out = at + inward / 0.05 * 0.35
@@ -160,7 +160,7 @@ def _corridor(b: _Building) -> Walk:
 
 
 def _rooms(b: _Building) -> Walk:
-    """A corridor with three rooms on either side; the walk goes once around in each and comes back."""
+    """A corridor with three rooms on either side; the path runs once around in each and returns."""
     rng, plan = stream(b.scene, "synthetic", "floor"), plan_room(b.scene, 0)
     wide, deep, half = pick(rng, b.scene, 6.6, 7.0), pick(rng, b.scene, 5.8, 6.2), 1.2
     ends = 1.5 * wide
@@ -236,8 +236,8 @@ def build_tracking(variant: str, scene: int) -> World:
 
 def _walking(walk: Walk, lead_s: float, time: float) -> Posture:
     place, ahead = walk.at(np.array([time + lead_s, time + lead_s + 0.3]))
-    way = ahead - place
-    facing = math.degrees(atan2(way[1], way[0])) - 90.0
+    direction = ahead - place
+    facing = math.degrees(atan2(direction[1], direction[0])) - 90.0
     stride = 0.45 * (time + lead_s) * 2 * math.pi / 1.0
     return Posture(float(place[0]), float(place[1]), facing, stride, 0.6, 0.0, 0.0, time)
 
@@ -260,7 +260,7 @@ SWINGS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 
 
 def build_fast(variant: str, scene: int) -> World:
-    """The office, with nobody or the walking people, or the hall of the loops."""
+    """The office, without people or with the walking ones, or the hall of the loops."""
     camera = partial(fast_camera, variant, scene)
     if variant == "walking":
         office = build_replica("walking", "xyz", scene)

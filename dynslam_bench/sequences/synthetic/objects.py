@@ -35,7 +35,7 @@ from dynslam_bench.sequences.synthetic.scene import Actor, Body, World
 PERIOD_S = 20.0
 Draw = Callable[[float, float], float]
 Cast = tuple[tuple[Body, ...], tuple[Key, ...]]
-"""Bodies and, where somebody carries them, the carrier's timeline."""
+"""Bodies and, where a person carries them, the carrier's timeline."""
 
 
 def build_objects(variant: str, scene: int) -> World:
@@ -55,7 +55,7 @@ def _body(id: int, name: str, parts: Parts, keys: tuple[At, ...], period: float 
 
 
 def _balloon(j: Draw, scene: int, plan: Plan) -> Cast:
-    """Somebody walks to and fro and plays with a balloon in front of the camera."""
+    """A person walks to and fro and plays with a balloon in front of the camera."""
     y, reach, high = j(0.95, 1.05), j(0.32, 0.42), j(1.45, 1.55)
     keys = [At(0.0, reach, y, high - 0.3)]
     for k in range(8):
@@ -77,7 +77,7 @@ def _box_obstructing(j: Draw, scene: int, plan: Plan) -> Cast:
 
 
 def _box_aside(j: Draw, scene: int, plan: Plan) -> Cast:
-    """Somebody carries a carton through the room; it never hides most of the view."""
+    """A person carries a carton through the room; it never hides most of the view."""
     y, z = j(1.3, 1.4), j(0.95, 1.05)
     box = printed_box(1, (j(0.21, 0.25), j(0.15, 0.19), j(0.17, 0.21)))
     times = ((0, -1.6), (1.5, -1.6), (5.5, 0.35), (7.5, 0.2), (10.0, 1.6), (12.0, 1.6), (16.0, -0.3), (18.5, -1.6),
@@ -120,7 +120,7 @@ def _stand(j: Draw, stations: list[tuple[float, float, float]], came: bool) -> C
 
 
 def _kidnapped(j: Draw, scene: int, plan: Plan) -> Cast:
-    """A very large carton comes before the camera, fills the image while it moves, and goes."""
+    """A very large carton comes before the camera, fills the image while it moves, and leaves."""
     y, z = j(1.0, 1.1), j(1.1, 1.2)
     box = printed_box(1, (j(1.15, 1.25), 0.12, j(0.8, 0.9)))
     keys = [At(0, -2.6, y, z), At(3.0, -2.6, y, z), At(5.0, -0.3, y, z), At(7.5, 0.3, y - 0.06, z + 0.05)]
@@ -130,7 +130,7 @@ def _kidnapped(j: Draw, scene: int, plan: Plan) -> Cast:
 
 
 def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
-    """Somebody pushes a loaded trolley to and fro before the desk."""
+    """A person pushes a loaded trolley to and fro before the desk."""
     y = j(1.3, 1.4)
     stops = ((0, -2.0, 0), (1.5, -2.0, 0), (6.0, 0.15, 0), (8.0, 0.2, 6), (11.5, 2.3, 0), (12.5, 2.3, 180),
              (15.5, 0.1, 180), (16.5, 0.05, 174), (19.5, -2.0, 180), (20.0, -2.0, 360))  # fmt: skip
@@ -140,7 +140,7 @@ def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
 
 
 def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
-    """A chair with a carton on it is turned and rolled; nobody is seen."""
+    """A chair with a carton on it is turned and rolled; no person is in view."""
     x, y, turned = j(-0.2, 0.2), j(1.15, 1.25), j(150, 210)
     parts = Parts()
     add_chair(parts, 1, plan.tints["chair"], plan.tints["metal"])

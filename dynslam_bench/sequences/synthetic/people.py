@@ -384,7 +384,7 @@ class Key:
 
 @dataclass(frozen=True)
 class ChairKey:
-    """Where a chair stands at one time (facing as for people)."""
+    """The place of a chair at one time (facing as for people)."""
 
     t: float
     x: float
@@ -485,7 +485,7 @@ def _walking(j: Draw) -> Script:
 
 
 def _chairs(cx: float, cy: float) -> tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]:
-    """A chair that rolls as somebody sits down on it and rises, and one that is pushed in passing."""
+    """A chair that rolls when a person sits down on it and rises, and one that is pushed in passing."""
     rest_y = cy + 0.2
     first = (
         ChairKey(0, cx, rest_y, 100),
@@ -524,7 +524,7 @@ def _ease(x: float) -> float:
 
 
 def _angle(a: float, b: float, s: float) -> float:
-    """From a to b degrees the short way round."""
+    """From a to b degrees through the smaller angle."""
     return a + s * ((b - a + 180.0) % 360.0 - 180.0)
 
 

@@ -54,7 +54,7 @@ class Family:
 
     Attributes:
         name: First part of the ids.
-        variants: Second parts; the empty one stands for the name alone.
+        variants: Second parts; empty for the name alone.
         build: Variant and scene number to the world that is filmed.
         tags: As in the catalogue: ``static``, ``low-dynamic``, ``high-dynamic``; of each variant, or of all.
         frames: Default length of each variant, or of all.
@@ -133,7 +133,7 @@ SITTING = Family("sitting", MOTIONS, partial(build_replica, "sitting"), ("low-dy
 # Four people who walk past each other all the time and hide most of the view.
 
 LANES_M = (1.0, 1.27, 1.54, 1.8)
-"""Distance of each person's way from the camera's plumb line: nobody walks through another."""
+"""Distance of each person's path from the camera's plumb line: no two people cross."""
 
 
 def build_crowd(motion: str, scene: int) -> World:
@@ -155,8 +155,8 @@ def _walker(scene: int, number: int, lane: float) -> Actor:
     stations += [(cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0)]
     times = itertools.accumulate(station[0] for station in stations)
     keys = tuple(
-        Key(t, x, lane, 180.0 - 90.0 * way if way else 180.0, 0, talk)
-        for t, (_, x, way, talk) in zip(times, stations, strict=True)
+        Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
+        for t, (_, x, direction, talk) in zip(times, stations, strict=True)
     )
     period = keys[-1].t
     start = pick(rng, scene, 0.0, period)
@@ -185,7 +185,7 @@ class Step:
 
 
 def build_synchronous(variant: str, scene: int) -> World:
-    """The office, two people side by side, and a camera that goes with them."""
+    """The office, two people side by side, and a camera that moves with them."""
     plan, rng = plan_room(scene), stream(scene, "synthetic", "synchronous")
     step = Step(pick(rng, scene, 0.5, 0.6), pick(rng, scene, 4.4, 5.2), pick(rng, scene, 0.0, 1.0))
     places = ((-pick(rng, scene, 0.3, 0.36), pick(rng, scene, 1.2, 1.3)), (pick(rng, scene, 0.28, 0.34), 1.35))

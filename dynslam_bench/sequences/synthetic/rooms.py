@@ -410,7 +410,7 @@ def add_chair(parts: Parts, instance: int, tint: Array, metal: Array) -> None:
         parts.add(BOX, eye, np.array([side * 0.27, 0.05, 0.55]), (0.015, 0.02, 0.1), instance=instance, tint=metal)
 
 
-# The room: walls, floor and ceiling, and where its furniture stands.
+# The room: walls, floor and ceiling, and the places of its furniture.
 
 
 def build_room(scene: int, plan: Plan) -> Parts:
@@ -505,11 +505,11 @@ def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[fl
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = math.sqrt(dx * dx + dy * dy)
-    facing, way = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
+    facing, direction = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
 
     def piece(a: float, b: float, bottom: float) -> None:
         half = ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2)
-        at = np.array([*start, 0.0]) + (a + b) / 2 * way + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
+        at = np.array([*start, 0.0]) + (a + b) / 2 * direction + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
         parts.add(BOX, facing, at, half, texture="plaster", repeat=(0.5, 0.5), tint=plan.tints["wall"])
 
     edges = [0.0] + [door + side * DOOR_M / 2 for door in sorted(doors) for side in (-1, 1)] + [length]
