@@ -41,7 +41,7 @@ LEAST_COVERAGE = 0.15
 LEAST_PAIRS = 8
 REST_PX = 2.0
 GOOD = 0.75
-"""`Match.total` of a truth that agrees with the motion; 0.78 to 0.98 in healthy recordings, other readings up to 0.5."""
+"""`Match.total` of a truth that agrees with the motion; 0.78 to 0.98 in healthy recordings, else up to 0.5."""
 SURE = 0.86
 """The same for a shift in time of a recording that is shorter than the range of shifts searched, or has few pairs: one
 of 160 shifts fits by chance to 0.84."""
