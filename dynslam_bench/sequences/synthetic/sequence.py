@@ -38,6 +38,7 @@ from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads, row_times
 from dynslam_bench.sequences.synthetic.scene import Scene
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
+from dynslam_bench.sequences.view import Masks
 
 _END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _MODES = {"masks": ("L",), "depth": ("I;16", "I"), "rgb": ("RGB",)}
@@ -224,9 +225,16 @@ class SyntheticSequence:
         return Trajectory(self.timestamps, self.scene.poses(np.arange(len(self)) / FPS))
 
     @property
-    def masks(self) -> SyntheticMasks:
-        """Exact instance masks."""
-        return SyntheticMasks(self)
+    def masks(self) -> Masks:
+        """Exact masks of the instances, by frame index."""
+        return Masks(self._masks_of)
+
+    def _masks_of(self, index: int) -> FrameMasks:
+        i = range(len(self))[index]
+        ids = None if self.store is None else self.store.read("masks", float(self.timestamps[i]))
+        if ids is None:
+            ids = self.renderer.geometry(i)[1]
+        return FrameMasks(ids, self.scene.world.class_names, self.scene.moving(i))
 
     @cached_property
     def scene(self) -> Scene:
@@ -328,21 +336,6 @@ class SyntheticSequence:
             if lists and (index == len(self) - 1 or index == 0):
                 self.store.write_lists(self.ground_truth)
         return made
-
-
-class SyntheticMasks:
-    """Exact masks of a rendered sequence, by frame index."""
-
-    def __init__(self, sequence: SyntheticSequence) -> None:
-        self.sequence = sequence
-
-    def __getitem__(self, index: int) -> FrameMasks:
-        sequence = self.sequence
-        i = range(len(sequence))[index]
-        ids = None if sequence.store is None else sequence.store.read("masks", float(sequence.timestamps[i]))
-        if ids is None:
-            ids = sequence.renderer.geometry(i)[1]
-        return FrameMasks(ids, sequence.scene.world.class_names, sequence.scene.moving(i))
 
 
 def _metres(raw: NDArray[np.uint16]) -> NDArray[np.float32]:
