@@ -1,4 +1,4 @@
-"""The public sequences: what the catalogue's data files say of each."""
+"""Every sequence by its id: the public data sets, the rendered ones, plug-ins, and folders of the user's own."""
 
 from __future__ import annotations
 
@@ -128,9 +128,6 @@ def public_datasets() -> dict[str, CatalogueEntry]:
     for entry in catalogue().values():
         first.setdefault(entry.dataset, entry)
     return first
-
-
-# Every sequence by its id: the public data sets, the rendered ones, plug-ins, and folders of the user's own.
 
 
 _OPENED: dict[str, tuple[list[tuple[str, int, int, int, int]], Sequence]] = {}
@@ -388,7 +385,7 @@ def _builtin() -> Iterator[DatasetSpec]:
 DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
 
 
-# Sequences described for people: lists, and everything known of one.
+# Lists and descriptions for people.
 
 KNOWN = "known: another archive is refused"
 FIRST_USE = "not published: the first fetch takes it, every later one has to bring the same"

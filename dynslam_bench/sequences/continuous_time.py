@@ -1,4 +1,8 @@
-"""Corners followed through the images of a window, and the depth at pixels."""
+"""Bundle adjustment of a window of frames whose camera moves continuously: every row and depth image has its own time.
+
+Corners are tracked through the window. Kerl, Stueckler and Cremers, "Dense continuous-time tracking and mapping with
+rolling shutter RGB-D cameras", ICCV 2015.
+"""
 
 from __future__ import annotations
 
@@ -93,9 +97,6 @@ def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
     mean = (inverse * measured).sum(axis=1) / np.maximum(count, 1)
     spread = np.where(measured, inverse, -np.inf).max(axis=1) - np.where(measured, inverse, np.inf).min(axis=1)
     return np.where(inside & (count >= 20) & (spread < 0.12 * mean), mean, np.nan)
-
-
-# Bundle adjustment of a window of frames whose camera moves continuously: every row and depth image has its own time.
 
 
 LEAST_POINTS = 15
@@ -230,7 +231,7 @@ class Window:
         return float(np.sqrt(((rates - rates.mean(0)) ** 2).sum(1).mean()))
 
     def move_depth(self, readout_s: float, delay_s: float) -> None:
-        """Carry each depth from its image's time to its pixel's, with the motion as it is valid.
+        """Carry each depth from its image's time to its pixel's, with the motion as estimated so far.
 
         Args:
             readout_s: Readout time; the depth image's rows are taken to be read as the colour image's are.

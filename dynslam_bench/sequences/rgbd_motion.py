@@ -1,4 +1,7 @@
-"""The camera's motion between frames of one RGB-D sequence, measured by tracked corners and their depth."""
+"""The camera's motion between frames of an RGB-D sequence, and the agreement of a ground truth with it.
+
+The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
+"""
 
 from __future__ import annotations
 

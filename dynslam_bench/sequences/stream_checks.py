@@ -1,4 +1,9 @@
-"""What a check of a recording found."""
+"""Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
+
+Contours of depth are contours in the colour image, too, at the same place and time. Their correlation over shifts,
+mirrorings and delays says whether the depth is registered, which way up the images are, and whether the two streams
+are synchronous.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +47,6 @@ def note(id: str, value: float | None, unit: str, text: str, cure: str) -> Findi
     """A finding that is good to know."""
     return Finding(id, "note", None if value is None else float(value), unit, text, cure)
 
-
-# Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
 
 Map = NDArray[np.float32]
 

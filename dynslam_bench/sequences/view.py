@@ -1,4 +1,4 @@
-"""Part of a sequence, renumbered from 0."""
+"""Parts of a sequence: a view with renumbered frames, and the identity of the frames that it shows."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Masks:
         return self.masks_of(index)
 
 
-# What part of which sequence is seen, whatever it is called: equal frames have one identity in every spelling.
+# Identity of the frames: equal frames have one identity in every spelling.
 
 
 @dataclass(frozen=True)

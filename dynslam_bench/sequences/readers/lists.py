@@ -1,4 +1,4 @@
-"""Read ``rgb.txt`` and ``depth.txt``: stamps and file names, with a count of every line that was not used."""
+"""What a folder of images holds: stamped lists of files, their pairs, and counts of all that was not used."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def _count_unsorted(stamps: list[int | None]) -> int:
     return sum(later < earlier for earlier, later in pairwise(finite))
 
 
-# What a reader of recorded sequences finds in a folder; all readers give this, one class makes a sequence of it.
+# The result of every reader, from which `RecordedSequence` is made.
 
 
 @dataclass(frozen=True, eq=False)

@@ -246,7 +246,7 @@ def _file_size(path: Path) -> int | None:
         return None
 
 
-# Decode colour and depth images, and say in one line what is wrong with those that cannot be.
+# Decoding of colour and depth images.
 
 
 def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.uint8]:
@@ -323,7 +323,7 @@ def _read_raw(path: Path, depth_factor: float, size: tuple[int, int] | None, mis
     return image.astype(np.uint16, copy=False)
 
 
-# Depth as arrays of metres in NumPy's own format; a file that claims to be huge is refused before it costs memory.
+# Depth as arrays of metres in NumPy's own format; the size is checked before memory is taken.
 
 
 def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Numbers of calibration files in YAML, OpenCV's dialect (``%YAML:1.0``, ``!!opencv-matrix``) included."""
+"""Tables and calibration files of data sets: YAML with OpenCV's matrices, CSV with nanoseconds, poses of a body."""
 
 from __future__ import annotations
 

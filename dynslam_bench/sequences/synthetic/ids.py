@@ -1,4 +1,4 @@
-"""All families of rendered sequences, and their ids."""
+"""Ids and families of the rendered sequences; light: imports neither numba nor OpenCV."""
 
 from __future__ import annotations
 
@@ -22,8 +22,6 @@ REPLICA_IDS = (*WALKING.ids(), *SITTING.ids())
 SYNTHETIC_IDS = tuple(name for family in FAMILIES.values() for name in family.ids())
 """Every rendered sequence that is listed, scene 0, default length."""
 
-
-# Ids of the rendered sequences; light: imports neither numba nor OpenCV.
 
 _OPTIONS = {"scene": (0, HELD_OUT_SCENES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
 """What may stand behind the question mark, with the least and the largest value."""

@@ -1,4 +1,4 @@
-"""What the renderer's kernels are handed."""
+"""The renderer's numba kernels: intersections of rays, tiles, shading with antialiased edges, flow and motion blur."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Intrinsics = tuple[float, float, float, float]
 """Focal lengths and principal point, pixels."""
 
 
-# Where a ray meets a primitive.
+# Intersections of rays with primitives.
 
 NEAR_M = 0.05
 """Nothing nearer than this is seen, metres."""
@@ -95,7 +95,7 @@ def hit_round_cone(
     return best
 
 
-# The numba kernels of the renderer: ray casting over tile bins and edge antialiasing.
+# Ray casting over tiles, and antialiasing of edges.
 
 
 @dividing_kernel
@@ -347,7 +347,7 @@ def shade_pixels(
             cosine[row, column] = own_cos
 
 
-# The numba kernels of motion in the image: exact flow, and blur along it. As in `raycast`, rows are independent.
+# Motion in the image: exact flow, and blur along it. Rows are independent.
 
 MOST_TAPS = 16
 """Samples of the longest blur."""

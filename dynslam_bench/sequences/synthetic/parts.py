@@ -1,4 +1,4 @@
-"""Primitives of a scene: unit shapes in a local frame, and how to collect them."""
+"""Primitives of a scene: unit shapes in a local frame, how to collect them, and paths of rigid bodies."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How a frame's rows see the scene: all from one pose, or each from its own under a rolling shutter.
+"""Renders frames of a scene: geometry, colour, depth as measured, masks and flow.
 
-Under a rolling shutter the camera's pose is exact for every row; things and people are placed as they are when the
-middle of the image is exposed.
+All rows of a frame see the scene from one pose, or each from its own under a rolling shutter: then the camera's pose is
+exact for every row, while things and people are placed as they are when the middle of the image is exposed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.sequences.synthetic import kernels, sensors
-from dynslam_bench.sequences.synthetic import kernels as motion_kernels
 from dynslam_bench.sequences.synthetic.arithmetic import cos, exp, norm, power, product, sin
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.kernels import NEAR_M
@@ -159,8 +158,6 @@ def _project(points: Array, valid: NDArray[np.bool_]) -> Array:
     return np.stack(low + high)
 
 
-# Renders frames of a scene: geometry, colour, depth as measured, masks and flow.
-
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 
@@ -256,7 +253,7 @@ class Renderer:
             return rolling_flow(now, after, hit, depth)
         flow = np.empty((*hit.shape, 2), np.float32)
         motion = self._motion(now.middle, after.middle)
-        self._rows(lambda a, b: motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
+        self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
         return flow
 
     def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -304,15 +301,15 @@ class Renderer:
         def work(a: int, b: int) -> None:
             row = (a + b) // 2
             motion = self._motion(now.at_row(row), after.at_row(row))
-            motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
+            kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
 
         self._rows(work, bands=now.rolling)
         shutter, exact, shares = (
             self.color_sensor.shutter,
             sharp.astype(np.float64).ravel(),
-            motion_kernels.tap_shares(),
+            kernels.tap_shares(),
         )
-        self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
+        self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
         return blurred
 
     def _rows(self, work: Callable[[int, int], None], *, bands: bool = False) -> None:

@@ -1,4 +1,6 @@
-"""What announces a family of rendered sequences."""
+"""Families of rendered sequences in the office: replicas of TUM's fr3 sequences, a crowd, people who step in time with
+the camera, and conditions that sensors dislike.
+"""
 
 from __future__ import annotations
 

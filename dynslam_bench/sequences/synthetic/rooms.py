@@ -1,6 +1,7 @@
-"""The room of a scene, drawn so that scenes for tuning and held-out ones share no size and no place.
+"""Rooms and furniture of a scene: plans, walls, desks, shelves, posters, chairs, and things that move.
 
-Every choice of size or place is drawn from the half of its pool that belongs to the scene's split.
+Scenes for tuning and held-out ones share no size and no place: each is drawn from the half of its pool that belongs to
+the scene's split.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""What a scene of a family films, as data: a room, rigid bodies on paths, people, a camera, two sensors."""
+"""What a scene of a family films: static parts, rigid bodies on paths, people, a camera, two sensors.
+
+`World` is the description, `Scene` its primitives at any time and their motion between two times.
+"""
 
 from __future__ import annotations
 

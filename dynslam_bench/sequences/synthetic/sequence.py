@@ -1,9 +1,8 @@
-"""The cache of rendered frames: a folder in TUM layout, written frame by frame and checked when read.
+"""The rendered sequence: frames are rendered when first read, then come from the cache.
 
-``rgb/``, ``depth/`` and ``masks/`` hold one PNG a frame, named by its stamp; ``rgb.txt``, ``depth.txt`` and
-``groundtruth.txt`` list them. Every file appears by an atomic rename and every read checks the PNG's checksums, so
-several processes may render into one folder, an interrupted rendering goes on where it stopped, and a damaged file
-counts as missing.
+The cache is a folder in TUM layout. ``rgb/``, ``depth/`` and ``masks/`` hold one PNG a frame, named by its stamp; lists
+name them. Every file appears by an atomic rename and every read checks the PNG's checksums, so several processes may
+render into one folder, an interrupted rendering is resumed, and a damaged file counts as missing.
 """
 
 from __future__ import annotations
@@ -166,8 +165,6 @@ class FrameStore:
         stamps = {format_ns(ns)[:-3] for ns, _ in read_stamped_lines(path) if ns is not None}
         return {stamp for stamp in stamps if (self.folder / kind / f"{stamp}.png").is_file()}
 
-
-# The rendered sequence: frames are rendered when first read, then come from the cache.
 
 START_S = 1000.0
 """Stamp of the first frame in seconds."""
