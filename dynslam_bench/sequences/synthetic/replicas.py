@@ -1,5 +1,7 @@
-"""Families of rendered sequences in the office: replicas of TUM's fr3 sequences, a crowd, people who step in time with
-the camera, and conditions that sensors dislike.
+"""Families of rendered sequences in the office.
+
+Replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, and conditions that sensors
+dislike.
 """
 
 from __future__ import annotations
