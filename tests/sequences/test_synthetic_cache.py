@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.sequences import SequenceView
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
 from dynslam_bench.sequences.synthetic.people import draw_person, write_script
@@ -65,6 +66,8 @@ def test_the_first_read_is_what_later_reads_give(tmp_path: Path) -> None:
     assert np.array_equal(first.rgb, again.rgb)
     assert np.array_equal(first.depth, again.depth) and again.depth.dtype == np.float32
     assert np.array_equal(sequence.masks[4].instances, sequence.renderer.geometry(4)[1])
+    view = SequenceView(sequence, 3)
+    assert np.array_equal(view.masks[1].instances, sequence.masks[4].instances) and view[1].index == 1
     assert sequence[-1].index == 8
     with pytest.raises(IndexError):
         sequence[9]
