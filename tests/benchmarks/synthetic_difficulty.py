@@ -1,7 +1,7 @@
 """How hard rendered sequences are for a reference system: ORB-SLAM3, repeated, with controls.
 
-Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving none frozen masked persons] [--runs N]
-           [--cache DIR] [--out FILE.jsonl] [--table]
+Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving none frozen masked persons]
+           [--runs 5] [--cache DIR] [--out FILE.jsonl] [--table]
 
 Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
 step. `--table` only prints the Markdown table of the file. Controls: `none` renders the room without people, `frozen`
