@@ -176,18 +176,16 @@ _LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One frame as it goes to disk, and the exact geometry behind it.
+    """One frame as it is stored.
 
     Attributes:
         rgb: uint8 ``[H, W, 3]``.
         raw_depth: uint16 ``[H, W]`` in units of 1 / 5000 m, 0 = missing, as the sensor measures it.
-        exact_depth: float64 ``[H, W]`` z-depth in metres, 0 where nothing is hit.
         instances: uint8 ``[H, W]``.
     """
 
     rgb: NDArray[np.uint8]
     raw_depth: NDArray[np.uint16]
-    exact_depth: NDArray[np.float64]
     instances: NDArray[np.uint8]
 
 
@@ -240,7 +238,7 @@ class Renderer:
             color = self._blur(now, index, hit, depth, color)
         rgb = self._expose(index, color)
         ids = np.append(self.scene.instance, 0).astype(np.uint8)
-        return Rendered(rgb, raw, depth, ids[hit >> 3])
+        return Rendered(rgb, raw, ids[hit >> 3])
 
     def flow(self, index: int, other: int) -> NDArray[np.float32]:
         """Exact flow float32 ``[H, W, 2]`` in pixels from frame `index` to frame `other`; NaN where there is none.
@@ -487,12 +485,10 @@ class Renderer:
         if optics.gain != 1 or optics.auto_exposure:
             mean = max(float(color.mean(dtype=np.float64)) * optics.gain, 1.0)
             gain *= optics.gain * power(_MEAN_GREY / mean, optics.auto_exposure)
-        gains = np.repeat(gain[:, None], 3, axis=1)
-        offset = np.zeros_like(gains)
         rgb = np.empty(color.shape, np.uint8)
         seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index + 1)) & 0xFFFFFFFFFFFFFFFF)
         read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
-        self._rows(lambda a, b: sensors.expose(a, b, seed, color, gains, offset, read, shot, rgb))
+        self._rows(lambda a, b: sensors.expose(a, b, seed, color, gain, read, shot, rgb))
         return rgb
 
 
