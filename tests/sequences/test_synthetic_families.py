@@ -148,10 +148,10 @@ class TestRollingShutter:
 
 
 def test_splits_share_no_place_of_any_thing() -> None:
-    def places(instance: int) -> set[tuple[float, ...]]:
+    def places(scene: int) -> set[tuple[float, ...]]:
         found = set()
         for variant in ("box_obstructing", "trolley", "kidnapped"):
-            (body,) = parse_synthetic_id(f"synthetic/objects_{variant}?scene={instance}").world().bodies
+            (body,) = parse_synthetic_id(f"synthetic/objects_{variant}?scene={scene}").world().bodies
             found |= {(variant, key.x, key.y, key.z, key.yaw) for key in body.path.args[0][2:4]}
         return found
 

@@ -1,4 +1,4 @@
-"""Long ways: laps of the length they say, places come back to, furniture moved out of sight, walls never met."""
+"""Long paths: laps of the length they say, places come back to, furniture moved out of sight, walls never met."""
 
 import numpy as np
 import pytest
@@ -12,10 +12,10 @@ def walk_of(name: str):
 
 
 @pytest.mark.parametrize(("shape", "lap_m"), [("room", 20), ("corridor", 60), ("rooms", 120)])
-@pytest.mark.parametrize("instance", [0, 131])
-def test_laps_have_their_length_and_are_walked_more_than_once(shape: str, lap_m: float, instance: int) -> None:
-    sequence = open_synthetic(f"synthetic/loop_{shape}?scene={instance}", None)
-    walk = walk_of(f"synthetic/loop_{shape}?scene={instance}")
+@pytest.mark.parametrize("scene", [0, 131])
+def test_laps_have_their_length_and_are_walked_more_than_once(shape: str, lap_m: float, scene: int) -> None:
+    sequence = open_synthetic(f"synthetic/loop_{shape}?scene={scene}", None)
+    walk = walk_of(f"synthetic/loop_{shape}?scene={scene}")
     places = walk.at(np.linspace(0.0, walk.lap_s, 20 * len(walk.control) + 1))
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).sum() == pytest.approx(lap_m, rel=0.12)
     assert 1.1 * walk.lap_s < len(sequence) / 30 < 10_000 / 30 and len(sequence) >= 2000
@@ -25,7 +25,7 @@ def test_laps_have_their_length_and_are_walked_more_than_once(shape: str, lap_m:
     assert (se3.rotation_angle(step) * 30).max() < 2.2
     lap = round(walk.lap_s * 30)
     again = np.linalg.norm(truth.positions[lap:] - truth.positions[:-lap], axis=1)
-    assert 0.01 < again.max() < 0.6, "the same way again, not the same poses"
+    assert 0.01 < again.max() < 0.6, "the same path again, not the same poses"
     middle = lap // 2
     assert np.linalg.norm(truth.positions[middle] - truth.positions[0]) > 2
 
