@@ -25,7 +25,7 @@ sys.path.insert(0, str(ROOT))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from synthetic_judge import SideBySide, error, trajectory  # noqa: E402
+from synthetic_difficulty import SideBySide, error, trajectory  # noqa: E402
 
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402

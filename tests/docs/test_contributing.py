@@ -19,7 +19,7 @@ CONTENT = {
     "dynslam_bench/trackers/systems/dynaslam.py": r"compose\(",
     "dynslam_bench/evaluation/protocol.py": r"class Protocol",
     "dynslam_bench/slam/keyframes.py": r"def ",
-    "dynslam_bench/sequences/synthetic/people/": r"skeleton",
+    "dynslam_bench/sequences/synthetic/people.py": r"skeleton",
 }
 """What must be found behind each answer for it to be one."""
 

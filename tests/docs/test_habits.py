@@ -29,7 +29,6 @@ PRIVATE = {
     "runs/test_runs_infrastructure.py": ({"_process"}, "kills the fork server"),
     "segmentation/test_segmentation_hostile.py": ({"_cells"}, "the anchors, which no result of shapes alone shows"),
     "segmentation/test_segmentation_torchvision.py": ({"_dynamo"}, "torch._dynamo must not be loaded"),
-    "sequences/test_synthetic_loops.py": ({"_geometry", "_tiles"}, "what every ray hits, which no image shows"),
     "sequences/test_synthetic_families.py": ({"_geometry", "_tiles"}, "the exact scene as one row alone sees it"),
     "sequences/test_synthetic_geometry.py": ({"_geometry", "_tiles"}, "the exact scene behind a rendered frame"),
     "trackers/adapters/test_adapter_orbslam3.py": (

@@ -1,7 +1,7 @@
-"""Judges rendered sequences by an outside system: the real ORB-SLAM3, repeated, with controls.
+"""How hard rendered sequences are for a reference system: ORB-SLAM3, repeated, with controls.
 
-Usage: python tests/benchmarks/synthetic_judge.py [ID ...] [--controls moving none frozen masked persons] [--runs 5]
-           [--cache DIR] [--out FILE.jsonl] [--table]
+Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving none frozen masked persons]
+           [--runs 5] [--cache DIR] [--out FILE.jsonl] [--table]
 
 Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
 step. `--table` only prints the Markdown table of the file. Controls: `none` renders the room without people, `frozen`
@@ -20,30 +20,21 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.geometry.association import associate
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.synthetic import REPLICA_IDS, SYNTHETIC_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 
 VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
 CONTROLS = ("moving", "none", "frozen", "masked", "persons")
-
-
-def rmse(estimate: Trajectory, truth: Trajectory) -> float:
-    """RMSE of the positions after the best rigid alignment (Umeyama without scale), metres; common stamps only."""
-    index = {round(t, 6): i for i, t in enumerate(truth.timestamps)}
-    pairs = [(i, index[round(t, 6)]) for i, t in enumerate(estimate.timestamps) if round(t, 6) in index]
-    a = estimate.positions[[i for i, _ in pairs]]
-    b = truth.positions[[j for _, j in pairs]]
-    a, b = a - a.mean(0), b - b.mean(0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return float(np.sqrt(((a @ rotation.T - b) ** 2).sum(1).mean()))
 
 
 def without(frame: Frame, hidden: np.ndarray) -> Frame:
@@ -71,8 +62,13 @@ def trajectory(poses: list[tuple[float, np.ndarray]]) -> Trajectory:
 
 
 def error(estimate: Trajectory, truth: Trajectory) -> float | None:
-    """`rmse` to 0.01 mm; None of fewer than three poses, which any path fits."""
-    return round(rmse(estimate, truth), 5) if len(estimate) > 2 else None
+    """RMSE of the positions at common stamps after the best rigid alignment, m; None for fewer than three poses."""
+    ours, theirs = associate(estimate.timestamps, truth.timestamps, 1e-4)
+    if len(ours) < 3:
+        return None
+    poses, expected = estimate.T_world_cam[ours], truth.T_world_cam[theirs]
+    offset = align(poses, expected, "se3").apply(poses)[:, :3, 3] - expected[:, :3, 3]
+    return round(float(np.sqrt((offset**2).sum(axis=1).mean())), 5)
 
 
 class SideBySide:
@@ -117,10 +113,14 @@ class SideBySide:
         return rows
 
 
-def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
+def settings_of(control: str) -> RenderSettings:
+    """The renderer's settings of a control."""
+    return RenderSettings(people=control if control in ("none", "frozen") else "moving")
+
+
+def measure(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
     """Several runs of ORB-SLAM3 on one control of one sequence."""
-    settings = RenderSettings(people={"none": "none", "frozen": "frozen"}.get(control, "moving"))
-    sequence = open_synthetic(id, cache, settings=settings)
+    sequence = open_synthetic(id, cache, settings=settings_of(control))
     sequence.render()
     together = SideBySide(sequence, runs, sequence.fps)
     for index in range(len(sequence)):
@@ -140,25 +140,16 @@ def judge(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str,
 def table(rows: list[dict]) -> str:
     """Markdown: one line an id and control, the final and online ATE of every run."""
     lines = [
-        "| sequence | control | runs | final ATE, m: min / median / max | online: median | coverage | still |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| sequence | control | runs | without a trajectory | final ATE, m: min | median | max | online: median "
+        "| coverage | static camera |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    groups: dict[tuple[str, str], list[dict]] = {}
-
-    def rank(row: dict) -> tuple[int, str, int]:
-        return SYNTHETIC_IDS.index(row["id"].partition("?")[0]), row["id"], CONTROLS.index(row["control"])
-
-    for row in sorted(rows, key=rank):
-        groups.setdefault((row["id"], row["control"]), []).append(row)
-    for (id, control), members in groups.items():
-        final, online = (sorted(m[kind] for m in members if m[kind] is not None) for kind in ("final", "online"))
-        spread = f"{final[0]:.4f} / {np.median(final):.4f} / {final[-1]:.4f}" if final else "none"
-        if len(final) < len(members):
-            spread += f" ({len(members) - len(final)} without a trajectory)"
+    for (id, control), runs in pd.DataFrame(rows).groupby(["id", "control"], sort=False):
+        final = runs["final"].astype(float)
         lines.append(
-            f"| {id} | {control} | {len(members)} | {spread} "
-            f"| {f'{np.median(online):.4f}' if online else 'none'} | {min(m['coverage'] for m in members):.3f} "
-            f"| {members[0]['never']:.3f} |"
+            f"| {id} | {control} | {len(runs)} | {final.isna().sum()} | {final.min():.4f} | {final.median():.4f} "
+            f"| {final.max():.4f} | {runs['online'].astype(float).median():.4f} | {runs['coverage'].min():.3f} "
+            f"| {runs['never'].iloc[0]:.3f} |"
         )
     return "\n".join(lines)
 
@@ -168,22 +159,18 @@ def main() -> None:
     parser.add_argument("ids", nargs="*", default=list(REPLICA_IDS))
     parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_judge")
-    parser.add_argument("--out", type=Path, default=Path("synthetic_judge.jsonl"))
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_difficulty")
+    parser.add_argument("--out", type=Path, default=Path("synthetic_difficulty.jsonl"))
     parser.add_argument("--table", action="store_true")
     arguments = parser.parse_args()
     rows = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
     if not arguments.table:
         for id in arguments.ids:
             for control in arguments.controls:
-                digest = open_synthetic(
-                    id,
-                    None,
-                    settings=RenderSettings(people={"none": "none", "frozen": "frozen"}.get(control, "moving")),
-                ).digest()
+                digest = open_synthetic(id, None, settings=settings_of(control)).digest()
                 done = {r["run"] for r in rows if (r["id"], r["control"], r["digest"]) == (id, control, digest)}
                 todo = sorted(set(range(arguments.runs)) - done)
-                new = judge(id, control, todo, arguments.cache) if todo else []
+                new = measure(id, control, todo, arguments.cache) if todo else []
                 rows += new
                 with arguments.out.open("a") as file:
                     file.writelines(json.dumps(row) + "\n" for row in new)
