@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import write_atomic
 from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.html.page import write_side
 from dynslam_bench.reports.html.run_page import RunFrames
-from dynslam_bench.reports.model.load import LoadedRun
+from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.runs.artifacts import Snapshot, read_snapshots, spread
 from dynslam_bench.runs.exchange.export import open_stored
+from dynslam_bench.runs.record import RunRecord
 
 FOLDER = "frames"
 EVEN, WORST = 16, 4
@@ -43,13 +44,14 @@ class PictureBook:
     output: Path
     seconds: float
     _spent: float = 0.0
-    _opened: dict[tuple[Any, ...], Sequence | str] = field(default_factory=dict)
+    _opened: dict[tuple[Any, ...], Sequence | DynslamError] = field(default_factory=dict)
 
-    def add(self, run: LoadedRun, frames: RunFrames, missing: Counter[str]) -> bool:
-        """Draw the frames that a run shows and write what was seen on them as ``data/looks-<run id>.js``.
+    def add(self, row: RunRow, record: RunRecord, frames: RunFrames, missing: Counter[str]) -> bool:
+        """Draw the frames that a run shows and write what the tracker saw on them as ``data/looks-<run id>.js``.
 
         Args:
-            run: The run.
+            row: The run.
+            record: Its whole record.
             frames: Its frames.
             missing: Why some frames have no picture, which is counted there.
 
@@ -59,64 +61,57 @@ class PictureBook:
         if not len(frames):
             return False
         try:
-            size, shots = read_snapshots(run.store.folder(run.row.run_id))
+            size, snapshots = read_snapshots(row.folder)
         except DynslamError as error:
             missing[str(error)] += 1
             return False
-        began = time.perf_counter()
-        by_index = {shot.index: shot for shot in shots}
-        chosen = _chosen(frames, sorted(by_index))
-        looks = [self._look(run, index, by_index.get(index), size, missing) for index in chosen]
-        self._spent += time.perf_counter() - began
-        known = [look for look in looks if look.get("image") or look.get("points")]
-        if not known:
-            return False
-        errors = dict(zip(frames.columns["index"].tolist(), (1000 * frames.errors_m).tolist(), strict=True))
-        for look in known:
-            look["error_mm"] = significant(errors.get(look["index"]))
-        write_side(self.output, f"looks-{run.row.run_id}", {"looks": known, "stored": bool(shots)})
-        return True
+        by_index = {snapshot.index: snapshot for snapshot in snapshots}
+        errors_mm = dict(zip(frames.columns["index"].tolist(), (1000 * frames.errors_m).tolist(), strict=True))
+        looks = []
+        for index in _chosen(frames, sorted(by_index)):
+            look: dict[str, Any] = {"index": index}
+            try:
+                look["image"] = self._image(record, index)
+            except DynslamError as error:
+                missing[str(error)] += 1
+            if index in by_index:
+                look |= _annotations(by_index[index], size)
+            if look.get("image") or look.get("points"):
+                looks.append(look | {"error_mm": significant(errors_mm.get(index))})
+        if looks:
+            write_side(self.output, f"looks-{row.run_id}", {"looks": looks, "stored": bool(snapshots)})
+        return bool(looks)
 
-    def _look(
-        self, run: LoadedRun, index: int, shot: Snapshot | None, size: tuple[int, int], missing: Counter[str]
-    ) -> dict[str, Any]:
-        try:
-            look: dict[str, Any] = {"index": index, "image": self._image(run, index)}
-        except DynslamError as error:
-            missing[str(error)] += 1
-            look = {"index": index}
-        return look if shot is None else look | _seen(shot, size)
-
-    def _image(self, run: LoadedRun, index: int) -> str:
+    def _image(self, record: RunRecord, index: int) -> str:
         """Relative path of the picture of a frame; drawn if it is not there yet.
 
         Raises:
             DynslamError: The sequence cannot be opened, is another one by now, or the time is over.
         """
-        record = run.record
         number = (record.frames or (0, None))[0] + (index * record.stride) + record.offset
         path = self.output / FOLDER / (record.sequence.block or record.sequence.part) / f"{number}.webp"
         if not path.is_file():
             if self._spent >= self.seconds:
                 raise DynslamError(f"not drawn within {self.seconds:.0f} s", "make the report again: it goes on there")
             began = time.perf_counter()
-            image = self._sequence(run)[index].rgb
+            image = self._sequence(record)[index].rgb
+            size = _shrunk_size(image, _WIDTH)
+            shrunk = cv2.resize(np.ascontiguousarray(image[:, :, ::-1]), size, interpolation=cv2.INTER_AREA)
+            write_atomic(path, _encoded(".webp", np.asarray(shrunk), cv2.IMWRITE_WEBP_QUALITY, _QUALITY))
             self._spent += time.perf_counter() - began
-            write_atomic(path, _coded(".webp", _shrunk(image[:, :, ::-1], _WIDTH), cv2.IMWRITE_WEBP_QUALITY, _QUALITY))
         return path.relative_to(self.output).as_posix()
 
-    def _sequence(self, run: LoadedRun) -> Sequence:
-        record = run.record
+    def _sequence(self, record: RunRecord) -> Sequence:
         key = (record.place or record.sequence.id, record.frames, record.offset, record.stride, record.sequence.content)
         if key not in self._opened:
             try:
-                self._opened[key] = open_stored(run.record)
+                self._opened[key] = open_stored(record)
             except DynslamError as error:
-                self._opened[key] = str(error)
-        found = self._opened[key]
-        if isinstance(found, str):
-            raise DynslamError(found)
-        return found
+                self._opened[key] = error
+        opened = self._opened[key]
+        if isinstance(opened, DynslamError):
+            raise opened
+        return opened
 
 
 def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
@@ -130,35 +125,31 @@ def _chosen(frames: RunFrames, stored: PySequence[int]) -> list[int]:
     return sorted(even | set([index for index in bad if index in set(stored)][:WORST]))
 
 
-def _seen(shot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
+def _annotations(snapshot: Snapshot, size: tuple[int, int]) -> dict[str, Any]:
     """Features (two bytes each: x and y in 255ths of the image), which were kept, and the mask as a small image."""
     height, width = size
-    places = np.clip(shot.points * np.array((255 / width, 255 / height), np.float32), 0, 255).round().astype(np.uint8)
-    order = np.argsort(shot.kept, kind="stable")  # culled ones first
-    seen = {"points": base64.b64encode(places[order].tobytes()).decode(), "culled": int((~shot.kept).sum())}
-    seen |= {"width": width, "height": height}
-    mask = shot.mask
-    if mask is None:
-        return seen | {"share": None}
-    seen["share"] = significant(100 * np.count_nonzero(mask) / mask.size, 3)
-    if not seen["share"]:
-        return seen
-    small = cv2.resize(mask.view(np.uint8), _shrunk_size(mask, _MASK_WIDTH), interpolation=cv2.INTER_NEAREST)
-    coded = base64.b64encode(_coded(".png", np.asarray(small), cv2.IMWRITE_PNG_BILEVEL, 1)).decode()
-    return seen | {"mask": f"data:image/png;base64,{coded}"}
+    places = (
+        np.clip(snapshot.points * np.array((255 / width, 255 / height), np.float32), 0, 255).round().astype(np.uint8)
+    )
+    order = np.argsort(snapshot.kept, kind="stable")  # culled ones first
+    annotations = {"points": base64.b64encode(places[order].tobytes()).decode(), "culled": int((~snapshot.kept).sum())}
+    annotations |= {"width": width, "height": height, "share": None}
+    mask = snapshot.mask
+    if mask is not None:
+        annotations["share"] = significant(100 * np.count_nonzero(mask) / mask.size, 3)
+    if mask is not None and annotations["share"]:
+        small = cv2.resize(mask.view(np.uint8), _shrunk_size(mask, _MASK_WIDTH), interpolation=cv2.INTER_NEAREST)
+        png = base64.b64encode(_encoded(".png", np.asarray(small), cv2.IMWRITE_PNG_BILEVEL, 1)).decode()
+        annotations["mask"] = f"data:image/png;base64,{png}"
+    return annotations
 
 
 def _shrunk_size(image: NDArray[Any], width: int) -> tuple[int, int]:
     return width, max(round(image.shape[0] * width / image.shape[1]), 1)
 
 
-def _shrunk(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    size = _shrunk_size(image, width)
-    return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _coded(kind: str, image: NDArray[Any], *options: int) -> bytes:
-    done, coded = cv2.imencode(kind, image, options)
+def _encoded(kind: str, image: NDArray[Any], *options: int) -> bytes:
+    done, data = cv2.imencode(kind, image, options)
     if not done:
         raise DynslamError(f"this OpenCV cannot write {kind} images")
-    return bytes(coded)
+    return bytes(data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import median
 
 import numpy as np
@@ -13,9 +13,10 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import SEEN, RunRow
-from dynslam_bench.reports.tables.leaderboard import SEEN_NOTE, sequence_columns, skipped_words
+from dynslam_bench.reports.model.statistics import FLOOR_M
+from dynslam_bench.reports.tables.leaderboard import SEEN_NOTE, Marks, best_marks, sequence_columns, skipped_words
 from dynslam_bench.reports.tables.runs import run_link
-from dynslam_bench.reports.tables.table import Column, Emphasis, Table, TableCell, emphasise, mm, significant_text
+from dynslam_bench.reports.tables.table import Column, Emphasis, Table, TableCell, mm, significant_text, texts
 
 Value = Callable[[RunRow], float | None]
 """A number of a run; None where it has none."""
@@ -50,59 +51,58 @@ def metric_table(
         trackers: Variant keys; the board's by default.
         doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT` and is never bold.
     """
-    keys = board.trackers if trackers is None else trackers
-    at = {(key, name): cell for key in keys for name, cell in board.cells[key].items() if name in board.sequences}
-    found = {place: number for place, cell in at.items() if (number := median_of(cell, value)) is not None}
-    if not found:
+    values = medians(board, value, board.trackers if trackers is None else trackers)
+    if not values:
         return None
-    doubted = {place: words for place in found if (words := doubt(at[place]))}
+    doubts = {(key, sequence): doubt(board.cells[key][sequence]) for key, sequence in values}
     sign = -1.0 if larger_is_better else 1.0
-    marks = column_marks(board, {place: sign * number for place, number in found.items() if place not in doubted})
-    present = [key for key in keys if any((key, sequence) in found for sequence in board.sequences)]
+    marks = column_marks(board, {place: sign * number for place, number in values.items() if not doubts[place]})
+    keys = list(dict.fromkeys(key for key, _ in values))
     rows = []
-    for key in present:
+    for key in keys:
         cells = [TableCell(board.labels[key])]
         for place in ((key, sequence) for sequence in board.sequences):
-            cell, number, why = at.get(place), found.get(place), doubted.get(place, "")
+            cell, why = board.cells[key].get(place[1]), doubts.get(place, "")
             if cell is not None and not cell.success:
                 cells.append(TableCell(emphasis="failed", tip=cell.ending))
-            elif cell is None or number is None:
+            elif cell is None or place not in values:
                 cells.append(TableCell())
             else:
-                shown, mark = text(number) + DOUBT * bool(why), "muted" if why else marks.get(place, "")
+                shown = text(values[place]) + DOUBT * bool(why) + SEEN * cell.seen
+                mark: Emphasis = "muted" if why else marks.get(place, "")
                 tip = why or (SEEN_NOTE if cell.seen else cell.ending)
-                cells.append(TableCell(shown + SEEN * cell.seen, skipped_words(cell), number, mark, tip=tip))
+                cells.append(TableCell(shown, skipped_words(cell), values[place], mark, tip=tip))
         rows.append(cells)
-    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
-    competing = sum(key in board.ranked for key in present)
-    muted = [at for at, key in enumerate(present) if key not in board.ranked]
-    separators = {competing} if 0 < competing < len(rows) else set()
+    columns = [*texts("tracker"), *sequence_columns(board)]
+    muted = board.unranked_rows(keys)
+    ranked = len(keys) - len(muted)
+    separators = {ranked} if 0 < ranked < len(rows) else set()
     return Table(name, title, caption, columns, rows, muted, separators, f"{title} ({unit})")
 
 
-def median_of(cell: Cell, value: Value) -> float | None:
-    """Median of a number over the runs of a cell that count and succeeded."""
-    values = [number for row in cell.kept if not row.failed and (number := value(row)) is not None]
-    return median(values) if values else None
+def medians(board: Board, value: Value, keys: Sequence[str]) -> dict[tuple[str, str], float]:
+    """Median of a number over the runs that count and succeeded, by tracker and sequence."""
+    of_cell = {}
+    for key in keys:
+        for name, cell in board.cells[key].items():
+            values = [number for row in cell.kept if not row.failed and (number := value(row)) is not None]
+            if values and name in board.sequences:
+                of_cell[key, name] = median(values)
+    return of_cell
 
 
-def column_marks(board: Board, values: dict[tuple[str, str], float]) -> dict[tuple[str, str], Emphasis]:
+def column_marks(board: Board, values: Mapping[tuple[str, str], float]) -> Marks:
     """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
 
     Args:
         board: The board.
         values: ``(variant, sequence)`` to a number, less is better; what has none takes no part.
     """
-    marks: dict[tuple[str, str], Emphasis] = {}
+    competing = {}
     for name in board.sequences:
         cells = {key: board.cells[key][name] for key in board.ranked if name in board.cells[key]}
-        keys = [key for key, cell in cells.items() if not cell.failed and board.competes(key, name)]
-        found = emphasise([values.get((key, name)) for key in keys])
-        marks |= {(key, name): mark for key, mark in zip(keys, found, strict=True)}
-    return marks
-
-
-# Tables with one column for every sequence: absolute and relative errors, and published numbers beside them.
+        competing[name] = [key for key, cell in cells.items() if not cell.failed and board.competes(key, name)]
+    return best_marks(board, values, competing)
 
 
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
@@ -111,21 +111,23 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     usual = sizes.most_common(1)[0][0] if sizes else 1
     medians = {(key, name): cell.median for key in board.ranked for name, cell in board.cells[key].items()}
     marks = column_marks(board, {place: value for place, value in medians.items() if value is not None})
-    rows, muted = [], {at for at, key in enumerate(board.trackers) if key not in board.ranked}
+    rows = []
     for key in board.trackers:
         cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
-        for name in board.sequences:
-            cells.append(_error_cell(board, key, name, marks.get((key, name), ""), usual))
-        rows.append(cells)
-    separators = board.separators() | {len(rows)}
-    rows.append([TableCell(STATIC_CAMERA), *(_never_cell(board, name) for name in board.sequences)])
-    muted.add(len(rows) - 1)
-    if reported:
-        separators.add(len(rows))
-        for name, tag in dict.fromkeys((cell.system, cell.tag) for cell in reported):
-            muted.add(len(rows))
-            found = [cell for cell in reported if (cell.system, cell.tag) == (name, tag)]
-            rows.append([TableCell(name, tag=tag), *_reported_cells(board, found)])
+        rows.append(
+            cells + [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
+        )
+    rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
+    separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
+    for name, tag in dict.fromkeys((cell.system, cell.tag) for cell in reported):
+        by_sequence: dict[str, ReportedCell] = {}
+        for cell in reported:
+            if (cell.system, cell.tag) == (name, tag):
+                by_sequence.setdefault(cell.sequence, cell)
+        line = [by_sequence.get(sequence) for sequence in board.sequences]
+        cells = [TableCell(mm(cell.value), value=cell.value, tip=cell.source) if cell else TableCell() for cell in line]
+        rows.append([TableCell(name, tag=tag), *cells])
+    muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
     caption = (
         f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
         "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
@@ -141,10 +143,11 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
             "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
         )
-    columns = [Column("tracker", numeric=False), *sequence_columns(board)]
+    columns = [*texts("tracker"), *sequence_columns(board)]
     if any(row.seen_in_training for row in board.rows):
         columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
-        rows = [[*row, TableCell(_trained_on(board, board.trackers, at))] for at, row in enumerate(rows)]
+        keys = [*board.trackers, *[None] * (len(rows) - len(board.trackers))]
+        rows = [[*row, TableCell(_trained_on(board, key))] for key, row in zip(keys, rows, strict=True)]
         caption += f" {SEEN_NOTE}"
     brief = "Absolute trajectory error (RMSE, mm), lost frames held"
     return Table(
@@ -152,9 +155,9 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     )
 
 
-def _trained_on(board: Board, keys: Sequence[str], at: int) -> str:
-    """The sequences on which the masks of a row's tracker were trained; empty for the rows below the trackers."""
-    cells = board.cells[keys[at]] if at < len(keys) else {}
+def _trained_on(board: Board, key: str | None) -> str:
+    """The sequences on which the masks of a tracker were trained; empty for no tracker."""
+    cells = {} if key is None else board.cells[key]
     return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].seen)
 
 
@@ -231,34 +234,37 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
 
 def _rotation_doubt(cell: Cell) -> str:
     """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
-    found = [row.rotation_uncertainty_deg or 0.0 for row in cell.kept if not row.failed and not row.rotation_reliable]
-    return f"unreliable: the alignment's rotation is known to ±{max(found):.0f}° only" if found else ""
+    uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
+    largest = max((row.rotation_uncertainty_deg or 0.0 for row in uncertain), default=0.0)
+    return f"unreliable: the alignment's rotation is known to ±{largest:.0f}° only" if uncertain else ""
 
 
 def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
     cell = board.cells[key].get(sequence)
     if cell is None or cell.median is None:
         return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
-    coverage, link = 100 * float(np.mean([row.coverage for row in cell.rows])), run_link(cell.typical)
+    coverage = f"coverage {100 * float(np.mean([row.coverage for row in cell.rows])):.1f} %"
+    link = run_link(cell.typical)
+    count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
     if not cell.success:
-        tip = f"counts as {mm(cell.median)} mm, coverage {coverage:.1f} %"
-        return TableCell(cell.ending, _count(cell, usual), emphasis="failed", tip=tip, link=link)
-    notes = [_spread(cell), _count(cell, usual), skipped_words(cell)]
+        tip = f"counts as {mm(cell.median)} mm, {coverage}"
+        return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
+    notes = [_spread(cell), count, skipped_words(cell)]
     if board.no_better_than_static(key, sequence):
         notes.append("no better than a static camera")
     if cell.failed:
         notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
-    small = ", ".join(filter(None, notes))
     base = board.reference_median(sequence)
-    if base is None:
-        shown = mm(cell.median) + SEEN * cell.seen
-        return TableCell(shown, small, cell.median, mark, tip=f"coverage {coverage:.1f} %", link=link)
-    ratio = cell.median / max(base, 1e-6)
-    if cell.seen:
-        return TableCell(mm(cell.median) + SEEN, small, cell.median, mark, tip=SEEN_NOTE, link=link)
-    colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
-    tip = f"{ratio:.2f} × the reference, coverage {coverage:.1f} %" + (f"; {cell.ending}" if cell.failed else "")
-    return TableCell(mm(cell.median), small, cell.median, mark, colour, tip, link=link)
+    colour = None
+    tip = coverage
+    if base is not None and cell.seen:
+        tip = SEEN_NOTE
+    elif base is not None:
+        ratio = cell.median / max(base, FLOOR_M)
+        colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
+        tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
+    shown = mm(cell.median) + SEEN * cell.seen
+    return TableCell(shown, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
 
 
 def _spread(cell: Cell) -> str:
@@ -268,24 +274,12 @@ def _spread(cell: Cell) -> str:
     return "deterministic" if cell.deterministic else ""
 
 
-def _count(cell: Cell, usual: int) -> str:
-    return "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
-
-
-def _never_cell(board: Board, sequence: str) -> TableCell:
+def _static_camera_cell(board: Board, sequence: str) -> TableCell:
     value, base = board.static_camera[sequence], board.reference_median(sequence)
     if base is None:
         return TableCell(mm(value), value=value)
-    ratio = value / max(base, 1e-6)
+    ratio = value / max(base, FLOOR_M)
     return TableCell(mm(value), value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
-
-
-def _reported_cells(board: Board, reported: Sequence[ReportedCell]) -> list[TableCell]:
-    cells = []
-    for sequence in board.sequences:
-        found = [cell for cell in reported if cell.sequence == sequence]
-        cells.append(TableCell(mm(found[0].value), value=found[0].value, tip=found[0].source) if found else TableCell())
-    return cells
 
 
 def shade(ratio: float) -> float:

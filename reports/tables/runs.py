@@ -79,7 +79,7 @@ def _spread_cells(board: Board, key: str) -> list[TableCell]:
 
 def machines(board: Board) -> Table:
     """Computers and versions behind the runs."""
-    counts = Counter(row.machine or "not recorded" for row in board.rows)
+    counts = Counter(row.machine_words or "not recorded" for row in board.rows)
     columns = [Column("runs"), Column("machine and versions", numeric=False)]
     rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
     caption = "Times of different machines are not comparable."
