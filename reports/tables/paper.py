@@ -71,7 +71,9 @@ def time_table(board: Board) -> Table | None:
     )
     muted = board.unranked_rows(keys)
     brief = "Error in percent of a static camera, accuracy, and time of a frame"
-    return Table("paper_accuracy", "Accuracy, error and time", caption, _columns(board, columns), rows, muted, brief=brief)
+    return Table(
+        "paper_accuracy", "Accuracy, error and time", caption, _columns(board, columns), rows, muted, brief=brief
+    )
 
 
 def _share(row: RunRow) -> float | None:
