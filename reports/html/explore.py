@@ -19,8 +19,7 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.figures import COLOURS, significant
 from dynslam_bench.reports.html.page import render_run_page, write_side
-from dynslam_bench.reports.html.pictures import PictureBook
-from dynslam_bench.reports.html.run_page import MOST_FRAMES, exact_shares, read_frames, run_content
+from dynslam_bench.reports.html.run_page import MOST_FRAMES, PictureBook, exact_shares, read_frames, run_content
 from dynslam_bench.reports.model.board import Board, Cell
 from dynslam_bench.reports.model.common_frames import representatives
 from dynslam_bench.reports.model.load import JOB, run_jobs

@@ -17,7 +17,6 @@ from dynslam_bench.reports.model.row import command_line
 from dynslam_bench.reports.model.statistics import FEWEST, power_note
 from dynslam_bench.reports.tables import errors as error_tables
 from dynslam_bench.reports.tables import leaderboard as tables
-from dynslam_bench.reports.tables import runs as run_tables
 from dynslam_bench.reports.tables.paper import (
     LOST_MARK,
     LOST_NOTE,
@@ -155,7 +154,7 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
 def repeatability_section(board: Board) -> Section:
     """How far the runs of a cell lie apart."""
     section = Section("repeatability", "Repeatability", "Repeatability")
-    table = run_tables.repeatability(board)
+    table = tables.repeatability(board)
     if table is not None:
         caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
         section.blocks += figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
@@ -192,7 +191,7 @@ def masks_section(board: Board) -> Section:
 
 def failures_section(board: Board) -> Section:
     """Every run that failed, or that none did."""
-    table = run_tables.failures(board)
+    table = tables.failures(board)
     block = Block("table", table=table)
     if table is None:
         block = Block("list", entries=[f"None of {len(board.rows)} runs failed."])
@@ -202,7 +201,7 @@ def failures_section(board: Board) -> Section:
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
     section = Section("provenance", "Machines, versions, commands", "Reproduce")
-    section.blocks.append(Block("table", table=run_tables.machines(board)))
+    section.blocks.append(Block("table", table=tables.machines(board)))
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     section.blocks.append(

@@ -398,11 +398,9 @@ def _result(row: RunRow) -> object:
     return row.status, row.n_processed, row.coverage, row.score_m, row.final_ate_m, tuple(sorted(row.metrics.items()))
 
 
-_KINDS = dict.fromkeys(
-    ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
-    + ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"],
-    "string",
-)
+_TEXTS = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
+_TEXTS += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
+_KINDS = dict.fromkeys(_TEXTS, "string")
 _KINDS |= dict.fromkeys(["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"], "Int64")
 _KINDS |= dict.fromkeys(["ranked", "failed", "cached", "seen_in_training"], "boolean")
 _NUMBERS = ["coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"]

@@ -16,7 +16,6 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from types import ModuleType
@@ -149,18 +148,15 @@ class RowCache:
 
     def read(self) -> dict[str, RunRow]:
         """The rows that hold, by run id."""
-        run_ids = self.store.ids()
-        if not run_ids:
-            return {}
-        try:
-            with closing(self._open()) as index:
-                query = "SELECT run_id, state, row FROM report_rows WHERE protocol = ?"
-                lines = {line[0]: line for line in index.execute(query, (self._protocol_digest,))}
-        except sqlite3.DatabaseError:
-            self._path.unlink(missing_ok=True)
-            return {}
-        rows = (self._valid(*lines[run_id]) for run_id in run_ids if run_id in lines)
-        return {row.run_id: row for row in rows if row is not None}
+        rows = {}
+        if self.store.ids():
+            query = "SELECT run_id, state, row FROM report_rows WHERE protocol = ?"
+            lines = {line[0]: line for line in self._execute(query, [(self._protocol_digest,)])}
+            for run_id in self.store.ids():
+                row = self._valid(*lines[run_id]) if run_id in lines else None
+                if row is not None:
+                    rows[run_id] = row
+        return rows
 
     def take(self, run_ids: Sequence[str]) -> tuple[list[tuple[RunRow, str]], list[str]]:
         """Read some runs and score them.
@@ -185,23 +181,24 @@ class RowCache:
         for row, state in rows:
             with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
                 lines.append((self._protocol_digest, row.run_id, state, row.model_dump_json(exclude_defaults=True)))
-        with suppress(sqlite3.Error), closing(self._open()) as index, index:
-            index.executemany("INSERT OR REPLACE INTO report_rows VALUES (?, ?, ?, ?)", lines)
+        self._execute("INSERT OR REPLACE INTO report_rows VALUES (?, ?, ?, ?)", lines)
 
-    def _open(self) -> sqlite3.Connection:
-        """The index; an empty one in memory where its file cannot be used."""
-        index = sqlite3.connect(":memory:")
-        index.execute(_TABLE)
-        if self._path.is_symlink() or (self._path.exists() and not self._path.is_file()):  # e.g. a pipe, which blocks
-            return index
+    def _execute(self, statement: str, lines: Iterable[tuple[str, ...]]) -> list[tuple[str, str, str]]:
+        """What a statement answers to the last of some values; nothing where the index cannot be used."""
+        answer: list[tuple[str, str, str]] = []
+        if self._path.exists() and not self._path.is_file():  # e.g. a pipe, which blocks
+            return answer
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            return _opened(self._path)
+            with closing(sqlite3.connect(self._path)) as index, index:
+                index.execute(_TABLE)
+                for line in lines:
+                    answer = index.execute(statement, line).fetchall()
         except (OSError, sqlite3.OperationalError):  # read-only, or locked
-            return index
+            return []
         except sqlite3.DatabaseError:  # damaged
-            self._path.unlink()
-            return _opened(self._path)
+            self._path.unlink(missing_ok=True)
+        return answer
 
     def _valid(self, run_id: str, state: str, text: str) -> RunRow | None:
         """The row of a line; None if it does not hold or is another run's."""
@@ -228,12 +225,6 @@ class RowCache:
         return folder_state(self.store.root / kind / name, self.store.root)
 
 
-def _opened(path: Path) -> sqlite3.Connection:
-    index = sqlite3.connect(path)
-    index.execute(_TABLE)
-    return index
-
-
 # -- runs that count
 
 
@@ -258,11 +249,6 @@ class Loaded:
     trials: int = 0
     unreadable: list[str] = field(default_factory=list)
     conflicts: list[str] = field(default_factory=list)
-
-    @cached_property
-    def by_id(self) -> dict[str, RunRow]:
-        """The rows by their run's id."""
-        return {row.run_id: row for row in self.rows}
 
 
 def load_runs(
@@ -413,13 +399,11 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     if not paths:
         raise ReportError("no results folder was given", "for example results")
     stores = []
-    for path in paths:
-        folder = path.expanduser()
+    for folder in (path.expanduser() for path in paths):
         if not folder.is_dir():
             raise ReportError(f"there is no results folder {folder}", "make runs first, or name their folder")
-        if folder.name == "runs" and not (folder / "runs").is_dir():
-            folder = folder.parent
-        if not (folder / "runs").is_dir():
+        root = folder.parent if folder.name == "runs" and not (folder / "runs").is_dir() else folder
+        if not (root / "runs").is_dir():
             raise ReportError(f"{folder} holds no runs: it has no folder 'runs'", "name the folder given as --results")
-        stores.append(RunStore(folder))
+        stores.append(RunStore(root))
     return stores

@@ -14,8 +14,14 @@ from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FLOOR_M
-from dynslam_bench.reports.tables.leaderboard import SEEN_NOTE, Marks, best_marks, sequence_columns, skipped_words
-from dynslam_bench.reports.tables.runs import run_link
+from dynslam_bench.reports.tables.leaderboard import (
+    SEEN_NOTE,
+    Marks,
+    best_marks,
+    run_link,
+    sequence_columns,
+    skipped_words,
+)
 from dynslam_bench.reports.tables.table import Column, Emphasis, Table, TableCell, mm, significant_text, texts
 
 Value = Callable[[RunRow], float | None]
