@@ -101,15 +101,15 @@ def _read_known_rows(data: bytes | None, folder: Path) -> None:
     path = known_rows.RowCache(store, protocol)._path  # only it knows the name
     at(path.parent, path.name, data)
     loaded = load_runs([store], protocol)
-    assert [run.row.run_id for run in loaded.runs] == [RUN] and not loaded.unreadable
-    assert loaded.runs[0].row.log == str(store.folder(RUN) / "log.txt")
+    assert [row.run_id for row in loaded.rows] == [RUN] and not loaded.unreadable
+    assert loaded.rows[0].folder == store.folder(RUN)
 
 
 @cache
 def _known_rows() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         _read_known_rows(None, Path(folder))
-        (path,) = Path(folder).glob("results/index/rows-*")
+        (path,) = Path(folder).glob("results/index/*.sqlite")
         return path.read_bytes()
 
 
@@ -304,8 +304,8 @@ TARGETS = [
         "known rows of a report",
         _read_known_rows,
         lambda: [_known_rows()],
-        (known_rows.RowCache.read, known_rows.RowCache._holds, known_rows.CachedRow.of, *_LINE_FILE),
-        mutate_lines,
+        (known_rows.RowCache.read, known_rows.RowCache._valid, known_rows.RowCache._execute),
+        mutate_bytes,
     ),
     Target(
         "metric record",
