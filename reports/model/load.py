@@ -181,7 +181,8 @@ class RowCache:
         for row, state in rows:
             with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
                 lines.append((self._protocol_digest, row.run_id, state, row.model_dump_json(exclude_defaults=True)))
-        self._execute("INSERT OR REPLACE INTO report_rows VALUES (?, ?, ?, ?)", lines)
+        if lines:
+            self._execute("INSERT OR REPLACE INTO report_rows VALUES (?, ?, ?, ?)", lines)
 
     def _execute(self, statement: str, lines: Iterable[tuple[str, ...]]) -> list[tuple[str, str, str]]:
         """What a statement answers to the last of some values; nothing where the index cannot be used."""

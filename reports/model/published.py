@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 import pandas as pd
 
@@ -61,7 +60,7 @@ def published() -> pd.DataFrame:
     `Evaluation.metrics`), value, unit, alignment (as far as stated), source (where it was read; this need not be the
     system's own paper), remarks.
     """
-    return read_data("published.csv")
+    return _read("published.csv").astype({"value": float})
 
 
 @cache
@@ -72,9 +71,9 @@ def claimed() -> pd.DataFrame:
     ``accuracy_percent``, ``time_ms``, ...), kind (``value``, or ``improvement_percent``: the gain of the paper's method
     over the system), value, digits (decimals as printed).
     """
-    frame = read_data("claimed.csv", value=str)
+    frame = _read("claimed.csv")
     digits = frame["value"].str.partition(".")[2].str.len()
-    return frame.assign(value=frame["value"].astype(float), digits=digits)
+    return frame.astype({"table": int, "value": float}).assign(digits=digits)
 
 
 @cache
@@ -85,13 +84,13 @@ def records() -> pd.DataFrame:
     alignment (as far as stated), protocol (id of the protocol here that scores alike, empty where that is not known; a
     table that states no alignment and takes depth is taken for TUM's), hardware, source, how (see `HOW`).
     """
-    return read_data("records.csv")
+    return _read("records.csv").astype({"value": float})
 
 
 @cache
 def static_camera_errors() -> dict[tuple[str, str], float]:
     """Errors of a static camera by sequence and metric, from the published ground truth."""
-    frame = read_data("never_move.csv")
+    frame = _read("never_move.csv").astype({"value": float})
     return dict(zip(zip(frame["sequence"], frame["metric"], strict=True), frame["value"], strict=True))
 
 
@@ -168,7 +167,7 @@ def records_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCe
     ]
 
 
-def read_data(name: str, **types: Any) -> pd.DataFrame:
-    """A table of this package's data, with floats as printed and no missing texts."""
+def _read(name: str) -> pd.DataFrame:
+    """A table of this package's data, all of it as texts."""
     with (files("dynslam_bench.reports.model") / "data" / name).open(encoding="utf-8") as file:
-        return pd.read_csv(file, dtype=types, keep_default_na=False, float_precision="round_trip")
+        return pd.read_csv(file, dtype=str, keep_default_na=False)

@@ -305,7 +305,6 @@ TARGETS = [
         _read_known_rows,
         lambda: [_known_rows()],
         (known_rows.RowCache.read, known_rows.RowCache._valid, known_rows.RowCache._execute),
-        mutate_bytes,
     ),
     Target(
         "metric record",

@@ -6,7 +6,6 @@ import json
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.row import RunRow
-from dynslam_bench.runs.record import SequenceInfo, TrackerInfo
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 
@@ -22,17 +21,23 @@ def page_data(folder, name):
     return json.loads(text[text.index(",") + 1 : text.rindex(")")])
 
 
-def row(tracker="a", sequence="s", error=0.1, block=None, provenance="external", tags=(), content="", noise=None, **changes):
-    frames = changes.get("frames")
-    info = SequenceInfo(
-        id=sequence, part="0" * 16, block=digest([block] if block else [sequence, frames], 16), frames=60, duration_s=2,
-        fps=30, ground_truth=True, tags=list(tags), content=content, noise=noise,
-    )  # fmt: skip
+SEQUENCE = {"block", "tags", "content", "noise", "duration_s"}
+TRACKER = {"label", "provenance", "ranked", "deterministic"}
+
+
+def row(tracker="a", sequence="s", error=0.1, variant=None, **changes):
+    """A row of one run that ended; `variant` holds settings, device and threads."""
+    info, spec = ({name: changes.pop(name) for name in names & set(changes)} for names in (SEQUENCE, TRACKER))
+    info["block"] = digest([info.get("block") or sequence, changes.get("frames")], 16)
+    settings = dict(variant or {})
+    changes |= {name: settings.pop(name) for name in ("device", "threads") if name in settings}
     base = dict(
-        run_id=digest([tracker, sequence, error, changes], 16), status="ok", sequence=info, protocol_id="p",
-        tracker=TrackerInfo(id=tracker, label=tracker.upper(), provenance=provenance), protocol_digest="d",
-        metrics={"ate_rmse_m": error, "rpe_1s_trans_rmse_m": error / 2}, hold_last_pose_ate_m=error,
-        static_camera_ate_rmse_m=0.3, coverage=1.0, n_frames=60, n_processed=60, n_tracked=60,
+        run_id=digest([tracker, sequence, error, str(changes), str(info), settings], 16), status="ok",
+        sequence=dict(id=sequence, part="0" * 16, frames=60, duration_s=2, fps=30, ground_truth=True) | info,
+        tracker=dict(id=tracker, label=tracker.upper()) | spec, overrides=settings, settings=settings,
+        protocol_id="p", protocol_digest="d", metrics={"ate_rmse_m": error, "rpe_1s_trans_rmse_m": error / 2},
+        hold_last_pose_ate_m=error, static_camera_ate_rmse_m=0.3, coverage=1.0, n_frames=60, n_processed=60,
+        n_tracked=60,
     )  # fmt: skip
     return RunRow(**(base | changes))
 

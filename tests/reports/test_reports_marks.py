@@ -47,7 +47,7 @@ def test_what_the_embedded_network_was_trained_on(source, sequence, seen):
 
 def test_such_cells_do_not_rank_unless_asked_for(store):
     board = load_board(store)
-    names = {board.first(key).tracker: key for key in board.labels}
+    names = {board.first(key).tracker.id: key for key in board.labels}
     assert board.common == [NEW] and set(board.ranked) == set(names.values())
     everything = load_board(store, rank_seen=True)
     assert set(everything.common) == {OLD, NEW} and len(everything.ranked) == 4
@@ -58,8 +58,8 @@ def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ran
     for tracker, masks in (("orb-slam2", ""), ("ds-slam", "oracle"), ("mask-rcnn", "embedded")):
         add_run(store, tracker, OLD, masks=masks, error=0.001 if masks == "embedded" else 0.03)
     board = load_board(store)
-    assert {board.first(key).tracker for key in board.ranked} == {"orb-slam2", "ds-slam"}
-    assert {board.first(key).tracker for key in board.trackers} == {"orb-slam2", "ds-slam", "mask-rcnn"}, "but shown"
+    assert {board.first(key).tracker.id for key in board.ranked} == {"orb-slam2", "ds-slam"}
+    assert {board.first(key).tracker.id for key in board.trackers} == {"orb-slam2", "ds-slam", "mask-rcnn"}, "but shown"
     assert len(load_board(store, rank_seen=True).ranked) == 3
 
 

@@ -57,7 +57,7 @@ def test_four_statistics_and_improvements_are_those_of_the_evaluation(store):
 def test_accuracy_is_what_is_left_of_not_moving(store):
     board = load_board(store)
     (ours,) = (cells for cells in time_table(board).rows if cells[0].text == "ours")
-    row = next(row for row in board.rows if row.label == "ours" and row.sequence == "s/a")
+    row = next(row for row in board.rows if row.label == "ours" and row.sequence.id == "s/a")
     error = 100 * row.hold_last_pose_ate_m / row.static_camera_ate_rmse_m
     assert [cell.value for cell in ours[1:4]] == pytest.approx([100 - error, error, 20.0])
 
@@ -124,13 +124,13 @@ def test_errors_on_common_frames_are_those_of_the_evaluation(store):
     found, frames = common_errors(board, PROTOCOL, loaded)
     assert frames["s/a"] == "58 of 60"
     errors = {}
-    for run in loaded.runs:
-        if run.row.sequence == "s/a" and not run.row.failed:
-            whole = store.trajectory(run.row.run_id)
+    for row in loaded.rows:
+        if row.sequence.id == "s/a" and not row.failed:
+            whole = store.trajectory(row.run_id)
             stamps = stamps_of(60)
             kept = np.isin(whole.timestamps.round(6), np.delete(stamps, [20, 21]).round(6))
             metrics = evaluate(whole.select(kept), truth_of("s/a", 60)).metrics
-            errors[run.row.variant_key] = metrics["ate_rmse_m"]
+            errors[row.variant_key] = metrics["ate_rmse_m"]
     assert len(errors) == 3
     for key, error in errors.items():
         assert found[key, "s/a"] == pytest.approx(error, rel=1e-8)
