@@ -123,7 +123,7 @@ def publish(
     as_json: AsJson = False,
 ) -> None:
     """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
-    from dynslam_bench.reports import build_report as publish_site
+    from dynslam_bench.reports import publish as publish_site
 
     with progress("site") as advance:
         site = publish_site(

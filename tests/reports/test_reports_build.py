@@ -111,12 +111,11 @@ def test_the_leaderboard_orders_and_compares(made):
 
 def test_numbers_are_those_of_the_evaluation(made):
     store, paths = made
-    rows = rows_of(paths.csv["runs"])[::7]
-    assert rows
-    for row in rows:
-        trajectory = store.trajectory(row["run_id"])
-        truth = truth_of(row["sequence"])
-        assert float(row["ate_rmse_m"]) == pytest.approx(evaluate(trajectory, truth).metrics["ate_rmse_m"], rel=1e-6)
+    lines = rows_of(paths.csv["runs"])[::7]
+    assert lines
+    for line in lines:
+        metrics = evaluate(store.trajectory(line["run_id"]), truth_of(line["sequence"])).metrics
+        assert float(line["ate_rmse_m"]) == pytest.approx(metrics["ate_rmse_m"], rel=1e-6)
 
 
 def test_failures_are_rows_and_count_as_not_moving(made):

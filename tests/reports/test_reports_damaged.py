@@ -82,7 +82,7 @@ def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
     store = RunStore(tmp_path / "r")
     for name, count in (("crashed", 30), ("whole", 60)):
         add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
-    runs = sorted(load_runs([store], PROTOCOL).rows, key=lambda run: row.tracker.id)
+    runs = sorted(load_runs([store], PROTOCOL).rows, key=lambda row: row.tracker.id)
     assert [*exact_shares(runs)] == [*range(60)]
 
 
@@ -92,7 +92,7 @@ def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
     for name, kept in (("whole", None), ("thin", [0, 1, 2, 3])):
         add_run(store, name, "s/a", error=0.01, final_error=0.005, final_frames=kept)
     protocol = PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
-    rows = {row.tracker.id: run.row for row in load_runs([store], protocol).rows}
+    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
     assert (rows["whole"].coverage, rows["whole"].failed) == (1.0, False)
     thin = rows["thin"]
     assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
@@ -104,8 +104,8 @@ def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final
     store, protocol = RunStore(tmp_path / "r"), PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
     add_run(store, "found", "s/a", error=0.01, status="lost", final_error=0.005, final_whole=True)
     add_run(store, "sparse", "s/a", error=0.01, kind="imported", lost=[at for at in range(120) if at % 5])
-    rows = {row.tracker.id: run.row for row in load_runs([store], protocol).rows}
+    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
     assert (rows["found"].status, rows["found"].failed, rows["found"].coverage) == ("ok", False, 1.0)
-    rows = {row.tracker.id: run.row for row in load_runs([store], PROTOCOL).rows}
+    rows = {row.tracker.id: row for row in load_runs([store], PROTOCOL).rows}
     assert rows["found"].failed and rows["found"].status == "lost"
     assert not rows["sparse"].failed, "a file of keyframes says what it covers, and that no more was asked for"

@@ -11,8 +11,7 @@ from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import build_report as publish
-from dynslam_bench.reports import load_board
+from dynslam_bench.reports import load_board, publish
 from dynslam_bench.reports.figures import FIGURES, bar_figure
 from dynslam_bench.reports.model.common_frames import common_errors
 from dynslam_bench.reports.model.load import load_runs
@@ -119,12 +118,11 @@ def test_tables_of_the_paper_are_in_the_report(store, tmp_path):
 
 def test_errors_on_common_frames_are_those_of_the_evaluation(store):
     """Of the loser's 58 of 60 frames all have the same, and the number is what `evaluate` says of them."""
-    loaded = load_runs([store], PROTOCOL)
     board = load_board(store)
-    found, frames = common_errors(board, PROTOCOL, loaded)
+    found, frames = common_errors(board, PROTOCOL)
     assert frames["s/a"] == "58 of 60"
     errors = {}
-    for row in loaded.rows:
+    for row in board.rows:
         if row.sequence.id == "s/a" and not row.failed:
             whole = store.trajectory(row.run_id)
             stamps = stamps_of(60)
