@@ -20,8 +20,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.figures import COLOURS, significant
 from dynslam_bench.reports.html.page import render_run_page, write_side
 from dynslam_bench.reports.html.run_page import MOST_FRAMES, PictureBook, exact_shares, read_frames, run_content
-from dynslam_bench.reports.model.board import Board, Cell
-from dynslam_bench.reports.model.common_frames import representatives
+from dynslam_bench.reports.model.board import Board, Cell, representatives
 from dynslam_bench.reports.model.load import JOB, run_jobs
 from dynslam_bench.reports.model.row import SEEN, RunRow
 from dynslam_bench.reports.tables.leaderboard import middle, rank_cell, timed

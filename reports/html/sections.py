@@ -8,8 +8,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, folded
-from dynslam_bench.reports.model.board import Board
-from dynslam_bench.reports.model.common_frames import common_errors, representatives
+from dynslam_bench.reports.model.board import Board, common_errors, representatives
 from dynslam_bench.reports.model.load import Loaded, trial_words, without_scale_words
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
@@ -17,7 +16,7 @@ from dynslam_bench.reports.model.row import command_line
 from dynslam_bench.reports.model.statistics import FEWEST, power_note
 from dynslam_bench.reports.tables import errors as error_tables
 from dynslam_bench.reports.tables import leaderboard as tables
-from dynslam_bench.reports.tables.paper import (
+from dynslam_bench.reports.tables.errors import (
     LOST_MARK,
     LOST_NOTE,
     STATISTICS,

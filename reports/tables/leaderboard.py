@@ -11,8 +11,7 @@ import numpy as np
 
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import Board, Cell, mean_skipped, rank
-from dynslam_bench.reports.model.common_frames import MOST_COMPARED
+from dynslam_bench.reports.model.board import MOST_COMPARED, Board, Cell, mean_skipped, rank
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (

@@ -11,7 +11,7 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, figures
 from dynslam_bench.reports.html import explore, sections
 from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
-from dynslam_bench.reports.model import common_frames
+from dynslam_bench.reports.model import board as board_module
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
@@ -68,13 +68,13 @@ def test_common_frames_of_many_runs_are_those_around_every_median(monkeypatch):
         for at, error in enumerate(some)
     ]
     board = make_board(rows)
-    runs = common_frames.successful(board, "s")
-    assert len(common_frames.around_medians(runs)) == 10
-    monkeypatch.setattr(common_frames, "MOST_COMPARED", 9)
-    kept = {(row.tracker.id, row.metrics["ate_rmse_m"]) for row in common_frames.around_medians(runs)}
+    runs = board_module.successful(board, "s")
+    assert len(board_module.around_medians(runs)) == 10
+    monkeypatch.setattr(board_module, "MOST_COMPARED", 9)
+    kept = {(row.tracker.id, row.metrics["ate_rmse_m"]) for row in board_module.around_medians(runs)}
     assert kept == {("a", 0.2), ("a", 0.3), ("a", 0.4), ("b", 1.0), ("c", 1.0), ("c", 2.0), ("c", 3.0)}
-    monkeypatch.setattr(common_frames, "MOST_COMPARED", 1)
-    kept = {(row.tracker.id, row.metrics["ate_rmse_m"]) for row in common_frames.around_medians(runs)}
+    monkeypatch.setattr(board_module, "MOST_COMPARED", 1)
+    kept = {(row.tracker.id, row.metrics["ate_rmse_m"]) for row in board_module.around_medians(runs)}
     assert kept == {("a", 0.3), ("b", 1.0), ("c", 2.0)}
 
 

@@ -13,9 +13,8 @@ from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import load_board, publish
 from dynslam_bench.reports.figures import FIGURES, bar_figure
-from dynslam_bench.reports.model.common_frames import common_errors
-from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.tables.paper import LOST_MARK, absolute_table, relative_table, subject_of, time_table
+from dynslam_bench.reports.model.board import common_errors
+from dynslam_bench.reports.tables.errors import LOST_MARK, absolute_table, relative_table, subject_of, time_table
 from dynslam_bench.runs.store import RunStore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
