@@ -87,13 +87,6 @@ def test_accuracy_is_a_deviation_in_disguise(report):
     assert all(f.holds for f in sums)
 
 
-def test_compared_with_what_was_published(report):
-    factors = {(f.system, f.sequence): f.printed / f.expected for f in report.of("published")}
-    assert factors["YOLO-SLAM", "tum/fr3/walking_xyz"] == pytest.approx(23.1, abs=0.1)
-    assert factors["ORB-SLAM2", "tum/fr3/sitting_xyz"] > 30
-    assert factors["ORB-SLAM2", "tum/fr3/walking_xyz"] < 1
-
-
 def test_summary_and_details(report):
     summary = report.summary()
     assert [row[0].text for row in summary.rows] == list(CHECKS)
@@ -178,11 +171,6 @@ def test_published_numbers_are_plausible_and_sourced():
     found = {(p.system, p.sequence): p.value for p in rows if p.source == "DynaSLAM paper" and p.metric == "ate_rmse_m"}
     assert found["DynaSLAM N+G", "tum/fr3/walking_xyz"] == 0.015
     assert found["ORB-SLAM2", "tum/fr3/walking_xyz"] == 0.459
-
-
-def test_published_sequences_are_catalogued():
-    catalogue = pytest.importorskip("dynslam_bench.sequences.catalogue")
-    assert all(catalogue.entry_of(sequence) is not None for sequence in set(published()["sequence"]))
 
 
 def test_reported_rows_do_not_mix_alignments():

@@ -3,14 +3,12 @@
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
 from reports_fake_store import add_run, truth_of
-from reports_rows import crashed, page_data, row, rows_of
+from reports_rows import page_data, rows_of
 
-import dynslam_bench.reports
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
@@ -18,8 +16,6 @@ from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.figures import broken
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs
-from dynslam_bench.reports.tables.errors import per_sequence
-from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.runs.store import RunStore
 
 
@@ -41,23 +37,6 @@ class Page(HTMLParser):
     def handle_endtag(self, tag):
         while self.stack and self.stack.pop() != tag:
             pass
-
-
-def test_all_files_are_there(made):
-    _, paths = made
-    assert paths.html.name == "index.html"
-    for path in [paths.html, paths.markdown, paths.latex, paths.data, *paths.csv.values()]:
-        assert path.stat().st_size > 0
-    assert {
-        "leaderboard",
-        "per_sequence",
-        "runs",
-        "failures",
-        "repeatability",
-        "common_frames",
-        "failure_rules",
-    } <= set(paths.csv)
-    assert {"rpe_1s_trans", "rpe_1s_rot", "rpe_1f_trans", "rpe_1f_rot", "mask_iou", "machines"} <= set(paths.csv)
 
 
 def test_the_page_is_complete_in_itself(made):
@@ -136,16 +115,6 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert "counts as a static camera, or worse (1 of 61 runs)" in markdown
 
 
-def test_captions_carry_the_protocol_and_the_power_note(made):
-    _, paths = made
-    for text in (paths.html.read_text(), paths.markdown.read_text()):
-        assert "1190f97bbd77" in text
-        assert "With 4 sequences no two trackers are called different" in text
-        assert "dynslam-bench bench dynamic" in text or text is not paths.html
-    assert "\\begin{tabular}" in paths.latex.read_text()
-    assert "&gt; Mixed" not in paths.html.read_text()
-
-
 def test_common_frames_beside_the_error(made):
     _, paths = made
     table = {row["tracker"]: row for row in rows_of(paths.csv["common_frames"])}
@@ -199,17 +168,6 @@ def test_an_unknown_reference_is_refused(tmp_path):
     with pytest.raises(ReportError) as caught:
         build_report(store, tmp_path / "r", reference="orb-slam3")
     assert caught.value.hint == "did you mean 'orb-slam2'?" and not (tmp_path / "r").exists()
-
-
-def test_variants_of_a_tracker_are_rows_of_their_own(tmp_path):
-    store = RunStore(tmp_path / "r")
-    for seed in (0, 1):
-        add_run(store, "orb-slam2", "s/a", seed)
-        add_run(store, "orb-slam2", "s/a", seed, overrides={"features": 500})
-    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    board = make_board(loaded.rows)
-    assert sorted(board.labels.values()) == ["orb-slam2", "orb-slam2 · features=500"]
-    assert board.reference_name == "orb-slam2"
 
 
 def test_only_the_newest_of_equal_runs_counts(tmp_path):
@@ -268,18 +226,6 @@ def test_what_cannot_be_reported_is_one_clear_line(tmp_path, case):
     assert not (tmp_path / "report").exists()
 
 
-def test_the_final_trajectory_has_its_own_table(tmp_path):
-    store = RunStore(tmp_path / "r")
-    run_id = add_run(store, "orb-slam2", "s/a", final_error=0.001)
-    add_run(store, "never-move", "s/a")
-    paths = build_report(store, tmp_path / "report")
-    (only,) = rows_of(paths.csv["final_trajectory"])
-    expected = evaluate(store.trajectory(run_id, "final"), truth_of("s/a")).metrics["ate_rmse_m"]
-    assert only["tracker"] == "orb-slam2"
-    assert float(only["s/a"]) == pytest.approx(expected, rel=1e-6)
-    assert expected < 0.5 * evaluate(store.trajectory(run_id), truth_of("s/a")).metrics["ate_rmse_m"]
-
-
 # -- reported rows
 
 
@@ -303,27 +249,6 @@ def test_published_numbers_stand_apart_and_never_compete(tmp_path):
 # -- pieces
 
 
-def test_scores_impute_failures_only():
-    assert row(hold_last_pose_ate_m=None).score_m == 0.1
-    assert crashed(metrics={}, hold_last_pose_ate_m=None).score_m == 0.3
-    assert row(metrics={}, hold_last_pose_ate_m=None, static_camera_ate_rmse_m=None).score_m is None
-
-
-def test_trackers_that_lack_sequences_are_shown_but_not_ranked():
-    rows = [row("orb-slam2", s, label="O") for s in ("s", "t")] + [row("half", label="H")]
-    rows += [row("control", s, label="C", ranked=False) for s in ("s", "t")]
-    board = make_board(rows, on="all")
-    assert [board.labels[key] for key in board.ranked] == ["O"]
-    assert [board.labels[key] for key in board.incomplete] == ["H"]
-    protocol = get_protocol("tum-rgbd/v1")
-    table = leaderboard(board, protocol)
-    assert table.muted_rows == {1, 2}
-    texts = {cells[2].text: cells[3].small for cells in table.rows}
-    assert texts["H"].endswith("on 1 of 2")
-    matrix = per_sequence(board, protocol)
-    assert matrix.rows[[r[0].text for r in matrix.rows].index("H")][2].text == "–"
-
-
 def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     stamps = np.r_[0:0.95:0.1, 1.05:2:0.1, 2.6:3:0.1]
     values = stamps[:, None] * [1.0, 2.0]
@@ -338,14 +263,3 @@ def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     assert len(t) < 420
     assert {long[0], long[4999], long[5000], long[-1]} <= set(t.tolist())
     assert np.isnan(v[:, 0]).sum() == 1
-
-
-def test_every_template_is_used():
-    """A script that no page takes any more is deleted, not shipped."""
-    room = Path(dynslam_bench.reports.__file__).parent
-    named = " ".join(
-        path.read_text(encoding="utf-8") for pattern in ("**/*.py", "**/*.j2") for path in room.glob(pattern)
-    )
-    templates = [path.name for path in (room / "html" / "templates").iterdir() if path.is_file()]
-    assert len(templates) > 10
-    assert [name for name in templates if not re.search(rf'["\']{re.escape(name)}["\']', named)] == []

@@ -108,12 +108,3 @@ def test_labels_name_files_without_their_folders_unless_two_would_be_alike(tmp_p
     assert labels("onnx:/a/best.onnx", "onnx:/b/best.onnx") == [
         f"MASK-RCNN · segmentation.source=onnx:/{folder}/best.onnx" for folder in "ab"
     ]
-
-
-def test_the_board_names_masks_without_their_folders(tmp_path):
-    store = RunStore(tmp_path / "r")
-    add_run(store, "mask-rcnn", "s/a", masks="onnx:/home/me/nets/yolov8n-seg.onnx")
-    add_run(store, "orb-slam2", "s/a")
-    paths = build_report(store, tmp_path / "report")
-    assert "onnx:yolov8n-seg masks" in paths.markdown.read_text()
-    assert "/home/me" not in paths.markdown.read_text() + paths.csv["leaderboard"].read_text()

@@ -99,11 +99,6 @@ def test_figures_thin_many_points_and_say_so(tmp_path, monkeypatch):
     assert {len(trace["x"]) for trace in figures.mask_figure(board)["data"]} == {3}
 
 
-def test_long_lists_end_in_how_many_more_there_are():
-    assert sections.first_of(["a", "b"], 2, "and {}") == ["a", "b"]
-    assert sections.first_of(["a", "b", "c", "d"], 2, "and {}") == ["a", "b", "and 2"]
-
-
 def test_csv_of_every_kind_of_column():
     frame = pd.DataFrame(
         {

@@ -117,15 +117,6 @@ def test_one_more_sequence_takes_nobodys_rank():
     assert everything.ranked == []
 
 
-def test_two_trackers_are_ranked_on_what_both_have():
-    board = make_board([row("a", "s"), row("a", "t"), row("b", "t", 0.2)])
-    assert board.common == ["t"]
-    assert len(board.ranked) == 2
-    alone = make_board([row("a", "s"), row("b", "t", 0.2)])
-    assert len(alone.ranked) == 1
-    assert alone.standings
-
-
 def test_missing_cells_are_named_with_the_commands_that_fill_them():
     board = make_board(uneven())
     note = missing_note(board)
