@@ -189,7 +189,7 @@ def pair_errors(
             make_cell([row for row in side if row.repeat_key in repeats] or side) for side in (a[column], b[column])
         ]
         if cells[0].scores and cells[1].scores:
-            name = columns[column] + f" {SEEN}" * (cells[0].seen or cells[1].seen)
+            name = columns[column] + f" {SEEN}" * (cells[0].in_training or cells[1].in_training)
             paired.append((name, cells[0], cells[1]))
     return sorted(paired, key=itemgetter(0))
 

@@ -96,9 +96,7 @@ def guide(x: float | None = None, y: float | None = None) -> dict[str, Any]:
 
 def significant(value: float | None, digits: int = 5) -> float | None:
     """A number shortened for the page; None for what is no number (JSON knows no NaN)."""
-    if value is None or not np.isfinite(value):
-        return None
-    return float(f"{value:.{digits}g}")
+    return None if value is None or not np.isfinite(value) else float(f"{value:.{digits}g}")
 
 
 def rounded(values: Sequence[float]) -> list[float | None]:

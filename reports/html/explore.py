@@ -293,7 +293,7 @@ def explore_content(board: Board, protocol: Protocol, pages: Pages, pageless: st
             {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])}
             for n in names
         ],
-        "still": [significant(board.static_camera.get(name), 5) for name in names],
+        "static": [significant(board.static_camera.get(name), 5) for name in names],
         "cells": [
             [at, column[name], *_cell(cell, metrics, board.rank_seen)]
             for key, at in place.items()
@@ -316,15 +316,15 @@ def _listed(board: Board, paged: Collection[str]) -> list[RunRow]:
 
 def _cell(cell: Cell, metrics: Sequence[Mapping[str, str]], rank_seen: bool) -> list[Any]:
     """How many runs of a cell there are and failed, what speaks against it, and the median of every number."""
-    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.seen and not rank_seen)
+    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.in_training and not rank_seen)
     values = [[_value(row, metric) for row in cell.kept] for metric in metrics]
-    medians = [middle(value for value in some if value is None or np.isfinite(value)) for some in values]
+    medians = [middle(value for value in of_runs if value is None or np.isfinite(value)) for of_runs in values]
     return [len(cell.rows), cell.failed, doubt, [significant(value, 5) for value in medians]]
 
 
 def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:
     runs, first = board.runs(key), board.first(key)
-    standing = next((found for found in board.standings if found.key == key), None)
+    standing = next((standing for standing in board.standings if standing.key == key), None)
     ended = [row for row in runs if not row.failed]
     counts = Counter(row.failed for row in runs)
     return {
@@ -345,7 +345,7 @@ def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:
 
 def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     """The numbers to choose from: of the online and of the final trajectory."""
-    found = [
+    numbers = [
         ("ate", "ATE", "m", "ate_rmse_m"),
         *(
             ("rpe", f"RPE over {spec.describe()}", "m/s" if spec.rate else "m", spec.metric("trans"))
@@ -360,7 +360,7 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     return [
         {"kind": kind, "name": name, "unit": unit, "key": key, "which": which}
         for which in ("online", "final")
-        for kind, name, unit, key in found
+        for kind, name, unit, key in numbers
     ]
 
 

@@ -181,12 +181,12 @@ def packed_rows(rows: ArrayLike) -> list[list[float | str]]:
         of their range.
     """
     array = np.atleast_2d(np.asarray(rows, dtype=np.float64))
-    known = np.isfinite(array)
-    low = np.min(array, axis=1, where=known, initial=np.inf)
-    high = np.max(array, axis=1, where=known, initial=-np.inf)
+    finite = np.isfinite(array)
+    low = np.min(array, axis=1, where=finite, initial=np.inf)
+    high = np.max(array, axis=1, where=finite, initial=-np.inf)
     low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
     step = np.where(high > low, (high - low) / (_MISSING - 1), 1.0)
-    counts = np.where(known, (array - low[:, None]) / step[:, None], _MISSING).round().astype("<u2")
+    counts = np.where(finite, (array - low[:, None]) / step[:, None], _MISSING).round().astype("<u2")
     return [
         [float(f"{first:.9g}"), float(f"{width:.9g}"), base64.b64encode(row.tobytes()).decode()]
         for first, width, row in zip(low, step, counts, strict=True)

@@ -61,7 +61,10 @@ def run_content(
         "ending": row.ending,
         "reason": row.reason,
         "facts": _facts(row, record, protocol.rpe),
-        "settings": {name: _plain(value) for name, value in record.settings.items()},
+        "settings": {
+            name: value if isinstance(value, str | int | bool | None) else str(value)
+            for name, value in record.settings.items()
+        },
         "overrides": sorted(record.overrides),
         "stages": [
             [name, *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s))]
@@ -81,31 +84,24 @@ def run_content(
 
 def _facts(row: RunRow, record: RunRecord, rpe: Sequence[RPESpec]) -> list[list[str | float | None]]:
     """Name, number and unit of what is known of a run."""
-    facts: list[tuple[str, float | None, str]] = [
-        ("ATE, lost frames held", None if row.score_m is None else 1000 * row.score_m, "mm"),
-        ("ATE of the tracked frames", _scaled(row.metrics.get("ate_rmse_m"), 1000), "mm"),
-        ("ATE of the final trajectory", _scaled(row.final_ate_m, 1000), "mm"),
-        *(
-            (f"RPE over {s.describe()}", _scaled(row.metrics.get(s.metric("trans")), 1000), "mm/s" if s.rate else "mm")
-            for s in rpe
-        ),
-        ("coverage", 100 * row.coverage, "%"),
-        ("frame time", row.frame_ms, "ms"),
-        ("real time", row.real_time_factor, "×"),
-        ("memory", row.peak_memory_mb, "MB"),
-        ("keyframes", record.keyframes, ""),
-        ("map points", record.map_points, ""),
-        ("mask overlap (IoU)", row.mask_iou, ""),
+    rpe_facts = [
+        (f"RPE over {spec.describe()}", row.metrics.get(spec.metric("trans")), 1000, "mm/s" if spec.rate else "mm")
+        for spec in rpe
     ]
-    return [[name, significant(value), unit] for name, value, unit in facts if value is not None]
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, str | int | bool) or value is None else str(value)
+    facts: list[tuple[str, float | None, int, str]] = [
+        ("ATE, lost frames held", row.score_m, 1000, "mm"),
+        ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, "mm"),
+        ("ATE of the final trajectory", row.final_ate_m, 1000, "mm"),
+        *rpe_facts,
+        ("coverage", row.coverage, 100, "%"),
+        ("frame time", row.frame_ms, 1, "ms"),
+        ("real time", row.real_time_factor, 1, "×"),
+        ("memory", row.peak_memory_mb, 1, "MB"),
+        ("keyframes", record.keyframes, 1, ""),
+        ("map points", record.map_points, 1, ""),
+        ("mask overlap (IoU)", row.mask_iou, 1, ""),
+    ]
+    return [[name, significant(value * factor), unit] for name, value, factor, unit in facts if value is not None]
 
 
 def _log(row: RunRow) -> str:
@@ -131,7 +127,7 @@ def _series(frames: RunFrames, most: int) -> dict[str, Any]:
     rows = [stamps - start, 1000 * frames.errors_m, 100 * frames.share]
     rows += [columns[f"stat_{name}"] for name in counts] + [1000 * columns[name] for name in stages]
     t, error, share, *others = packed_rows([np.asarray(row, dtype=np.float64)[::step] for row in rows])
-    found: dict[str, Any] = {
+    series: dict[str, Any] = {
         "count": len(frames),
         "step": step,
         "start": start,
@@ -142,7 +138,7 @@ def _series(frames: RunFrames, most: int) -> dict[str, Any]:
         "counts": dict(zip(counts, others, strict=False)),
         "stages": {name[:-2]: row for name, row in zip(stages, others[len(counts) :], strict=True)},
     }
-    return found | {"share": share} if np.isfinite(frames.share).any() else found
+    return series | {"share": share} if np.isfinite(frames.share).any() else series
 
 
 def _track(row: RunRow, protocol: Protocol, most: int) -> dict[str, Any]:
@@ -187,11 +183,11 @@ def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) ->
     together = np.column_stack(list(columns.values()))
     stamps, values = broken(track.timestamps - start, together, most)
     t, *rows = packed_rows(np.vstack([stamps, values.T]))
-    found: dict[str, Any] = {"start": start, "t": t}
+    packed: dict[str, Any] = {"start": start, "t": t}
     for name, width in zip(columns, widths, strict=True):
-        found[name] = rows[0] if width == 1 else rows[:width]
+        packed[name] = rows[0] if width == 1 else rows[:width]
         rows = rows[width:]
-    return found
+    return packed
 
 
 def _angles(track: Trajectory, true: Trajectory) -> Array:
@@ -270,9 +266,9 @@ def exact_shares(rows: Sequence[RunRow]) -> dict[int, float]:
         except RunError:  # is named on the page of that run
             continue
         if columns is not None and "dynamic_share" in columns:
-            known = np.isfinite(columns["dynamic_share"])
-            indices = (columns["index"][known] + row.offset).tolist()
-            shares |= dict(zip(indices, columns["dynamic_share"][known].tolist(), strict=True))
+            finite = np.isfinite(columns["dynamic_share"])
+            indices = (columns["index"][finite] + row.offset).tolist()
+            shares |= dict(zip(indices, columns["dynamic_share"][finite].tolist(), strict=True))
     return shares
 
 

@@ -64,8 +64,8 @@ def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list
     if any(count for count, _ in left):
         notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
     if loaded.conflicts:
-        told = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
-        notes.insert(0, f"Runs with one id must be equal, but these have different results: {told}.")
+        conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
+        notes.insert(0, f"Runs with one id must be equal, but these have different results: {conflicts}.")
     older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
     if older:
         why = "as a newer program has made runs of the same tracker and settings, or as the runs' ids are unverified"

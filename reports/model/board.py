@@ -135,7 +135,7 @@ class Board:
 
     def competes(self, key: str, name: str) -> bool:
         """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
-        return self.rank_seen or not self.cells[key][name].seen
+        return self.rank_seen or not self.cells[key][name].in_training
 
     def lacking(self, key: str) -> list[str]:
         """The sequences on which a tracker was not run."""
@@ -361,7 +361,7 @@ class Cell:
         return ordered[(len(ordered) - 1) // 2] if ordered else self.rows[0]
 
     @cached_property
-    def seen(self) -> bool:
+    def in_training(self) -> bool:
         """Whether masks of it come from a network that was trained on the scene."""
         return any(row.seen_in_training for row in self.rows)
 

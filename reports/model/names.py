@@ -14,8 +14,8 @@ from dynslam_bench.reports.model.row import SEEN, RunRow
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
     """A name for every column, no two alike.
 
-    Recordings that share a name are told apart by the last parts of their folders' paths, then by camera, content and
-    frames: ``chess/seq-01`` and ``fire/seq-01``.
+    Recordings that share a name are distinguished by the last parts of their folders' paths, then by camera, content
+    and frames: ``chess/seq-01`` and ``fire/seq-01``.
 
     Returns:
         Column id (see `RunRow.column_id`) to its name.
@@ -117,7 +117,7 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     runs, is not.
     Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
     """
-    seen = {row.variant_key for row in rows if row.seen_in_training}
+    in_training = {row.variant_key for row in rows if row.seen_in_training}
     variants: dict[str, RunRow] = {}
     for row in rows:
         variants.setdefault(row.variant_key, row)
@@ -140,7 +140,7 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
         if row.imported and not all(other.imported for other in by_tracker[tracker]):
             parts.append("imported")
         name = f"{row.label} <{tracker}>" if len(trackers_of[row.label]) > 1 else row.label
-        labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in seen)
+        labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
     return labels
 
 

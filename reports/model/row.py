@@ -158,12 +158,10 @@ class RunRow(RunRecord):
     def variant(self) -> dict[str, Any]:
         """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
         variant: dict[str, Any] = dict(sorted(self.asked.items()))
-        if not self.imported:
-            variant |= {"device": self.device, "threads": self.threads}
-        if self.realtime:
-            variant["realtime"] = f"{self.machine.cpu}, {self.machine.cores} cores" if self.machine else True
-        if self.drop_share:
-            variant["drop_share"] = self.drop_share
+        machine = f"{self.machine.cpu}, {self.machine.cores} cores" if self.machine else True
+        variant |= {} if self.imported else {"device": self.device, "threads": self.threads}
+        variant |= {"realtime": machine} if self.realtime else {}
+        variant |= {"drop_share": self.drop_share} if self.drop_share else {}
         return variant | {f"degrade.{name}": value for name, value in sorted(self.degrade.items())}
 
     @cached_property
@@ -277,7 +275,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     static_m = static_camera_error(store, record, protocol, evaluation)
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
     diagnostics = [] if evaluation is None else evaluation.diagnostics
-    known: Mapping[str, Any] = dict(
+    scores: Mapping[str, Any] = dict(
         settings={name: record.settings[name] for name in record.overrides if name in record.settings},
         identity={name: value for name, value in record.identity.items() if name != "settings"},
         timings={name: time for name, time in record.timings.items() if name == "total"},
@@ -292,7 +290,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         notes=[*(f"hint: {hint}" for hint in scored.hints), *trial, *record.notes, *diagnostics],
         hints=scored.hints,
     )
-    return RunRow(**(dict(record) | known | _outcome(record, scored, protocol))).stored_in(store)
+    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol))).stored_in(store)
 
 
 def _outcome(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> dict[str, Any]:

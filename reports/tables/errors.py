@@ -74,9 +74,9 @@ def metric_table(
             elif cell is None or place not in values:
                 cells.append(TableCell())
             else:
-                shown = text(values[place]) + DOUBT * bool(why) + SEEN * cell.seen
+                shown = text(values[place]) + DOUBT * bool(why) + SEEN * cell.in_training
                 mark: Emphasis = "muted" if why else marks.get(place, "")
-                tip = why or (SEEN_NOTE if cell.seen else cell.ending)
+                tip = why or (SEEN_NOTE if cell.in_training else cell.ending)
                 cells.append(TableCell(shown, skipped_words(cell), values[place], mark, tip=tip))
         rows.append(cells)
     columns = [*texts("tracker"), *sequence_columns(board)]
@@ -164,7 +164,7 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
 def _trained_on(board: Board, key: str | None) -> str:
     """The sequences on which the masks of a tracker were trained; empty for no tracker."""
     cells = {} if key is None else board.cells[key]
-    return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].seen)
+    return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].in_training)
 
 
 def final_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -263,13 +263,13 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
     base = board.reference_median(sequence)
     colour = None
     tip = coverage
-    if base is not None and cell.seen:
+    if base is not None and cell.in_training:
         tip = SEEN_NOTE
     elif base is not None:
         ratio = cell.median / max(base, FLOOR_M)
         colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
         tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
-    shown = mm(cell.median) + SEEN * cell.seen
+    shown = mm(cell.median) + SEEN * cell.in_training
     return TableCell(shown, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
 
 
@@ -430,7 +430,9 @@ def _error_cells(
                 yield TableCell()
             else:
                 error, mark = values[key, name], marks[kind].get((key, name), "")
-                yield TableCell(mm(error) + SEEN * cell.seen + LOST_MARK * has_lost(cell), value=error, emphasis=mark)
+                yield TableCell(
+                    mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell), value=error, emphasis=mark
+                )
 
 
 def has_lost(cell: Cell | None) -> bool:

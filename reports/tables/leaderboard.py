@@ -298,7 +298,7 @@ def common_frames_table(
             else:
                 cell = board.cells[key][name]
                 mark = marks.get((key, name), "")
-                cells.append(TableCell(mm(error) + SEEN * cell.seen, skipped_words(cell), error, mark))
+                cells.append(TableCell(mm(error) + SEEN * cell.in_training, skipped_words(cell), error, mark))
         rows.append(cells)
     rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
     caption = (
