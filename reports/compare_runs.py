@@ -16,7 +16,7 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.board import Cell, make_cell
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
-from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow
+from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, ratio_interval
 from dynslam_bench.reports.tables.leaderboard import interval_cell
 from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts, to_csv, to_markdown
@@ -137,10 +137,8 @@ Paired = tuple[str, Cell, Cell]
 
 def make_side(rows: Sequence[RunRow]) -> Side:
     """Rows by variant and column."""
-    side: Side = {}
-    for row in rows:
-        side.setdefault(row.variant_key, {}).setdefault(row.column_id, []).append(row)
-    return side
+    variants = grouped(rows, lambda row: row.variant_key)
+    return {key: grouped(of_key, lambda row: row.column_id) for key, of_key in variants.items()}
 
 
 def pair_variants(a: Side, b: Side) -> list[tuple[str, str]]:

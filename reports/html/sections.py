@@ -47,34 +47,33 @@ def leaderboard_section(board: Board, protocol: Protocol, loaded: Loaded) -> Sec
 
 def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list[str]:
     cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
-    notes = [power_note(board.standings, len(board.common), min((len(c.scores) for c in cells if c.scores), default=0))]
-    missing = missing_note(board)
-    if missing:
-        notes.insert(0, missing)
-    if board.final_only:
-        named = ", ".join(board.labels[key] for key in board.final_only)
-        notes.append(f"Only in the table of final trajectories, as nothing else is known of them: {named}.")
-    if board.unscored:
-        notes.append(f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}.")
-    left = [
-        (loaded.superseded, "older runs of the same tracker, settings, frames and repeat"),
-        (loaded.stopped, "runs that were stopped on request"),
-        (len(loaded.unreadable), "folders without a valid record"),
-    ]
-    if any(count for count, _ in left):
-        notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
-    if loaded.conflicts:
-        conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
-        notes.insert(0, f"Runs with one id must be equal, but these have different results: {conflicts}.")
+    fewest_repeats = min((len(cell.scores) for cell in cells if cell.scores), default=0)
+    conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
+    final_only = ", ".join(board.labels[key] for key in board.final_only)
     older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
-    if older:
-        why = "as a newer program has made runs of the same tracker and settings, or as the runs' ids are unverified"
-        notes.append(f"Not ranked, {why}: {', '.join(older)}.")
-    if loaded.without_scale:
-        notes.append(f"Left out: {without_scale_words(loaded.without_scale, protocol)}.")
-    if loaded.trials:
-        notes.append(f"Left out: {trial_words(loaded.trials)}.")
-    return notes
+    left_out = {
+        "older runs of the same tracker, settings, frames and repeat": loaded.superseded,
+        "runs that were stopped on request": loaded.stopped,
+        "folders without a valid record": len(loaded.unreadable),
+    }
+    counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
+    notes = [
+        f"Runs with one id must be equal, but these have different results: {conflicts}." if conflicts else "",
+        missing_note(board),
+        power_note(board.standings, len(board.common), fewest_repeats),
+        f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
+        if final_only
+        else "",
+        f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}." if board.unscored else "",
+        f"Left out: {counts}." if counts else "",
+        "Not ranked, as a newer program has made runs of the same tracker and settings, or as the runs' ids are "
+        f"unverified: {', '.join(older)}."
+        if older
+        else "",
+        f"Left out: {without_scale_words(loaded.without_scale, protocol)}." if loaded.without_scale else "",
+        f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
+    ]
+    return [note for note in notes if note]
 
 
 def speed_section(board: Board) -> Section:

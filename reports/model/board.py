@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,7 +18,7 @@ from dynslam_bench.evaluation.prepare import common_frames
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores, run_jobs
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
-from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.reports.model.row import RunRow, grouped
 from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
 from dynslam_bench.runs.store import RunStore
 
@@ -91,7 +91,7 @@ class Board:
 
     @cached_property
     def _by_key(self) -> dict[str, list[RunRow]]:
-        return _grouped(self.rows, lambda row: row.variant_key)
+        return grouped(self.rows, lambda row: row.variant_key)
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
@@ -185,7 +185,7 @@ def make_board(
     board.labels = make_labels(rows)
     _order_sequences(board)
     for key in board.labels:
-        cells = _grouped(board.runs(key), board.sequence)
+        cells = grouped(board.runs(key), board.sequence)
         board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
     board.final_only = [key for key in board.labels if all(row.only_final for row in board.runs(key))]
     shown = [key for key in board.labels if key not in board.final_only]
@@ -243,7 +243,7 @@ def rank(
 
 def _order_sequences(board: Board) -> None:
     """Name the sequences and their groups, static ones first; note what a static camera scores on each."""
-    for name, rows in _grouped(board.rows, board.sequence).items():
+    for name, rows in grouped(board.rows, board.sequence).items():
         errors = [row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None]
         if errors:
             board.static_camera[name] = median(errors)
@@ -303,13 +303,6 @@ def _group(row: RunRow) -> str:
     tagged = [name for tag, name in _GROUPS.items() if tag in row.sequence.tags]
     named = [name for part, name in _NAMES if part in row.sequence.id]
     return next(iter([*tagged, *named]), _OTHER)
-
-
-def _grouped(rows: Iterable[RunRow], key: Callable[[RunRow], str]) -> dict[str, list[RunRow]]:
-    groups: dict[str, list[RunRow]] = {}
-    for row in rows:
-        groups.setdefault(key(row), []).append(row)
-    return groups
 
 
 @dataclass(frozen=True)
@@ -380,11 +373,8 @@ class Cell:
 def make_cell(rows: Sequence[RunRow]) -> Cell:
     """Order the runs of a cell and find the copies among them."""
     ordered = sorted(rows, key=lambda row: row.repeat_key)
-    groups: dict[object, list[RunRow]] = {}
-    for row in ordered:
-        groups.setdefault((row.offset, row.sequence.noise, row.imported), []).append(row)
     kept: list[RunRow] = []
-    for group in groups.values():
+    for group in grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported)).values():
         results = {_result(row) for row in group}
         kept += group[:1] if len(results) == 1 else group
     return Cell(tuple(ordered), tuple(kept))
@@ -531,12 +521,10 @@ def common_errors(
             continue
         compared = [row for row in rows if row.run_id in of_run]
         frames[sequence] = f"{count} of {max(row.n_frames for row in compared)}"
-        by_key: dict[str, list[float]] = {}
-        for row in compared:
-            error = of_run[row.run_id]
-            if error is not None:
-                by_key.setdefault(row.variant_key, []).append(error)
-        errors |= {(key, sequence): median(values) for key, values in by_key.items()}
+        for key, rows_of_key in grouped(compared, lambda row: row.variant_key).items():
+            values = [error for row in rows_of_key if (error := of_run[row.run_id]) is not None]
+            if values:
+                errors[key, sequence] = median(values)
     return errors, frames
 
 
@@ -583,7 +571,7 @@ def around_medians(rows: Sequence[RunRow]) -> Sequence[RunRow]:
 
 def _by_error(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
     """Runs by tracker, from the smallest to the largest error."""
-    return _grouped(sorted(rows, key=lambda row: row.metrics["ate_rmse_m"]), lambda row: row.variant_key)
+    return grouped(sorted(rows, key=lambda row: row.metrics["ate_rmse_m"]), lambda row: row.variant_key)
 
 
 def successful(board: Board, sequence: str) -> list[RunRow]:

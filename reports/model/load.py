@@ -28,7 +28,7 @@ from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportE
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
-from dynslam_bench.reports.model.row import RunRow, make_row
+from dynslam_bench.reports.model.row import RunRow, grouped, make_row
 from dynslam_bench.runs.run_index import folder_state, stamp_if_there
 from dynslam_bench.runs.store import RunStore
 
@@ -347,10 +347,7 @@ def _split_programs(rows: Iterable[RunRow]) -> None:
 
     Runs by an older program are not ranked, nor are those whose identity is not verified, which are always marked.
     """
-    groups: dict[str, list[RunRow]] = {}
-    for row in rows:
-        groups.setdefault(row.settings_key, []).append(row)
-    for group in groups.values():
+    for group in grouped(rows, lambda row: row.settings_key).values():
         parts = {name: {row.program.get(name) for row in group} - {None} for row in group for name in row.program}
         varying = {name for name, values in parts.items() if len(values) > 1 or name == "identity"}
         for row in group:
@@ -362,11 +359,8 @@ def _split_programs(rows: Iterable[RunRow]) -> None:
 
 def _two_results(rows: Iterable[RunRow]) -> list[str]:
     """Which runs of one id from several stores have different results although they should be equal, in words."""
-    by_id: dict[str, list[RunRow]] = {}
-    for row in rows:
-        by_id.setdefault(row.run_id, []).append(row)
     conflicts = []
-    for first, *others in by_id.values():
+    for first, *others in grouped(rows, lambda row: row.run_id).values():
         errors = sorted({row.metrics["ate_rmse_m"] for row in (first, *others) if "ate_rmse_m" in row.metrics})
         if len(errors) > 1 and first.tracker.deterministic and not first.realtime:
             results = ", ".join(f"{1000 * error:.3f}" for error in errors)

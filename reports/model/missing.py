@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.model.board import Board
-from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.reports.model.row import RunRow, grouped
 
 _MOST = 8
 
@@ -34,15 +34,14 @@ def missing_note(board: Board) -> str:
 def missing_commands(board: Board) -> list[str]:
     """Commands that make the runs of the missing cells of all that can be run here."""
     commands: list[str] = []
-    plainest: dict[str, RunRow] = {}  # of every sequence a run without offset or noise, if there is one
-    for row in sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset)):
-        plainest.setdefault(board.sequence(row), row)
+    plainest = sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset))
+    by_sequence = grouped(plainest, board.sequence)
     for key, lacking in _lacking(board).items():
         row = board.first(key)
         if row.imported:
             continue
         wanted: dict[tuple[str, ...], list[str]] = {}
-        for other in (plainest[name] for name in lacking):
+        for other in (by_sequence[name][0] for name in lacking):
             wanted.setdefault(tuple(_part_options(other)), []).append(other.place or other.sequence.id)
         seeds = sorted({run.seed for run in board.runs(key)})
         offsets = sorted({run.offset for run in board.runs(key)})

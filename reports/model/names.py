@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.toml import label_text, setting_text
-from dynslam_bench.reports.model.row import SEEN, RunRow
+from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
 
 
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
@@ -20,15 +20,11 @@ def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
     Returns:
         Column id (see `RunRow.column_id`) to its name.
     """
-    first: dict[str, RunRow] = {}
-    for row in sorted(rows, key=lambda row: (row.sequence.noise is not None, row.offset, len(_name(row)), _name(row))):
-        first.setdefault(row.column_id, row)
-    alike: dict[str, dict[str, RunRow]] = {}
-    for column, row in first.items():
-        alike.setdefault(_name(row), {})[column] = row
+    plainest = sorted(rows, key=lambda r: (r.sequence.noise is not None, r.offset, len(_name(r)), _name(r)))
+    columns = [of_column[0] for of_column in grouped(plainest, lambda row: row.column_id).values()]
     names: dict[str, str] = {}
-    for name, group in alike.items():
-        names |= {column: name for column in group} if len(group) == 1 else _distinct(name, group)
+    for name, group in grouped(columns, _name).items():
+        names |= _distinct(name, {row.column_id: row for row in group})
     return names
 
 
@@ -67,7 +63,10 @@ def _name(row: RunRow) -> str:
 
 
 def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
+    """Names of columns that would all have one name."""
     names = dict.fromkeys(group, name)
+    if len(group) == 1:
+        return names
     places = {column: Path(row.place).parts for column, row in group.items()}
     if all(places.values()):
         for length in range(1, max(map(len, places.values())) + 1):
@@ -87,9 +86,6 @@ def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
         if len(set(names.values())) < len(names) and len(set(words.values())) > 1:
             names = {column: f"{name} ({words[column]})" if words[column] else name for column, name in names.items()}
     return names
-
-
-# What the rows of a table are called.
 
 
 def _camera_words(row: RunRow) -> str:
@@ -118,14 +114,9 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
     """
     in_training = {row.variant_key for row in rows if row.seen_in_training}
-    variants: dict[str, RunRow] = {}
-    for row in rows:
-        variants.setdefault(row.variant_key, row)
-    by_tracker: dict[str, list[RunRow]] = {}
-    trackers_of: dict[str, set[str]] = {}
-    for row in variants.values():
-        by_tracker.setdefault(row.tracker.id, []).append(row)
-        trackers_of.setdefault(row.label, set()).add(row.tracker.id)
+    variants = {key: of_key[0] for key, of_key in grouped(rows, lambda row: row.variant_key).items()}
+    by_tracker = grouped(variants.values(), lambda row: row.tracker.id)
+    by_label = grouped(variants.values(), lambda row: row.label)
     shown = {tracker: {*ALWAYS, *_differing(others)} for tracker, others in by_tracker.items()}
     asked = {tracker: {name for row in others for name in row.variant} for tracker, others in by_tracker.items()}
     for tracker, names in asked.items():  # what this tracker alone was asked for
@@ -139,7 +130,7 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
         parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
         if row.imported and not all(other.imported for other in by_tracker[tracker]):
             parts.append("imported")
-        name = f"{row.label} <{tracker}>" if len(trackers_of[row.label]) > 1 else row.label
+        name = f"{row.label} <{tracker}>" if len({other.tracker.id for other in by_label[row.label]}) > 1 else row.label
         labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
     return labels
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, PrivateAttr
 
@@ -26,6 +26,7 @@ from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
+K = TypeVar("K", bound=Hashable)
 Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
 SEEN = "§"
@@ -232,6 +233,14 @@ class RunRow(RunRecord):
         if self.git is not None:
             parts.append(f"git {self.git.revision[:10]}{' (changed)' if self.git.dirty else ''}")
         return "; ".join(parts)
+
+
+def grouped(rows: Iterable[RunRow], key: Callable[[RunRow], K]) -> dict[K, list[RunRow]]:
+    """Rows by a key, in their order."""
+    groups: dict[K, list[RunRow]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
 
 
 class ReportData(Record):

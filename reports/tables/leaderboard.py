@@ -116,27 +116,19 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "in the map of an earlier one or by an older program, real-time runs beside others, trackers that lack "
         "sequences, never succeeded, or are no better than a static camera.",
     ]
-    if worse := _no_better_than_static(board):
-        parts.append(f"No better than a static camera, although their runs ended: {worse}.")
-    if board.asked_reference and board.reference is None:
-        parts.append(
-            f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a static "
-            "camera takes its place."
-        )
-    if epipolar:
-        parts.append("F skipped: frames on which an epipolar system did not use its fundamental matrix.")
-    if any(row.cached for row in board.rows):
-        parts.append(CACHED_NOTE)
-    if any(row.seen_in_training for row in board.rows):
-        rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
-        parts.append(f"{SEEN_NOTE} {rule} Instances 100-199 are held out.")
-    if hinted := _hinted(board.rows):
-        runs = _count(sum(bool(row.hints) for row in board.rows), "run")
-        parts.append(
-            f"{HINTED} The trajectories of {runs} are probably faulty ({hinted}), as the diagnostics say; no number is "
-            "changed for that."
-        )
-    return " ".join(parts)
+    worse, hinted = _no_better_than_static(board), _hinted(board.rows)
+    rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
+    remarks = {
+        f"No better than a static camera, although their runs ended: {worse}.": worse,
+        f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a static "
+        "camera takes its place.": board.asked_reference and board.reference is None,
+        "F skipped: frames on which an epipolar system did not use its fundamental matrix.": epipolar,
+        CACHED_NOTE: any(row.cached for row in board.rows),
+        f"{SEEN_NOTE} {rule} Instances 100-199 are held out.": any(row.seen_in_training for row in board.rows),
+        f"{HINTED} The trajectories of {_count(sum(bool(row.hints) for row in board.rows), 'run')} are probably faulty "
+        f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
+    }
+    return " ".join(parts + [remark for remark, holds in remarks.items() if holds])
 
 
 def _hinted(rows: Iterable[RunRow]) -> str:
