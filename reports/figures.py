@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.reports.model.statistics import Interval
+from dynslam_bench.reports.tables.errors import LOST_MARK, STATISTICS, has_lost, medians
 from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, timed
-from dynslam_bench.reports.tables.paper import LOST_MARK, STATISTICS, averages, has_lost
 
 # How the report's figures look: colours, axes, layout, and numbers and names made fit for the page.
 
@@ -96,9 +96,7 @@ def guide(x: float | None = None, y: float | None = None) -> dict[str, Any]:
 
 def significant(value: float | None, digits: int = 5) -> float | None:
     """A number shortened for the page; None for what is no number (JSON knows no NaN)."""
-    if value is None or not np.isfinite(value):
-        return None
-    return float(f"{value:.{digits}g}")
+    return None if value is None or not np.isfinite(value) else float(f"{value:.{digits}g}")
 
 
 def rounded(values: Sequence[float]) -> list[float | None]:
@@ -353,22 +351,23 @@ def bar_figure(board: Board, statistic: str) -> Figure | None:
         statistic: ``mean``, ``median``, ``rmse`` or ``std``.
     """
     palette = colours(board)
-    found = averages(board, f"ate_{statistic}_m", board.trackers)
-    traces = [
-        {
-            "type": "bar",
-            "name": wrapped(board.labels[key]),
-            "x": [safe(board.short[name]) for name in values],
-            "y": rounded([1000 * value for value in values.values()]),
-            "text": [LOST_MARK * has_lost(board.cells[key].get(name)) for name in values],
-            "textposition": "outside",
-            "cliponaxis": False,
-            "marker": {"color": palette[key], "opacity": 1.0 if key in board.ranked else 0.45},
-            "hovertemplate": "%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
-        }
-        for key, values in found.items()
-        if values
-    ]
+    errors = medians(board, lambda row: row.metrics.get(f"ate_{statistic}_m"), board.trackers)
+    traces = []
+    for key in dict.fromkeys(key for key, _ in errors):
+        names = [name for name in board.sequences if (key, name) in errors]
+        traces.append(
+            {
+                "type": "bar",
+                "name": wrapped(board.labels[key]),
+                "x": [safe(board.short[name]) for name in names],
+                "y": rounded([1000 * errors[key, name] for name in names]),
+                "text": [LOST_MARK * has_lost(board.cells[key][name]) for name in names],
+                "textposition": "outside",
+                "cliponaxis": False,
+                "marker": {"color": palette[key], "opacity": 1.0 if key in board.ranked else 0.45},
+                "hovertemplate": "%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
+            }
+        )
     if not traces:
         return None
     layout = layout_of(

@@ -123,7 +123,7 @@ def publish(
     as_json: AsJson = False,
 ) -> None:
     """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
-    from dynslam_bench.reports import build_report as publish_site
+    from dynslam_bench.reports import publish as publish_site
 
     with progress("site") as advance:
         site = publish_site(
@@ -178,7 +178,7 @@ def audit_paper(
     from dynslam_bench.sequences.catalogue import entry_of
 
     truth = {}
-    for name in sorted({each.sequence for each in claimed()}):
+    for name in sorted(set(claimed()["sequence"])):
         entry = entry_of(name)
         folder = None if entry is None else entry.find(find_data_root(data_root))
         if folder is not None and (folder / "groundtruth.txt").is_file():

@@ -124,12 +124,12 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
     ]
     read = [
         (p.sequence, p.metric, p.value, p.source, "; ".join(filter(None, (p.alignment, p.remarks))))
-        for p in published()
+        for p in published().itertuples()
         if p.system in spec.published_as
     ]
     paper = [
         (c.sequence, c.quantity, c.value, f"EMFOA-OFT-SLAM, table {c.table}", f"{CLAIMED}: see 'report audit-paper'")
-        for c in claimed()
+        for c in claimed().itertuples()
         if c.system in spec.published_as and c.kind == "value"
     ]
     names = ("sequence", "metric", "value", "source", "remarks")

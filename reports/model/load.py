@@ -1,82 +1,232 @@
-"""From results folders to rows: which runs count, scored under one protocol."""
+"""From results folders to rows: which runs count, scored under one protocol.
+
+Rows of unchanged runs are taken from a table of the store's SQLite index. Many runs are scored by several processes.
+"""
 
 from __future__ import annotations
 
-import json
 import os
-import queue
-import subprocess
+import signal
+import sqlite3
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from multiprocessing import get_context, parent_process
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import ValidationError
 
 import dynslam_bench
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError, did_you_mean
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.reports.model.row import RunRow, Which, log_of, make_row
-from dynslam_bench.runs.process.fork_server import child_environment
-from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.reports.model.row import RunRow, grouped, make_row
+from dynslam_bench.runs.run_index import folder_state, stamp_if_there
 from dynslam_bench.runs.store import RunStore
 
+T = TypeVar("T")
 OnProgress = Callable[[float, float | None, str], None]
 """Called as ``on_progress(done, total, what)``; the total is None where it is not known."""
+MANY = 250
+"""Runs from which on worker processes save more time than they need to start."""
+MOST_WORKERS = 8
+JOB = 40
+"""Runs of one job of a worker, at most."""
+_CODE = ("evaluation", "geometry", "reports/model", "runs")
+_TABLE = (
+    "CREATE TABLE IF NOT EXISTS report_rows "
+    "(protocol TEXT, run_id TEXT, state TEXT, row TEXT, PRIMARY KEY (protocol, run_id))"
+)
 
 
 def no_progress(done: float, total: float | None, what: str) -> None:
-    """Progress that nobody wants to hear of."""
+    """Ignore progress."""
 
 
-@dataclass(frozen=True)
-class LoadedRun:
-    """A row with the place where its trajectory lies.
+# -- worker processes
 
-    Attributes:
-        row: The row.
-        part: The run's part of a sequence.
-        store: Where it lies.
+
+@contextmanager
+def worker_pool(runs: int) -> Iterator[Executor | None]:
+    """As many worker processes as so many runs are worth on this machine; None where they are worth none."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if runs < MANY or cores == 1:
+        yield None
+        return
+    context = get_context("spawn")  # a library cannot know which threads its caller has: no fork
+    with ProcessPoolExecutor(min(cores, MOST_WORKERS), context, _start_worker) as pool:
+        yield pool
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the parent process, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def run_jobs(
+    pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], on_answer: Callable[[T], None]
+) -> list[T]:
+    """Call a function once a job, in worker processes or here.
+
+    Args:
+        pool: The workers; None to call it here.
+        function: A function of a module.
+        jobs: Its arguments.
+        on_answer: Called with every answer as it arrives.
+
+    Returns:
+        The answers in the order of the jobs.
+
+    Raises:
+        DynslamError: A job cannot be done.
+        InfrastructureError: A worker has died.
+    """
+    if pool is None:
+        answers = []
+        for job in jobs:
+            answers.append(function(*job))
+            on_answer(answers[-1])
+        return answers
+    with _without_main():
+        futures = [pool.submit(function, *job) for job in jobs]
+    try:
+        for future in as_completed(futures):
+            on_answer(future.result())
+    except BrokenProcessPool as error:
+        raise InfrastructureError(f"a worker process of the report ended early: {error}") from error
+    finally:
+        for future in futures:
+            future.cancel()
+    return [future.result() for future in futures]
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Let workers start without the caller's script, which need not guard what it does at import."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+# -- rows of unchanged runs
+
+
+class RowCache:
+    """Rows of a store's runs under a protocol, which hold as long as their files and the code stay as they are.
+
+    The index may be deleted at any time. Damaged rows, and rows of other runs, count as missing.
+
+    Args:
+        store: The store.
+        protocol: How errors are computed.
     """
 
-    row: RunRow
-    part: str
-    store: RunStore
+    def __init__(self, store: RunStore, protocol: Protocol) -> None:
+        self.store, self.protocol, self._protocol_digest = store, protocol, protocol.digest()
+        self._code = digest([dynslam_bench.__version__, package_digest(_CODE)])
+        self._path = store.root / "index" / "runs.sqlite"
+        self._part_states: dict[str, str] = {}
 
-    @cached_property
-    def record(self) -> RunRecord:
-        """The whole record, many times as large as the row: read when it is first asked for.
+    def read(self) -> dict[str, RunRow]:
+        """The rows that hold, by run id."""
+        rows = {}
+        if self.store.ids():
+            query = "SELECT run_id, state, row FROM report_rows WHERE protocol = ?"
+            lines = {line[0]: line for line in self._execute(query, [(self._protocol_digest,)])}
+            for run_id in self.store.ids():
+                row = self._valid(*lines[run_id]) if run_id in lines else None
+                if row is not None:
+                    rows[run_id] = row
+        return rows
 
-        Raises:
-            DynslamError: It is damaged, or no longer there.
+    def take(self, run_ids: Sequence[str]) -> tuple[list[tuple[RunRow, str]], list[str]]:
+        """Read some runs and score them.
+
+        Returns:
+            The rows with the states of their files, and the folders without a valid record, with reasons.
         """
-        return self.store.read_whole(self.row.run_id)
+        rows = []
+        unreadable = []
+        for run_id in run_ids:
+            try:
+                run_state = self._folder_state("runs", run_id)  # before anything is read
+                row = make_row(self.store, self.store.read_whole(run_id), self.protocol)
+                rows.append((row, self._state(row, run_state)))
+            except DynslamError as error:
+                unreadable.append(f"{self.store.folder(run_id)}: {error}")
+        return rows, unreadable
 
-    def as_job(self) -> dict[str, Any]:
-        """The run for a helper process, see `reports.worker`."""
-        return {"store": str(self.store.root), "part": self.part, "row": self.row.model_dump(mode="json")}
+    def add(self, rows: Iterable[tuple[RunRow, str]]) -> None:
+        """Keep rows for later reports, as far as the store can be written."""
+        lines = []
+        for row, state in rows:
+            with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
+                lines.append((self._protocol_digest, row.run_id, state, row.model_dump_json(exclude_defaults=True)))
+        if lines:
+            self._execute("INSERT OR REPLACE INTO report_rows VALUES (?, ?, ?, ?)", lines)
 
-    def trajectory(self, which: Which) -> Trajectory | None:
-        """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
+    def _execute(self, statement: str, lines: Iterable[tuple[str, ...]]) -> list[tuple[str, str, str]]:
+        """What a statement answers to the last of some values; nothing where the index cannot be used."""
+        answer: list[tuple[str, str, str]] = []
+        if self._path.exists() and not self._path.is_file():  # e.g. a pipe, which blocks
+            return answer
         try:
-            return self.store.trajectory(self.row.run_id, which)
-        except DynslamError:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with closing(sqlite3.connect(self._path)) as index, index:
+                index.execute(_TABLE)
+                for line in lines:
+                    answer = index.execute(statement, line).fetchall()
+        except (OSError, sqlite3.OperationalError):  # read-only, or locked
+            return []
+        except sqlite3.DatabaseError:  # damaged
+            self._path.unlink(missing_ok=True)
+        return answer
+
+    def _valid(self, run_id: str, state: str, text: str) -> RunRow | None:
+        """The row of a line; None if it does not hold or is another run's."""
+        try:
+            row = RunRow.model_validate_json(text)
+            if (row.run_id, row.protocol_digest) != (run_id, self._protocol_digest):
+                return None
+            return row.stored_in(self.store) if state == self._state(row, self._folder_state("runs", run_id)) else None
+        except (ValidationError, DynslamError):  # damaged, or there is a link by now
             return None
 
-    def ground_truth(self) -> Trajectory | None:
-        """The ground truth of its part of the sequence; None if there is none, or it is damaged."""
-        try:
-            return self.store.ground_truth(self.part)
-        except DynslamError:
-            return None
+    def _state(self, row: RunRow, run_state: str) -> str:
+        """What a row was taken from: the code, the run's files, its stored errors and the ground truth."""
+        part = row.sequence.part
+        if part not in self._part_states:
+            try:
+                self._part_states[part] = self._folder_state("sequences", part)
+            except DynslamError:  # why the run cannot be evaluated
+                self._part_states[part] = ""
+        scored = stamp_if_there(self.store.metric_file(row.run_id, self._protocol_digest))
+        return digest([self._code, run_state, self._part_states[part], scored])
+
+    def _folder_state(self, kind: str, name: str) -> str:
+        return folder_state(self.store.root / kind / name, self.store.root)
+
+
+# -- runs that count
 
 
 @dataclass
@@ -84,7 +234,7 @@ class Loaded:
     """Everything read from the stores.
 
     Attributes:
-        runs: The newest run of every variant, column and repeat.
+        rows: The newest run of every variant, column and repeat.
         superseded: How many older ones there were.
         stopped: How many runs were left out since they were ended on request.
         without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
@@ -93,7 +243,7 @@ class Loaded:
         conflicts: Runs that should be equal and are not, in words.
     """
 
-    runs: list[LoadedRun] = field(default_factory=list)
+    rows: list[RunRow] = field(default_factory=list)
     superseded: int = 0
     stopped: int = 0
     without_scale: int = 0
@@ -101,67 +251,79 @@ class Loaded:
     unreadable: list[str] = field(default_factory=list)
     conflicts: list[str] = field(default_factory=list)
 
-    @cached_property
-    def by_id(self) -> dict[str, LoadedRun]:
-        """The runs by their id."""
-        return {run.row.run_id: run for run in self.runs}
-
 
 def load_runs(
-    sources: Sequence[RunStore],
+    stores: Sequence[RunStore],
     protocol: Protocol,
     on_progress: OnProgress = no_progress,
-    crew: Crew | None = None,
-    reference: str | None = None,
+    pool: Executor | None = None,
     *,
     trials: bool = False,
 ) -> Loaded:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
 
     Args:
-        sources: The stores.
+        stores: The stores.
         protocol: How to evaluate.
         on_progress: As in `build_report`.
-        crew: Helpers that score the runs; None to score them here.
-        reference: Id of a tracker of which there must be runs, looked for before anything is scored; None for any.
+        pool: Workers that score the runs; None to score them here.
         trials: Whether trials of studies count like other runs.
 
     Raises:
-        ReportError: There is no run at all, or none of the reference.
+        ReportError: There is no run at all.
     """
     on_progress(0, None, "looking for what has changed")
-    opened = [RowCache(store, protocol) for store in sources]
-    kept = [rows.read() for rows in opened]
-    _look_for(reference, opened, kept)
-    taken, unreadable = _take(opened, [unread for _, unread in kept], on_progress, crew)
-    everything = [
-        (store, each) for store, (known, _), new in zip(sources, kept, taken, strict=True) for each in (*known, *new)
-    ]
-    ended = [LoadedRun(each.row, each.part, store) for store, each in everything if each.row is not None]
-    scaled = [run for run in ended if protocol.finds_scale or not run.row.monocular]
-    found = [run for run in scaled if trials or not run.row.study]
-    loaded = Loaded(
-        stopped=len(everything) - len(ended), without_scale=len(ended) - len(scaled), trials=len(scaled) - len(found),
-        unreadable=unreadable,
-    )  # fmt: skip
-    _join_old_imports(found)
-    newest: dict[tuple[object, ...], LoadedRun] = {}
-    loaded.conflicts = _two_results(found)
-    for run in sorted(found, key=lambda run: (run.row.started, run.row.run_id)):
-        newest[run.row.settings_key, run.row.column_id, run.row.repeat_key, run.row.trajectory] = run
-    _split_programs([run.row for run in newest.values()])
-    loaded.superseded = len(found) - len(newest)
+    loaded = Loaded()
+    everything = _all_rows([RowCache(store, protocol) for store in stores], loaded, on_progress, pool)
+    ended = [row for row in everything if row.status != "stopped"]
+    scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
+    rows = [row for row in scaled if trials or not row.trial_of]
+    loaded.stopped = len(everything) - len(ended)
+    loaded.without_scale, loaded.trials = len(ended) - len(scaled), len(scaled) - len(rows)
+    loaded.conflicts = _two_results(rows)
+    newest: dict[tuple[object, ...], RunRow] = {}
+    for row in sorted(rows, key=lambda row: (row.started, row.run_id)):
+        newest[row.settings_key, row.column_id, row.repeat_key, row.trajectory] = row
+    _split_programs(newest.values())
+    loaded.superseded = len(rows) - len(newest)
+    loaded.rows = list(newest.values())
     if not newest and loaded.without_scale:
         raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
     if not newest and loaded.trials:
         raise ReportError(f"all {trial_words(loaded.trials)}")
     if not newest:
-        places = ", ".join(str(store.root) for store in sources)
-        raise ReportError(
-            f"there are no runs in {places}", loaded.unreadable[0] if loaded.unreadable else "make some with 'run'"
-        )
-    loaded.runs = list(newest.values())
+        places = ", ".join(str(store.root) for store in stores)
+        raise ReportError(f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'"))
     return loaded
+
+
+def _all_rows(
+    caches: Sequence[RowCache], loaded: Loaded, on_progress: OnProgress, pool: Executor | None
+) -> list[RunRow]:
+    """The rows of all runs of some stores: those that hold, and those that are read now."""
+    kept = [cache.read() for cache in caches]
+    jobs = []
+    size = 1 if pool is None else JOB
+    for cache, rows in zip(caches, kept, strict=True):
+        unread = [run_id for run_id in cache.store.ids() if run_id not in rows]
+        jobs += [(cache, unread[first : first + size]) for first in range(0, len(unread), size)]
+    total, done = sum(len(run_ids) for _, run_ids in jobs), 0
+
+    def on_answer(answer: tuple[list[tuple[RunRow, str]], list[str]]) -> None:
+        nonlocal done
+        rows, unreadable = answer
+        done += len(rows) + len(unreadable)
+        on_progress(done, total, f"scoring {rows[-1][0].tracker.id} on {rows[-1][0].sequence.id}" if rows else "")
+
+    taken: dict[int, list[tuple[RunRow, str]]] = {id(cache): [] for cache in caches}
+    for (cache, _), (rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
+        taken[id(cache)] += rows
+        loaded.unreadable += unreadable
+    everything = []
+    for cache, rows in zip(caches, kept, strict=True):
+        cache.add(taken[id(cache)])
+        everything += [*rows.values(), *(row for row, _ in taken[id(cache)])]
+    return everything
 
 
 def without_scale_words(count: int, protocol: Protocol) -> str:
@@ -180,62 +342,14 @@ def trial_words(count: int) -> str:
     )
 
 
-def _take(
-    opened: Sequence[RowCache], unread: Sequence[Sequence[str]], on_progress: OnProgress, crew: Crew | None
-) -> tuple[list[list[CachedRow]], list[str]]:
-    """The rows of the runs that are to be read, by store, and the folders without a valid record, with reasons."""
-    pieces = [(at, ids[first : first + JOB]) for at, ids in enumerate(unread) for first in range(0, len(ids), JOB)]
-    total, done = sum(map(len, unread)), 0
-
-    def heard(count: int, what: str) -> None:
-        nonlocal done
-        on_progress(done, total, what)
-        done += count
-
-    if crew is None:
-        answers = [opened[at].take_all(ids, lambda what: heard(1, what)) for at, ids in pieces]
-    else:
-        jobs = [{"store": str(opened[at].store.root), "runs": ids} for at, ids in pieces]
-        answers = crew.work("rows", jobs, heard, lambda answer: ([*map(CachedRow.answered, answer[0])], answer[1]))
-    taken: list[list[CachedRow]] = [[] for _ in opened]
-    for (at, _), (rows, _) in zip(pieces, answers, strict=True):
-        taken[at] += rows
-    return taken, [reason for _, unreadable in answers for reason in unreadable]
-
-
-def _look_for(
-    reference: str | None, opened: Sequence[RowCache], kept: Sequence[tuple[list[CachedRow], list[str]]]
-) -> None:
-    """Refuse a reference of which there is no run, before any run is scored.
-
-    Raises:
-        ReportError: As `check_reference`.
-    """
-    trackers = {each.row.tracker for known, _ in kept for each in known if each.row is not None}
-    for rows, (_, unread) in zip(opened, kept, strict=True):
-        for run_id in unread:
-            if reference is None or reference in trackers:
-                return
-            record = rows.store.get(run_id)
-            trackers |= set() if record is None or record.status == "stopped" else {record.tracker.id}
-    if trackers:
-        check_reference(reference, sorted(trackers))
-
-
-def _split_programs(rows: Sequence[RunRow]) -> None:
+def _split_programs(rows: Iterable[RunRow]) -> None:
     """Make the runs of each program a row of their own, where several made the runs of one tracker and its settings.
 
     Runs by an older program are not ranked, nor are those whose identity is not verified, which are always marked.
     """
-    groups: dict[str, list[RunRow]] = {}
-    for row in rows:
-        groups.setdefault(row.settings_key, []).append(row)
-    for group in groups.values():
-        values: dict[str, set[str]] = {}
-        for row in group:
-            for name, value in row.program.items():
-                values.setdefault(name, set()).add(value)
-        varying = {name for name, found in values.items() if len(found) > 1 or name == "identity"}
+    for group in grouped(rows, lambda row: row.settings_key).values():
+        parts = {name: {row.program.get(name) for row in group} - {None} for row in group for name in row.program}
+        varying = {name for name, values in parts.items() if len(values) > 1 or name == "identity"}
         for row in group:
             row.split_by = {name: value for name, value in row.program.items() if name in varying}
         last = max(group, key=lambda row: ("identity" not in row.split_by, row.started)).split_by
@@ -243,41 +357,15 @@ def _split_programs(rows: Sequence[RunRow]) -> None:
             row.is_current = row.split_by == last and "identity" not in row.split_by
 
 
-def _two_results(runs: Sequence[LoadedRun]) -> list[str]:
+def _two_results(rows: Iterable[RunRow]) -> list[str]:
     """Which runs of one id from several stores have different results although they should be equal, in words."""
     conflicts = []
-    by_id: dict[str, list[RunRow]] = {}
-    for run in runs:
-        by_id.setdefault(run.row.run_id, []).append(run.row)
-    for rows in by_id.values():
-        errors = sorted({row.metrics["ate_rmse_m"] for row in rows if "ate_rmse_m" in row.metrics})
-        if len(errors) > 1 and rows[0].deterministic:
-            found = ", ".join(f"{1000 * error:.3f}" for error in errors)
-            conflicts.append(f"{rows[0].label} on {rows[0].sequence} (run {rows[0].run_id}): ATE {found} mm")
+    for first, *others in grouped(rows, lambda row: row.run_id).values():
+        errors = sorted({row.metrics["ate_rmse_m"] for row in (first, *others) if "ate_rmse_m" in row.metrics})
+        if len(errors) > 1 and first.tracker.deterministic and not first.realtime:
+            results = ", ".join(f"{1000 * error:.3f}" for error in errors)
+            conflicts.append(f"{first.label} on {first.sequence.id} (run {first.run_id}): ATE {results} mm")
     return conflicts
-
-
-def _join_old_imports(runs: Sequence[LoadedRun]) -> None:
-    """Imports of older versions name no camera: they belong to the one column of the same frames, if there is one."""
-    columns: dict[str, set[str]] = {}
-    for run in runs:
-        if not run.row.imported:
-            columns.setdefault(run.part, set()).add(run.row.column_id)
-    for run in runs:
-        part = run.part
-        if run.row.imported and run.row.block == part and len(columns.get(part, ())) == 1:
-            (run.row.block,) = columns[part]
-
-
-def check_reference(reference: str | None, trackers: Sequence[str]) -> None:
-    """Refuse a reference that none of some runs' trackers is; None is none.
-
-    Raises:
-        ReportError: Names the reference, and the tracker that may have been meant.
-    """
-    known = sorted(set(trackers))
-    if reference is not None and reference not in known:
-        raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, known))
 
 
 def check_one_protocol(rows: Sequence[RunRow]) -> None:
@@ -286,10 +374,7 @@ def check_one_protocol(rows: Sequence[RunRow]) -> None:
     Raises:
         ReportError: Names the protocols and how many rows each has.
     """
-    counts: dict[tuple[str, str], int] = {}
-    for row in rows:
-        key = (row.protocol_id, row.protocol_digest)
-        counts[key] = counts.get(key, 0) + 1
+    counts = Counter((row.protocol_id, row.protocol_digest) for row in rows)
     if len(counts) > 1:
         named = " and ".join(f"{name} [{digest}] ({count} rows)" for (name, digest), count in sorted(counts.items()))
         raise ReportError(
@@ -309,248 +394,11 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     if not paths:
         raise ReportError("no results folder was given", "for example results")
     stores = []
-    for path in paths:
-        folder = path.expanduser()
+    for folder in (path.expanduser() for path in paths):
         if not folder.is_dir():
             raise ReportError(f"there is no results folder {folder}", "make runs first, or name their folder")
-        if folder.name == "runs" and not (folder / "runs").is_dir():
-            folder = folder.parent
-        if not (folder / "runs").is_dir():
+        root = folder.parent if folder.name == "runs" and not (folder / "runs").is_dir() else folder
+        if not (root / "runs").is_dir():
             raise ReportError(f"{folder} holds no runs: it has no folder 'runs'", "name the folder given as --results")
-        stores.append(RunStore(folder))
+        stores.append(RunStore(root))
     return stores
-
-
-# Rows that a report has taken before, kept in the store's index: an unchanged run is not read again.
-
-_CODE = ("evaluation", "geometry", "reports/model", "runs")
-_ROW: TypeAdapter[RunRow | None] = TypeAdapter(RunRow | None)
-
-
-@dataclass(frozen=True)
-class CachedRow:
-    """A run as a report takes it.
-
-    Attributes:
-        run_id: Its id.
-        state: Of its files, see `RunIndex.state`; the run's part of a sequence comes first.
-        row: Its row; None for a run that was stopped on request, which no report shows.
-    """
-
-    run_id: str
-    state: str
-    row: RunRow | None
-
-    @property
-    def part(self) -> str:
-        """The run's part of a sequence."""
-        return self.state.partition(" ")[0]
-
-    def answer(self) -> list[Any]:
-        """The same as a helper's answer."""
-        return [self.run_id, self.state, None if self.row is None else self.row.model_dump(mode="json")]
-
-    @classmethod
-    def answered(cls, answer: Sequence[Any]) -> CachedRow:
-        """What a helper has answered."""
-        return cls(answer[0], answer[1], None if answer[2] is None else RunRow.model_validate(answer[2]))
-
-
-class RowCache:
-    """The rows of a store's runs under a protocol.
-
-    Args:
-        store: The store.
-        protocol: How errors are computed.
-
-    Attributes:
-        store: The store.
-    """
-
-    def __init__(self, store: RunStore, protocol: Protocol) -> None:
-        self.store, self._protocol = store, protocol
-        self._name = f"report {protocol.digest()}"
-        self._version = digest([dynslam_bench.__version__, package_digest(_CODE)])
-
-    def read(self) -> tuple[list[CachedRow], list[str]]:
-        """All that hold, and the ids of the runs of which none does."""
-        stored = self.store.ids()
-        rows = []
-        for run_id, text in self.store.index.read(self._name, self._version, stored, check_links=True).items():
-            with suppress(ValueError):
-                state, value = json.loads(text)
-                row = _ROW.validate_python(value)
-                if row is None or (row.run_id, row.protocol_digest) == (run_id, self._protocol.digest()):
-                    rows.append(CachedRow(run_id, str(state), row))
-        for cached in rows:
-            if cached.row is not None:
-                cached.row.log = log_of(self.store, cached.run_id)
-        there = {cached.run_id for cached in rows}
-        return rows, [run_id for run_id in stored if run_id not in there]
-
-    def take_all(self, run_ids: Iterable[str], told: Callable[[str], None]) -> tuple[list[CachedRow], list[str]]:
-        """Read some runs, score them, and keep their rows for later reports, as far as the store can be written.
-
-        Args:
-            run_ids: Their ids.
-            told: Called with what was done, once a run.
-
-        Returns:
-            The rows, and the folders without a valid record, with reasons.
-        """
-        taken: list[CachedRow] = []
-        unreadable: list[str] = []
-        for run_id in run_ids:
-            try:
-                record, state = self.store.read_with_state(run_id)
-                row = None if record.status == "stopped" else make_row(self.store, record, self._protocol)
-                taken.append(CachedRow(run_id, state, row))
-                told("" if row is None else f"scoring {row.tracker} on {row.sequence}")
-            except DynslamError as error:
-                unreadable.append(f"{self.store.folder(run_id)}: {error}")
-                told("")
-        entries = []
-        for cached in taken:
-            value = None if cached.row is None else cached.row.model_dump(mode="json", exclude={"log"})
-            entries.append((cached.run_id, cached.state, json.dumps([cached.state, value])))
-        self.store.index.write(self._name, self._version, entries)
-        return taken, unreadable
-
-
-# Helper processes of a report: thousands of runs are read, scored and drawn on all cores.
-
-MODULE = "dynslam_bench.reports.worker"
-MANY = 250
-"""Runs from which on helpers save more time than they need to start."""
-MOST = 8
-JOB = 40
-"""Runs of one job, at most."""
-
-Heard = Callable[[int, str], None]
-"""Called as ``heard(runs that were done, what was done)``, by one thread at a time."""
-
-
-def unheard_run(done: int, what: str) -> None:
-    """Progress that nobody wants to hear of."""
-
-
-def helpers_for(runs: int) -> int:
-    """How many helpers so many runs are worth on this machine; 0 for none."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST) if runs >= MANY and cores > 1 else 0
-
-
-class Crew:
-    """Some helpers, who go with the block that they were hired for.
-
-    Args:
-        count: How many.
-        setup: What all of them have to know, see `reports.worker`.
-
-    Raises:
-        InfrastructureError: They cannot be started.
-    """
-
-    def __init__(self, count: int, setup: Mapping[str, Any]) -> None:
-        self._helpers: list[subprocess.Popen[str]] = []
-        try:
-            for _ in range(count):
-                self._helpers.append(
-                    subprocess.Popen(
-                        [sys.executable, "-m", MODULE],
-                        stdin=subprocess.PIPE,
-                        stdout=subprocess.PIPE,
-                        text=True,
-                        encoding="utf-8",
-                        env=child_environment(),
-                        start_new_session=True,  # Ctrl-C is for us; they end when their input does
-                    )
-                )
-                _send(self._helpers[-1], dict(setup))
-        except OSError as error:
-            self.__exit__(None, None, None)
-            raise InfrastructureError(f"cannot start {sys.executable}: {error.strerror}") from error
-
-    def __enter__(self) -> Crew:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        for helper in self._helpers:
-            helper.kill()
-        for helper in self._helpers:
-            with suppress(OSError):  # what was not sent yet goes nowhere
-                helper.communicate()
-
-    def work(
-        self,
-        kind: str,
-        jobs: Sequence[Mapping[str, Any]],
-        heard: Heard,
-        understood: Callable[[Any], Any] = lambda answer: answer,
-    ) -> list[Any]:
-        """Share jobs out among the helpers, the next job to whoever is free.
-
-        Args:
-            kind: A function of `reports.worker`.
-            jobs: What each is called with.
-            heard: Told of every run that is done.
-            understood: Makes of an answer, as soon as it is there, what is kept of it.
-
-        Returns:
-            The answers in the order of the jobs.
-
-        Raises:
-            ReportError: A job cannot be done.
-            InfrastructureError: A helper has died.
-        """
-        open_jobs: queue.SimpleQueue[int] = queue.SimpleQueue()
-        for number in range(len(jobs)):
-            open_jobs.put(number)
-        answers: list[Any] = [None] * len(jobs)
-        faults: list[Exception] = []
-        lock = threading.Lock()
-
-        def tell(done: int, what: str) -> None:
-            with lock:
-                heard(done, what)
-
-        def serve(helper: subprocess.Popen[str]) -> None:
-            with suppress(queue.Empty):
-                while not faults:
-                    number = open_jobs.get_nowait()
-                    try:
-                        answers[number] = understood(_asked(helper, kind, jobs[number], tell))
-                    except Exception as error:  # raised again below, by the thread that asked
-                        faults.append(error)
-
-        threads = [threading.Thread(target=serve, args=(helper,), daemon=True) for helper in self._helpers]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        if faults:
-            raise faults[0]
-        return answers
-
-
-def _send(helper: subprocess.Popen[str], message: Mapping[str, Any]) -> None:
-    assert helper.stdin is not None
-    helper.stdin.write(json.dumps(message) + "\n")
-    helper.stdin.flush()
-
-
-def _asked(helper: subprocess.Popen[str], kind: str, job: Mapping[str, Any], tell: Heard) -> Any:
-    """The answer of one helper to one job."""
-    assert helper.stdout is not None
-    with suppress(BrokenPipeError):  # it is gone: there is no answer either
-        _send(helper, {"kind": kind, "job": job})
-        for line in helper.stdout:
-            said = json.loads(line)
-            if "answer" in said:
-                return said["answer"]
-            if "fault" in said:
-                raise ReportError(*said["fault"])
-            tell(said["done"], said["what"])
-    raise InfrastructureError(f"a helper process of the report ended early (exit status {helper.wait()})")

@@ -8,27 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.toml import label_text, setting_text
-from dynslam_bench.reports.model.row import SEEN, RunRow
+from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
 
 
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
     """A name for every column, no two alike.
 
-    Recordings that share a name are told apart by the last parts of their folders' paths, then by camera, content and
-    frames: ``chess/seq-01`` and ``fire/seq-01``.
+    Recordings that share a name are distinguished by the last parts of their folders' paths, then by camera, content
+    and frames: ``chess/seq-01`` and ``fire/seq-01``.
 
     Returns:
         Column id (see `RunRow.column_id`) to its name.
     """
-    first: dict[str, RunRow] = {}
-    for row in sorted(rows, key=lambda row: (row.noise is not None, row.offset, len(_name(row)), _name(row))):
-        first.setdefault(row.column_id, row)
-    alike: dict[str, dict[str, RunRow]] = {}
-    for column, row in first.items():
-        alike.setdefault(_name(row), {})[column] = row
+    plainest = sorted(rows, key=lambda r: (r.sequence.noise is not None, r.offset, len(_name(r)), _name(r)))
+    columns = [of_column[0] for of_column in grouped(plainest, lambda row: row.column_id).values()]
     names: dict[str, str] = {}
-    for name, group in alike.items():
-        names |= {column: name for column in group} if len(group) == 1 else _told_apart(name, group)
+    for name, group in grouped(columns, _name).items():
+        names |= _distinct(name, {row.column_id: row for row in group})
     return names
 
 
@@ -61,13 +57,16 @@ def _split(name: str) -> tuple[str, list[str], str]:
 
 def _name(row: RunRow) -> str:
     """Sequence without its noise, and part of it."""
-    base, _, query = row.sequence.partition("?")
+    base, _, query = row.sequence.id.partition("?")
     kept = "&".join(word for word in query.split("&") if word and not word.startswith("noise="))
-    return base + (f"?{kept}" if kept else "") + (f" [{row.frames}]" if row.frames else "")
+    return base + (f"?{kept}" if kept else "") + (f" [{row.frame_words}]" if row.frame_words else "")
 
 
-def _told_apart(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
+def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
+    """Names of columns that would all have one name."""
     names = dict.fromkeys(group, name)
+    if len(group) == 1:
+        return names
     places = {column: Path(row.place).parts for column, row in group.items()}
     if all(places.values()):
         for length in range(1, max(map(len, places.values())) + 1):
@@ -77,19 +76,29 @@ def _told_apart(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
                 names = {column: tail + part for column, tail in tails.items()}
                 break
     marks: tuple[Callable[[str, RunRow], str], ...] = (
-        lambda _, row: row.camera,
-        lambda _, row: f"content {row.content[:6]}" if row.content else "",
+        lambda _, row: _camera_words(row),
+        lambda _, row: f"content {row.sequence.content[:6]}" if row.sequence.content else "",
         lambda column, _: f"frames {column[:6]}",
         lambda column, _: column,
     )
     for mark in marks:
         words = {column: mark(column, row) for column, row in group.items()}
         if len(set(names.values())) < len(names) and len(set(words.values())) > 1:
-            names = {column: f"{each} ({words[column]})" if words[column] else each for column, each in names.items()}
+            names = {column: f"{name} ({words[column]})" if words[column] else name for column, name in names.items()}
     return names
 
 
-# What the rows of a table are called.
+def _camera_words(row: RunRow) -> str:
+    """The camera in a few words, empty if the record does not name it."""
+    camera = row.identity.get("camera")
+    if not isinstance(camera, dict) or not {"width", "height", "fx", "fy"} <= camera.keys():
+        return ""
+    width, height, fx, fy = (
+        f"{value:g}" if isinstance(value, int | float) else str(value)
+        for value in (camera[name] for name in ("width", "height", "fx", "fy"))
+    )
+    return f"camera {width}x{height}, f {fx} {fy}"
+
 
 ALWAYS = ("map", "backend.map.localisation_only")
 """Named in any table: a run that begins in a map knows more than one that begins without."""
@@ -104,29 +113,25 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     runs, is not.
     Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
     """
-    seen = {row.variant_key for row in rows if row.seen_in_training}
-    variants: dict[str, RunRow] = {}
-    for row in rows:
-        variants.setdefault(row.variant_key, row)
-    by_tracker: dict[str, list[RunRow]] = {}
-    by_label: dict[str, set[str]] = {}
-    for row in variants.values():
-        by_tracker.setdefault(row.tracker, []).append(row)
-        by_label.setdefault(row.label, set()).add(row.tracker)
-    differing_of = {tracker: _differing(others) for tracker, others in by_tracker.items()}
-    single = {tracker: _single(tracker, by_tracker) for tracker in by_tracker}
-    kinds = {tracker: {other.kind for other in others} for tracker, others in by_tracker.items()}
+    in_training = {row.variant_key for row in rows if row.seen_in_training}
+    variants = {key: of_key[0] for key, of_key in grouped(rows, lambda row: row.variant_key).items()}
+    by_tracker = grouped(variants.values(), lambda row: row.tracker.id)
+    by_label = grouped(variants.values(), lambda row: row.label)
+    shown = {tracker: {*ALWAYS, *_differing(others)} for tracker, others in by_tracker.items()}
+    asked = {tracker: {name for row in others for name in row.variant} for tracker, others in by_tracker.items()}
+    for tracker, names in asked.items():  # what this tracker alone was asked for
+        shown[tracker] |= names.difference(OF_ALL, *(others for other, others in asked.items() if other != tracker))
+    texts = _short_texts(value for row in variants.values() for value in row.variant.values())
     labels = {}
-    values = [value for row in variants.values() for value in row.variant.values()]
-    texts = _short_texts(values)
     for key, row in variants.items():
-        shown = {*differing_of[row.tracker], *ALWAYS, *single[row.tracker]}
-        parts = [f"{name}={texts[setting_text(value)]}" for name, value in sorted(row.variant.items()) if name in shown]
+        tracker = row.tracker.id
+        settings = {name: value for name, value in sorted(row.variant.items()) if name in shown[tracker]}
+        parts = [f"{name}={texts[setting_text(value)]}" for name, value in settings.items()]
         parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
-        if row.imported and len(kinds[row.tracker]) > 1:
+        if row.imported and not all(other.imported for other in by_tracker[tracker]):
             parts.append("imported")
-        base = f"{row.label} <{row.tracker}>" if len(by_label[row.label]) > 1 else row.label
-        labels[key] = base + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in seen)
+        name = f"{row.label} <{tracker}>" if len({other.tracker.id for other in by_label[row.label]}) > 1 else row.label
+        labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
     return labels
 
 
@@ -134,13 +139,7 @@ def _short_texts(values: Iterable[Any]) -> dict[str, str]:
     """Values as texts, each with its short form; whole where two values have the same short form."""
     short = {text: label_text(text) for text in map(setting_text, values)}
     counts = Counter(short.values())
-    return {text: each if counts[each] == 1 else text for text, each in short.items()}
-
-
-def _single(tracker: str, by_tracker: Mapping[str, Sequence[RunRow]]) -> list[str]:
-    """What only this tracker was asked for."""
-    asked = {each: {name for row in rows for name in row.variant} - OF_ALL for each, rows in by_tracker.items()}
-    return sorted(asked[tracker].difference(*(names for each, names in asked.items() if each != tracker)))
+    return {text: label if counts[label] == 1 else text for text, label in short.items()}
 
 
 def _differing(variants: Sequence[RunRow]) -> list[str]:

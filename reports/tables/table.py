@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 import unicodedata
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from math import ceil
 from typing import Literal
 
-import numpy as np
 import pandas as pd
-from pandas.api.types import is_float_dtype, is_numeric_dtype
 
 from dynslam_bench.core.sanitise import printable
 
@@ -92,60 +88,38 @@ def number(value: float | None, digits: str = "", unit: str = "") -> TableCell:
     return TableCell((format(value, digits) if digits else repr(value)) + unit, value=value)
 
 
+@dataclass
 class Table:
-    """A table with a caption that says how to read it: a frame of what is shown and a frame of what is behind it.
+    """A table with a caption that says how to read it; pages, Markdown, CSV and LaTeX are made of it.
 
     Attributes:
         id: Short name, also the CSV file's.
         title: Heading.
         caption: Everything a reader needs, including the protocol.
         columns: The columns.
-        rows: What is displayed, by row.
-        shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
-        values: The numbers behind it with all their digits, in the units that the caption and the headings name
-            (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
-            ``Int64`` if all their numbers are whole, else ``Float64``; ``pd.NA`` where the cell has no number. Columns
-            of text are ``string``.
+        rows: A cell for every column, by row.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
         brief: Caption where there is little room, without the full stop: what is shown, and its unit.
     """
 
-    def __init__(
-        self,
-        id: str,
-        title: str,
-        caption: str,
-        columns: Sequence[Column],
-        rows: Sequence[Sequence[TableCell]],
-        muted_rows: Collection[int] = (),
-        separators: Collection[int] = (),
-        brief: str = "",
-    ) -> None:
-        """A table of rows with one cell for every column.
-
-        Raises:
-            ValueError: A row has another number of cells than there are columns.
-        """
-        self.id, self.title, self.caption, self.brief = id, title, caption, brief or title
-        self.columns = list(columns)
-        self.muted_rows, self.separators = set(muted_rows), set(separators)
-        self.rows = [list(row) for row in rows]
-        self.shown = pd.DataFrame(self.rows, columns=range(len(self.columns)), dtype=object)
-        series = [_values(column, self.shown[at]) for at, column in enumerate(self.columns)]
-        self.values = pd.concat(series, axis=1)
-        self.shown.columns = self.values.columns = pd.Index([column.key for column in self.columns])
+    id: str
+    title: str
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[TableCell]]
+    muted_rows: Collection[int] = ()
+    separators: Collection[int] = ()
+    brief: str = ""
 
     def frame(self) -> pd.DataFrame:
-        """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
-        columns = [
-            [
-                _words(cell) if value is pd.NA else value
-                for value, cell in zip(values.astype(object), shown, strict=True)
-            ]
-            for (_, values), (_, shown) in zip(self.values.items(), self.shown.items(), strict=True)
-        ]
-        return pd.DataFrame(list(zip(*columns, strict=True)), columns=self.values.columns, dtype=object)
+        """What CSV holds, in columns named by `Column.key`.
+
+        Numbers have all their digits, in the units that the caption and the headings name (errors in metres, times in
+        milliseconds, shares from 0 to 1); other cells have their words.
+        """
+        lines = [[_words(cell) if cell.value is None else cell.value for cell in row] for row in self.rows]
+        return pd.DataFrame(lines, columns=[column.key for column in self.columns], dtype=object)
 
     def displayed(self) -> Table:
         """The table as pages, Markdown and LaTeX show it; CSV has all.
@@ -163,13 +137,7 @@ class Table:
 
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
-        found: list[tuple[str, int]] = []
-        for column in self.columns:
-            if found and found[-1][0] == column.group:
-                found[-1] = (column.group, found[-1][1] + 1)
-            else:
-                found.append((column.group, 1))
-        return found
+        return [(name, len(list(group))) for name, group in groupby(self.columns, key=lambda column: column.group)]
 
 
 def to_markdown(table: Table) -> str:
@@ -197,37 +165,18 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(map(_harmless, frame.columns))
-    writer.writerows(zip(*(_written(values) for _, values in frame.items()), strict=True))
-    return text.getvalue()
-
-
-def _written(values: pd.Series) -> list[object]:
-    """What CSV says of a column; what cannot be harmful is not looked at one by one: there may be millions of it."""
-    if is_float_dtype(values.dtype):
-        numbers = values.to_numpy(dtype=np.float64, na_value=np.nan).tolist()
-        return [None if number != number else number for number in numbers]
-    found = values.astype(object)
-    if is_numeric_dtype(values.dtype):
-        return list(found.where(values.notna(), None))
-    if values.dtype == "string":
-        known = {word: _harmless(word) for word in set(found)}
-        return [known[word] for word in found]
-    return [_harmless(value) for value in found]
+    written = frame.rename(columns=_harmless)
+    for name in written.columns:
+        if written[name].dtype in ("object", "string"):
+            written[name] = written[name].astype(object).map(_harmless)
+    return written.to_csv(index=False, lineterminator="\n")
 
 
 def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
     """Best and second best (smallest) of a column; equal values share the mark."""
     present = sorted({value for value in values if value is not None})
-    marks: list[Emphasis] = []
-    for value in values:
-        if value is None or len(present) < 2:
-            marks.append("")
-        else:
-            marks.append("best" if value == present[0] else "second" if value == present[1] else "")
-    return marks
+    marks: dict[float, Emphasis] = dict(zip(present, ("best", "second"), strict=False)) if len(present) > 1 else {}
+    return ["" if value is None else marks.get(value, "") for value in values]
 
 
 def prose(text: str) -> str:
@@ -249,27 +198,14 @@ def _markdown_cell(cell: TableCell) -> str:
     return " ".join(part for part in parts if part)
 
 
-def _values(column: Column, shown: pd.Series) -> pd.Series:
-    """The numbers behind the cells of a column, or its words."""
-    if not column.numeric and all(cell.value is None for cell in shown):
-        return shown.map(_words).astype("string").rename(column.key)
-    found = [cell.value for cell in shown]
-    present = [value for value in found if value is not None]
-    whole = bool(present) and all(isinstance(value, int) for value in present)
-    return pd.Series(found, dtype="Int64" if whole else "Float64", name=column.key)
-
-
 def _words(cell: TableCell) -> str:
     return " ".join(part for part in (cell.text, cell.small, cell.tag) if part)
 
 
 def _harmless(value: object) -> object:
     if not isinstance(value, str):
-        return None if value is pd.NA or value != value else value
+        return value
     return ("'" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else "") + printable(value)
-
-
-# How numbers are written: millimetres with three significant digits, never more certainty than there is.
 
 
 def mm(metres: float) -> str:
@@ -294,8 +230,6 @@ def percent(share: float) -> str:
         return f"{100 * share:.1f} %" if 0.0005 <= share < 0.9995 else ("< 0.1 %" if share < 0.5 else "> 99.9 %")
     return f"{rounded} %"
 
-
-# Tables for LaTeX: `booktabs`, short captions, and as many floats as it takes to fit one column of a page.
 
 COLUMN_PT = 229.0
 """Width of a column of a two-column article; those of the common conference styles are wider."""
@@ -364,26 +298,21 @@ def _character(character: str) -> str:
     if "\u00c0" <= character <= "\u017e" and character not in "×÷":
         return character
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
-    return "".join(_LATEX.get(each, each) for each in plain) if plain else f"[U+{ord(character):04X}]"
+    return "".join(_LATEX.get(letter, letter) for letter in plain) if plain else f"[U+{ord(character):04X}]"
 
 
 def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> str:
-    words = [table.brief] + [f"protocol {protocol}"] * bool(protocol) + ["continued"] * bool(number)
-    caption = escape_latex(", ".join(words))
-    label = f"tab:{table.id}" + (f"-{number + 1}" if number else "")
-    starred = any(_STAR in block for block in blocks)
-    note = " $^*$\\,our back end." if starred else ""
-    return "\n".join(
-        [
-            "\\begin{table}[htbp]",
-            "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
-            f"\\caption{{{caption}.{note}}}",
-            f"\\label{{{label}}}",
-            "\n\\par\\medskip\n".join(blocks),
-            "\\end{table}",
-            "",
-        ]
-    )
+    words = [table.brief or table.title] + [f"protocol {protocol}"] * bool(protocol) + ["continued"] * bool(number)
+    note = " $^*$\\,our back end." if any(_STAR in block for block in blocks) else ""
+    lines = [
+        "\\begin{table}[htbp]",
+        "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
+        f"\\caption{{{escape_latex(', '.join(words))}.{note}}}",
+        f"\\label{{tab:{table.id}{f'-{number + 1}' if number else ''}}}",
+        "\n\\par\\medskip\n".join(blocks),
+        "\\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _blocks(table: Table) -> list[list[int]]:
@@ -391,32 +320,24 @@ def _blocks(table: Table) -> list[list[int]]:
     shown = [at for at, column in enumerate(table.columns) if column.latex]
     names = next((at for at in shown if not table.columns[at].numeric), 0)
     widths = {at: _width_pt(table, at) for at in shown}
-    room = COLUMN_PT - min(widths.get(names, 0.0), _NAMES_PT)
-    found: list[list[int]] = [[]]
+    available = COLUMN_PT - min(widths.get(names, 0.0), _NAMES_PT)
+    blocks: list[list[int]] = [[]]
     for at in (at for at in shown if at != names):
-        if found[-1] and _together_pt(table, [*found[-1], at], widths) > room:
-            found.append([])
-        found[-1].append(at)
-    return [[names, *columns] for columns in found]
-
-
-def _together_pt(table: Table, columns: Sequence[int], widths: Mapping[int, float]) -> float:
-    """About how wide neighbouring columns are, in points, with the headings above several of them."""
-    return sum(
-        max(sum(widths[at] + _GAP_PT for at in group), _text_pt(name) + _GAP_PT)
-        for name, run in groupby(columns, key=lambda at: table.columns[at].group)
-        for group in [list(run)]
-    )
+        by_group = groupby([*blocks[-1], at], key=lambda other: table.columns[other].group)
+        groups = [(name, sum(widths[other] + _GAP_PT for other in group)) for name, group in by_group]
+        if blocks[-1] and sum(max(width, _text_pt(name) + _GAP_PT) for name, width in groups) > available:
+            blocks.append([])
+        blocks[-1].append(at)
+    return [[names, *columns] for columns in blocks]
 
 
 def _width_pt(table: Table, at: int) -> float:
     """About how wide a column is, in points."""
-    words = [_plain(row[at]) for row in table.rows] + _heading(table.columns[at].name)
-    return max(map(_text_pt, words))
+    return max(map(_text_pt, [*(_plain(row[at]) for row in table.rows), *_heading(table.columns[at].name)]))
 
 
 def _text_pt(text: str) -> float:
-    return sum(_DIGIT_PT if each.isdigit() else _LETTER_PT for each in text)
+    return sum(_DIGIT_PT if character.isdigit() else _LETTER_PT for character in text)
 
 
 def _heading(name: str) -> list[str]:

@@ -34,10 +34,9 @@ Grid = dict[str, Errors]
 def recorded(folders: list[Path]) -> Grid:
     """ATE in metres of every configuration on the instances that all of them ran on."""
     grid: Grid = {}
-    for run in load_runs([RunStore(folder) for folder in folders], get_protocol("tum-rgbd/v1"), trials=True).runs:
-        row = run.row
+    for row in load_runs([RunStore(folder) for folder in folders], get_protocol("tum-rgbd/v1"), trials=True).rows:
         if row.score_m is not None:
-            grid.setdefault(row.variant_key, {})[ProblemInstance(row.sequence, offset=row.offset, seed=row.seed)] = (
+            grid.setdefault(row.variant_key, {})[ProblemInstance(row.sequence.id, offset=row.offset, seed=row.seed)] = (
                 row.score_m
             )
     most = max(map(len, grid.values()))

@@ -8,12 +8,15 @@ import pytest
 
 from dynslam_bench.cli import demo as demo_story
 from dynslam_bench.cli.demo import PROBE_FRAMES, PROBE_S, estimate, measure, tell
+from dynslam_bench.core.records import digest
 from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.runs.record import SequenceInfo, TrackerInfo
 
 
 def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100") -> RunRow:
     return RunRow(
-        run_id=f"{tracker}{sequence}", kind="run here", tracker=tracker, label=tracker, sequence=sequence,
+        run_id=digest([tracker, sequence], 16), status="ok", n_frames=100, tracker=TrackerInfo(id=tracker, label=tracker),
+        sequence=SequenceInfo(id=sequence, part="0" * 16, frames=100, duration_s=3.3, fps=30, ground_truth=True),
         protocol_id="p", protocol_digest="d", hold_last_pose_ate_m=ate_m,
     )  # fmt: skip
 

@@ -34,16 +34,6 @@ def test_tables_in_every_format():
     assert r"a\textbar{}b\_* & \textbf{0.5} &  \\" in latex
 
 
-def test_a_table_is_two_frames():
-    cells = [[TableCell("a"), TableCell("0.5", "±0.1", 0.51234), TableCell("3", value=3)]]
-    cells.append([TableCell("b"), TableCell("–"), TableCell()])
-    table = Table("t", "T", "c", [Column("name", numeric=False), Column("x"), Column("y")], cells)
-    assert table.rows == cells
-    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "Float64", "y": "Int64"}
-    assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
-    assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"
-
-
 def test_a_column_in_which_nothing_is_written_is_in_the_csv_only():
     columns = [Column("tracker", numeric=False), Column("p"), Column("ATE")]
     rows = [[TableCell("a"), TableCell(), TableCell("1.0", value=1.0)]]
