@@ -91,7 +91,7 @@ def evaluate(
     Raises:
         InstanceFailedError: A run crashed, timed out, ran out of memory or was invalid; the others are not waited for.
         CancelledError: `cancelled` said so.
-        DynslamError: Tracker, settings or a instance are unknown or unfit; nothing ran.
+        DynslamError: Tracker, settings or an instance are unknown or unfit; nothing ran.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     held, instances, stop = held_protocol(protocol), list(instances), [False]
@@ -153,7 +153,7 @@ def held_protocol(protocol: Protocol | str) -> Protocol:
 
 @lru_cache(maxsize=256)
 def static_camera_m(instance: ProblemInstance, data_root: str | None) -> float:
-    """ATE RMSE in metres of a camera that never moves on a instance, from the ground truth of its frames alone."""
+    """ATE RMSE in metres of a camera that never moves on an instance, from the ground truth of its frames alone."""
     sequence: Any = instance.open(data_root)
     truth, stamps = sequence.ground_truth, sequence.timestamps
     positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]

@@ -76,7 +76,7 @@ class Objective:
         return ranked[: max(1, round(WORST_SHARE * len(ranked)))] if self.worst else ranked
 
     def counts(self, instance: ProblemInstance) -> bool:
-        """Whether a instance counts."""
+        """Whether an instance counts."""
         return not self.degraded or any(strength > 0 for _, strength in instance.degradation)
 
 

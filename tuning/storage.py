@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import json
 import os
-import pickle
-import pickletools
 import random
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
 from pathlib import Path
 from typing import IO, Any
 from urllib.parse import unquote, urlsplit
 
 import optuna
+import psutil
 from optuna.exceptions import StorageInternalError
-from optuna.samplers import _cmaes as optuna_cmaes
 from optuna.storages import BaseStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
-from sqlalchemy import event
 from sqlalchemy.exc import DBAPIError
 
 from dynslam_bench.core.errors import StudyError
@@ -31,6 +26,9 @@ from dynslam_bench.core.passwords import HIDDEN, without_passwords
 from dynslam_bench.tuning.study_file import StudySpec
 
 JOURNAL = "journal.log"
+_ATTEMPTS = 10
+_BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
+"""What drivers say where another worker makes the tables at the same time."""
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
@@ -61,6 +59,25 @@ def open_storage(results: Path, spec: StudySpec) -> optuna.storages.BaseStorage:
         raise StudyError(said, "check the address and the permissions") from None
 
 
+def open_database(url: str) -> BaseStorage:
+    """Open a database, and make its tables if it is empty.
+
+    Workers may begin at the same time: one whose tables another worker makes meanwhile tries again.
+
+    Raises:
+        Exception: What the database's driver raises.
+    """
+    for attempt in range(_ATTEMPTS):
+        try:
+            return optuna.storages.get_storage(RDBStorage(url, engine_kwargs={"pool_pre_ping": True}))
+        except (DBAPIError, StorageInternalError) as error:
+            cause = str(error.__cause__ or error).lower()
+            if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _BEING_MADE):
+                raise
+            time.sleep(random.uniform(0.05, 0.5))
+    raise AssertionError("unreachable")
+
+
 def worker_name() -> str:
     """Names this process: host and process number."""
     return f"{socket.gethostname()}:{os.getpid()}"
@@ -72,19 +89,9 @@ def worker_is_dead(name: str) -> bool:
     if host != socket.gethostname() or not pid.isdigit():
         return False
     try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
+        return psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
         return True
-    except PermissionError:
-        return False
-    return _is_zombie(int(pid))
-
-
-def _is_zombie(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return False
 
 
 def _proxy(address: str) -> optuna.storages.BaseStorage:
@@ -118,71 +125,6 @@ def without_password(text: str, address: str) -> str:
     for secret in {password, unquote(password)} - {""}:
         text = text.replace(secret, HIDDEN)
     return without_passwords(text)
-
-
-# A study's database: its tables are made once, whoever begins at the same time, and a restart of it is waited for.
-
-RESTART_S = 60.0
-"""So long a database may be away in mid-study before its workers give up."""
-_ATTEMPTS = 10
-_MADE_MEANWHILE = ("already exists", "duplicate", "unique constraint", "is locked")
-
-
-def open_database(url: str) -> BaseStorage:
-    """Open a database, and make its tables if it is empty.
-
-    Raises:
-        Exception: It cannot be opened; what its driver raises.
-    """
-    for attempt in range(_ATTEMPTS):
-        try:
-            return optuna.storages.get_storage(_PatientStorage(url, engine_kwargs={"pool_pre_ping": True}))
-        except (DBAPIError, StorageInternalError) as error:
-            cause = str(error.__cause__ or error).lower()
-            if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _MADE_MEANWHILE):
-                raise
-            time.sleep(random.uniform(0.05, 0.5))  # another worker is making the tables
-    raise AssertionError("unreachable")
-
-
-def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
-    """The method, done once more if the connection broke in the middle; the new connection waits for the server."""
-
-    @wraps(method)
-    def again(*arguments: Any, **named: Any) -> Any:
-        try:
-            return method(*arguments, **named)
-        except (DBAPIError, StorageInternalError) as error:
-            cause = error if isinstance(error, DBAPIError) else error.__cause__
-            if not (isinstance(cause, DBAPIError) and cause.connection_invalidated):
-                raise
-            return method(*arguments, **named)
-
-    return again
-
-
-class _PatientStorage(RDBStorage):
-    """Optuna's storage; its connections outlast a restart of the server."""
-
-    def __init__(self, url: str, **options: Any) -> None:
-        super().__init__(url, **options)
-        event.listen(self.engine, "do_connect", _connect)
-
-
-for _name in BaseStorage.__abstractmethods__:
-    setattr(_PatientStorage, _name, _patient(getattr(RDBStorage, _name)))
-
-
-def _connect(dialect: Any, _: object, arguments: list[Any], named: dict[str, Any]) -> Any:
-    """Connect, again and again while the server does not answer; only the first connection of all fails at once."""
-    deadline = time.monotonic() + RESTART_S
-    while True:
-        try:
-            return dialect.connect(*arguments, **named)
-        except dialect.loaded_dbapi.OperationalError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(1.0)
 
 
 # The journal file of a study: Optuna's, but no kill and no full disk can spoil it.
@@ -260,54 +202,3 @@ def _append(file: IO[bytes], end: int, text: bytes) -> None:
     except OSError:
         file.truncate(end)
         raise
-
-
-# CMA-ES without the run of code: Optuna keeps its state in the study's storage as a pickle.
-
-_NUMPY = ("numpy._core", "numpy.core")
-_ALLOWED = {
-    ("cmaes._cma", "CMA"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    *((f"{core}.multiarray", name) for core in _NUMPY for name in ("_reconstruct", "scalar")),
-    *((f"{core}.numeric", "_frombuffer") for core in _NUMPY),
-}
-
-
-class _State(pickle.Unpickler):
-    """Reads a state of CMA-ES and nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"it names {module}.{name}")
-        return super().find_class(module, name)
-
-
-class _OnlyStates:
-    """Stands in for the module ``pickle`` where Optuna's CMA-ES reads its state."""
-
-    dumps = staticmethod(pickle.dumps)
-
-    @staticmethod
-    def loads(data: bytes) -> Any:
-        try:
-            for operation, argument, _ in pickletools.genops(data):
-                if operation.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > len(data):
-                    raise pickle.UnpicklingError(f"it asks for room for {argument} objects")
-            return _State(io.BytesIO(data)).load()
-        except Exception as error:  # a pickle that somebody made can raise whatever it likes
-            raise StudyError(
-                f"the study's storage holds no state of CMA-ES but something else: {str(error)[:200]}",
-                "it was tampered with or is damaged; use another sampler, or a storage of your own",
-            ) from error
-
-
-def restrict() -> None:
-    """Let Optuna's CMA-ES restore nothing but its own state, in this process.
-
-    Raises:
-        StudyError: This Optuna reads its state in another way, which is not known to be safe.
-    """
-    if not hasattr(optuna_cmaes, "pickle"):
-        raise StudyError("sampler 'cmaes' is not known to be safe with this version of Optuna", "use tpe or gp")
-    optuna_cmaes.pickle = _OnlyStates

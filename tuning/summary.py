@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dynslam_bench.core.records import Record
 from dynslam_bench.tuning.objectives import ACCURACY, FEWEST_SCENES, Objective, Outcomes, bounds, centre, upper
@@ -22,9 +22,8 @@ class Ratio(Record):
 
     Attributes:
         ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the default.
-        low: Lower end of the interval over scenes (`statistics.bounds`); below three scenes over starts, which tells
-            nothing of other scenes. None for a single run. Summaries of older versions hold a bootstrap interval, which
-            was too narrow.
+        low: Lower end of the interval over scenes (`objectives.bounds`); below three scenes over starts, which tells
+            nothing of other scenes. None for a single run.
         high: Upper end.
         n: Paired runs.
         sequences: How many scenes they come from.
@@ -130,26 +129,14 @@ class Candidate(Record):
     feasible: bool = True
     failed: str = ""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _of_an_older_version(cls, values: Any) -> Any:
-        """What is ``confirm`` now were fresh repeats on the tune split."""
-        if isinstance(values, dict) and "tune" in values:
-            return {**{key: value for key, value in values.items() if key != "tune"}, "confirm": values["tune"]}
-        return values
-
     @property
     def bound(self) -> float:
         """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
-        known = self.feasible and self.confirm is not None and self.confirm.bound is not None
-        if not self.nothing_lost(self.on_confirm):
-            return math.inf
-        return self.confirm.bound if known and self.confirm is not None and self.confirm.bound is not None else math.inf
+        return _bound(self.confirm) if self.feasible and self.nothing_lost(self.on_confirm) else math.inf
 
     def nothing_lost(self, ratios: Mapping[str, Ratio]) -> bool:
         """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the default, if that is asked."""
-        bound = ratios["accuracy"].bound if "accuracy" in ratios else None
-        return self.ate_margin is None or (bound is not None and bound < 1 + self.ate_margin)
+        return self.ate_margin is None or _bound(ratios.get("accuracy")) < 1 + self.ate_margin
 
     @property
     def worse_on_recordings(self) -> bool:
@@ -176,15 +163,14 @@ class StudySummary(Record):
         improves: Whether the chosen settings beat the default on the held-out split (the whole interval below 1), are
             not worse on recordings, and the splits are apart.
         conclusion: One sentence, see `conclude`.
-        importances: Shares of the parameters that matter more than chance, see `importance`.
-        inert: Parameters that changed nothing, or never took part.
+        importances: Optuna's importances of the parameters, see `trials.importances`.
         tune: The instances that trials ran on.
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
         picks: Presets of the study by name, and the trial of each; None where the default is the pick.
         split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
-        seen: Splits with scenes that the network behind the masks was trained on, see `seen.seen_note`.
+        seen: Splits with scenes that the network behind the masks was trained on, see `splits.seen_note`.
     """
 
     name: str
@@ -196,7 +182,6 @@ class StudySummary(Record):
     improves: bool
     conclusion: str
     importances: dict[str, float] = Field(default_factory=dict)
-    inert: list[str] = Field(default_factory=list)
     tune: list[str] = Field(default_factory=list)
     confirm: list[str] = Field(default_factory=list)
     held_out: list[str] = Field(default_factory=list)
@@ -204,12 +189,6 @@ class StudySummary(Record):
     picks: dict[str, int | None] = Field(default_factory=dict)
     split_notes: list[str] = Field(default_factory=list)
     seen: list[str] = Field(default_factory=list)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_an_older_version(cls, values: Any) -> Any:
-        """The repeats are told by the instances now."""
-        return {key: value for key, value in values.items() if key != "repeats"} if isinstance(values, dict) else values
 
     @property
     def verdict(self) -> str:
@@ -245,10 +224,10 @@ def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
         return _not_as_accurate(unsure)
     best = min(feasible, key=lambda each: each.bound)
     assert best.confirm is not None
-    many = f"none of the {len(judged)} best trials holds" if len(judged) > 1 else "the best trial does not hold"
+    many = f"none of the {len(judged)} best trials is" if len(judged) > 1 else "the best trial is not"
     bound = "none" if best.confirm.bound is None else f"{best.confirm.bound:.3f}"
     return (
-        f"Keep the default: {many} up on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
+        f"Keep the default: {many} confirmed on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
         f"{best.confirm}, upper bound {bound})."
     )
 

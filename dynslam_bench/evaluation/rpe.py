@@ -134,7 +134,7 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
 
 
 def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
-    """The way travelled up to every pose ``[N]``, in the unit of the delta."""
+    """Path length up to every pose ``[N]``, in the unit of the delta."""
     if spec.unit == "f":
         return np.arange(len(poses), dtype=np.float64)
     if spec.unit == "s":
@@ -321,18 +321,12 @@ def relative_metrics(
     metrics: dict[str, float] = {}
     counts: dict[str, int] = {}
     for spec in protocol.rpe:
-        errors: RelativeErrors
         stamps = estimate.timestamps
         if spec.pairs in ("tum-fixed", "tum-random"):
             errors = tum_relative_errors(estimate, ground_truth, spec, scale=similarity.scale)
         else:
             stamps = stamps[association.estimate]
-            errors = evo_relative_errors(
-                stamps,
-                aligned,
-                ground_truth.T_world_cam[association.ground_truth],
-                spec,
-            )
+            errors = evo_relative_errors(stamps, aligned, ground_truth.T_world_cam[association.ground_truth], spec)
         counts[spec.key] = len(errors.pairs)
         metrics.update(_statistics(spec, errors, stamps))
     return metrics, counts

@@ -104,7 +104,7 @@ def test_a_study_file_of_the_old_form_is_converted_with_a_note(tmp_path: Path) -
     path.write_text(f'tune = ["{TUNE}"]\npruner = "best"\n')
     with pytest.raises(StudyError, match="race: Input should be 'halving'"):
         read_study(path)
-    assert converted({"tune": ["a"], "race": "none"}) == ({"tune": ["a"], "race": "none"}, []), "today's stays"
+    assert converted({"tune": ["a"], "pruner": "none"}) == ({"tune": ["a"], "race": "none"}, []), "today's stays"
 
 
 def test_a_stored_study_of_the_old_form_can_be_looked_at(tmp_path: Path) -> None:

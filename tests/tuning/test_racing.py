@@ -59,7 +59,7 @@ def test_a_lucky_beginning_gives_no_immunity() -> None:
     ("halving", ["accuracy", "speed"]),
 ])  # fmt: skip
 def test_told_values_are_true(rule: str, objectives: list[str], tmp_path: Path) -> None:
-    tuner = SimulatedTuner(make_spec(race=rule, objectives=objectives, trials=16), tmp_path, effect=valley)
+    tuner = SimulatedTuner(make_spec(pruner=rule, objectives=objectives, trials=16), tmp_path, effect=valley)
     trials = tuner.run().get_trials()
     states = [trial.state for trial in trials]
     assert states[0] == TrialState.COMPLETE and TrialState.PRUNED in states
@@ -78,7 +78,7 @@ def test_told_values_are_true(rule: str, objectives: list[str], tmp_path: Path) 
 
 def test_wilcoxon_takes_one_objective(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match="'wilcoxon' takes one objective, the study has 2"):
-        SimulatedTuner(make_spec(race="wilcoxon", objectives=["accuracy", "speed"]), tmp_path)
+        SimulatedTuner(make_spec(pruner="wilcoxon", objectives=["accuracy", "speed"]), tmp_path)
 
 
 def test_the_race_takes_half_the_runs_of_the_full_grid_at_the_same_regret(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_the_race_takes_half_the_runs_of_the_full_grid_at_the_same_regret(tmp_pa
     regret: dict[str, list[float]] = {"none": [], "halving": []}
     for rule in runs:
         for seed in range(5):
-            spec = make_spec(race=rule, trials=24, sampler_seed=seed)
+            spec = make_spec(pruner=rule, trials=24, sampler_seed=seed)
             tuner = SimulatedTuner(spec, tmp_path / f"{rule}{seed}", effect=valley, seed=seed)
             regret[rule].append(valley(tuner.run().best_trial.params))
             runs[rule] += tuner.runs

@@ -35,7 +35,7 @@ def make(sequences: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": sequences[:2], "held_out": sequences[2:], "trials": 10,
         "space": {"include": ["gain", "wobble"]}, "seeds": [0], "offsets": [0], "top": 2,
-        "race": "none", "min_coverage": None, "recorded": [],
+        "pruner": "none", "min_coverage": None, "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 

@@ -178,7 +178,7 @@ def test_a_study_is_a_frame_and_its_page_tells_what_holds_up(folders: list[str],
         "sampler_seed": 3,
     }
     values |= {"space": {"include": ["gain", "mode", "anger"], "fixed": {"wobble": 0}}, "sampler": "random"}
-    spec = StudySpec.model_validate(values | {"race": "none", "min_coverage": 0.5, "recorded": []})
+    spec = StudySpec.model_validate(values | {"pruner": "none", "min_coverage": 0.5, "recorded": []})
     tuner = run_study(spec, results=tmp_path)
     summary = finish(tuner)
     tuner.study.set_user_attr("command", ["/home/x/venv/bin/dynslam-bench", "tune", "run", "my study.toml"])

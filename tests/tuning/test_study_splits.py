@@ -23,7 +23,7 @@ WALK = "synthetic/walking_xyz"
 def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": tune, "held_out": held_out, "trials": 2, "top": 1,
-        "space": {"include": ["gain"]}, "race": "none", "min_coverage": None, "offsets": [0], "recorded": [],
+        "space": {"include": ["gain"]}, "pruner": "none", "min_coverage": None, "offsets": [0], "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 
