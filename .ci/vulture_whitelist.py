@@ -11,7 +11,7 @@ BoxFilter  # a rejection rule for systems of one's own, held to its paper by tes
 emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
 hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
-TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
+
 compile_kernels  # cli.kernels: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 

@@ -29,8 +29,7 @@ from dynslam_bench.runs import run_index as line_file
 from dynslam_bench.runs.frames import FrameLog, load_frames
 from dynslam_bench.runs.scoring import evaluate_run
 from dynslam_bench.sequences.fetch import Receipt
-from dynslam_bench.tuning import Study, StudySummary
-from dynslam_bench.tuning import storage as cmaes_state
+from dynslam_bench.tuning import Study, StudySummary, samplers
 from dynslam_bench.tuning import study as python_study
 from dynslam_bench.tuning import trials as study_frame
 
@@ -366,8 +365,8 @@ TARGETS = [
     Target("stage cache entry", _read_entry, lambda: [_entry()], (StageCache.get, _unpack)),
     Target(
         "state of CMA-ES",
-        lambda data, folder: cmaes_state._OnlyStates.loads(data or b""),
+        lambda data, folder: samplers.restore_cma(data or b""),
         _state_seeds,
-        (cmaes_state._OnlyStates.loads, cmaes_state._State.find_class),
+        (samplers.restore_cma, samplers._CmaUnpickler.find_class),
     ),
 ]

@@ -47,4 +47,6 @@ def test_it_beats_random_search_at_equal_trials(objective: Callable[[optuna.Tria
 
 
 def test_the_same_seed_gives_the_same_study() -> None:
-    assert values(EmfoaSampler(seed=3, n_trials=40), sphere, 40) == values(EmfoaSampler(seed=3, n_trials=40), sphere, 40)
+    assert values(EmfoaSampler(seed=3, n_trials=40), sphere, 40) == values(
+        EmfoaSampler(seed=3, n_trials=40), sphere, 40
+    )

@@ -104,9 +104,7 @@ FORGED += [b"cbuiltins\neval\n.", b"cnumpy\nload\n.", b"cnumpy.core.multiarray\n
 
 
 @pytest.mark.parametrize("data", FORGED)
-def test_a_storage_cannot_run_code_through_cmaes(
-    data: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_storage_cannot_run_code_through_cmaes(data: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StudyError, match="no state of CMA-ES"):
         restore_cma(data)
