@@ -98,4 +98,3 @@ class Segmenter(Protocol):
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame; no objects is an empty result, never an error."""
-        ...

@@ -27,11 +27,9 @@ class Tracker(Protocol):
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; all randomness must come from `rng`."""
-        ...
 
     def track(self, frame: Frame) -> TrackResult:
         """Process one frame and return its camera-to-world pose, causally: later frames change nothing."""
-        ...
 
 
 @dataclass(frozen=True)
