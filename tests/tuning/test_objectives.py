@@ -45,7 +45,7 @@ def test_what_cannot_be_an_objective_is_refused() -> None:
     default = {instance: outcome(instance, 0.02) for instance in PLAIN}
     with pytest.raises(StudyError, match="'robustness' counts degraded instances alone"):
         OBJECTIVES["robustness"].value(default, default)
-    with pytest.raises(StudyError, match="'sped'.*'speed'"):
+    with pytest.raises(StudyError, match=r"'sped'.*'speed'"):
         find_objective("sped")
     with pytest.raises(StudyError, match="gives 0 on instance"):
         own_objective(lambda run: 0.0).value(default, default)
@@ -111,7 +111,7 @@ def test_a_front_gives_three_presets_in_either_order(objectives: list[str], tmp_
     assert 'mode = "fine"' in read_preset_text(study, tmp_path, "fast"), "what the study fixed is a comment"
     write_page(tuner, summary)
     assert "pareto" in (tuner.folder / PLOTS_FILE).read_text().lower()
-    with pytest.raises(StudyError, match="'fats'.*'fast'"):
+    with pytest.raises(StudyError, match=r"'fats'.*'fast'"):
         read_preset_text(study, tmp_path, "fats")
 
 
