@@ -1,4 +1,4 @@
-"""After the trials: the best judged again on instances that none has seen, the choice, the held-out check, the preset."""
+"""After the trials: the best are judged on unseen instances, one is chosen, checked on held-out ones and written."""
 
 from __future__ import annotations
 

@@ -228,15 +228,15 @@ def warnings_of(tuner: Tuner) -> list[str]:
     infeasible = sum(not is_feasible(trial) for trial in complete)
     if infeasible and infeasible == len(complete):
         notes.append(
-            f"None of the {infeasible} trials fulfils the constraints on its own instances: the least bad were judged on "
-            "instances that no trial had seen, and have to fulfil them there."
+            f"None of the {infeasible} trials fulfils the constraints on its instances: the least bad were judged on "
+            "unseen instances, and have to fulfil them there."
         )
     elif infeasible:
         notes.append(f"{infeasible} trials violate a constraint and are not candidates.")
     if "speed" in tuner.spec.objectives:
         notes.append(
-            "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On the "
-            "instances of the choice and on held-out ones the default and the candidates ran in turn: those count."
+            "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On "
+            "the instances of the choice and the held-out ones default and candidates ran in turn: those count."
         )
     return notes
 

@@ -1,7 +1,7 @@
 """Screening: which settings matter, by elementary effects (Morris 1991), with chance taken off.
 
-Each setting is moved by a step from the default and from points near it. A run changes by chance with every setting that
-changes anything at all. The mean effect over instances is no chance: it is compared with its scatter over instances.
+Each setting is moved by a step from the default and from points near it. Any change of a run
+has a random effect on its error; the mean effect over instances is compared with its scatter over instances.
 """
 
 from __future__ import annotations

@@ -168,8 +168,8 @@ def check_splits(
         What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is longer than
-            its sequence, too short or without ground truth; names both spellings.
+        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is too long,
+            too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
     tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
@@ -234,9 +234,9 @@ def _overlap(one: Any, other: Any) -> bool:
 # Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.
 
 _AROUND_S = np.array([-0.1, -0.05, 0.05, 0.1])
-"""The camera's distances from where it was and will be so long before and after a frame are the shape of its path."""
+"""The shape of a path at a frame: the camera's distances from its positions so long before and after it."""
 _PAIRS = 6
-"""So many pairs of frames with the most similar shapes, and as many with equal stamps, are compared by what they show."""
+"""So many pairs of frames with the most similar shapes, and as many with equal stamps, are compared by their images."""
 _LEAST_M = 1e-3
 """The shape of a shorter path is the ground truth's rounding."""
 _THUMB = (32, 24)

@@ -60,7 +60,7 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
         One row a trial, in order; what is missing is ``pd.NA``. ``Int64``: trial (0 is the default), runs
         (that it was evaluated on). ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``),
         reason (why it was pruned or failed; missing else). ``boolean``: feasible (all constraints hold; missing for
-        trials that are not complete). ``Float64``: one column for each objective, named after ``value_``, as Optuna has them
+        incomplete trials). ``Float64``: one column for each objective, named after ``value_``, as Optuna has them
         (natural logarithms of ratios to the default settings, less is better), ratio (the ATE ratio, below 1 is better
         than the default; missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second),
         duration_s (seconds from the start of the trial to its end). Then a column ``params.NAME`` for each tuned
