@@ -62,9 +62,9 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         )
         result.append(Block("figure", figure="ratios", caption=caption))
     plots = Markup('<a href="{}">Optuna\'s plots</a>: history, slices, importances, intermediate values, Pareto front')
-    found = [summary.verdict, *filter(None, [seen_note(summary.seen)])]
+    conclusion = [summary.verdict, *filter(None, [seen_note(summary.seen)])]
     sections = [
-        Section("result", "What the study found", "Result", found, result),
+        Section("result", "What the study found", "Result", conclusion, result),
         Section(
             "preset", "Settings: default, best trial, range", "Settings", _picks(summary),
             _preset(tuner, summary, settings),

@@ -57,7 +57,7 @@ class Need(Record):
 
 
 class Pilot(Record):
-    """What a pilot found; all spreads are of natural logarithms of ratios.
+    """The result of a pilot; all spreads are of natural logarithms of ratios.
 
     Attributes:
         objective: What the ratio is one of.

@@ -23,7 +23,7 @@ def write_presets(tuner: Tuner, summary: StudySummary) -> None:
     """Write every pick as a preset: tuned settings alone, with what they are worth and where that was seen."""
     spec = tuner.spec
     for name, number in summary.picks.items():
-        candidate = next((each for each in summary.candidates if each.trial == number), None)
+        candidate = next((one for one in summary.candidates if one.trial == number), None)
         remark = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
         text = preset_text(
             {} if candidate is None else candidate.params,

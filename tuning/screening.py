@@ -50,14 +50,14 @@ def plan(space: Sequence[Parameter], base: Mapping[str, Any], points: int, seed:
 
     Settings that another one switches off at the default are no part of it: see `live`.
     """
-    found = []
+    chosen: list[Point] = []
     for number in range(points):
         rng = stream(seed, "screening", number)
         start = {p.name: base[p.name] if number == 0 else toward(p, base[p.name], rng) for p in space}
         if number > 0:  # what switches others off stays as it is
             start |= {name: base[name] for p in space for name, _ in p.when if name in start}
-        found.append(Point(start, {p.name: stepped(p, start[p.name], rng) for p in space}))
-    return found
+        chosen.append(Point(start, {p.name: stepped(p, start[p.name], rng) for p in space}))
+    return chosen
 
 
 def live(space: Sequence[Parameter], base: Mapping[str, Any]) -> list[Parameter]:
@@ -116,10 +116,10 @@ class Effect(Record):
 
 
 class Screening(Record):
-    """What a screening found.
+    """The result of a screening.
 
     Attributes:
-        effects: Of each setting the largest over the objectives; the one most surely felt first.
+        effects: Of each setting the largest over the objectives; the surest first.
         kept: At most `KEPT` settings worth a study; empty where none matters more than chance.
         dead: Settings that changed nothing, to the last bit, on any of the instances.
         failed: Settings whose step broke a run, and how.

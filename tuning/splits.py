@@ -168,8 +168,8 @@ def check_splits(
         What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is too long,
-            too short or without ground truth; names both spellings.
+        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is too
+            long, too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
     tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))

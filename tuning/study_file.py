@@ -46,7 +46,8 @@ class StudySpec(_Part):
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
         tune: Instances that trials run on, written as `instances.parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Instances that no trial runs on. The best trials are judged again on them, and one is chosen. Empty for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
+        confirm: Instances that no trial runs on. The best trials are judged again on them, and one is chosen. Empty for
+            a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
         held_out: Instances that decide at the end whether tuning helped; neither trials nor the choice see them.
         recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.

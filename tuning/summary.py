@@ -271,7 +271,7 @@ def _judged(chosen: Candidate, overlapping: bool) -> str:
     if not chosen.nothing_lost(chosen.on_held_out):
         limit = 1 + (chosen.ate_margin or 0)
         return (
-            f"Not better, keep the default: {held} {on}, but not shown to be as accurate, which asks for an upper bound "
+            f"Not better, keep the default: {held} {on}, but not shown to be as accurate: the upper bound has to lie "
             f"below {limit:.2f} ({details})."
         )
     if held.shows_gain and not overlapping:

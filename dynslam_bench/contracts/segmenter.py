@@ -1,4 +1,4 @@
-"""The contract of segmenters: what announces them, what they are told and what they return."""
+"""The contract of segmenters: their spec, their context and their result."""
 
 from __future__ import annotations
 

@@ -102,8 +102,8 @@ class Sequence(Protocol):
 
 def timestamps_ns(sequence: Sequence) -> NDArray[np.int64]:
     """Stamps of all frames in nanoseconds, int64 ``[N]``."""
-    known: NDArray[np.int64] | None = getattr(sequence, "timestamps_ns", None)
-    return from_seconds(sequence.timestamps.tolist()) if known is None else known
+    exact: NDArray[np.int64] | None = getattr(sequence, "timestamps_ns", None)
+    return from_seconds(sequence.timestamps.tolist()) if exact is None else exact
 
 
 def exact_stamps(sequence: Sequence) -> dict[float, int]:

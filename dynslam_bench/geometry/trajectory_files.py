@@ -179,13 +179,13 @@ def read_stamps(path: Path) -> NDArray[np.int64]:
     Raises:
         TrajectoryError: The file cannot be read, or a line does not begin with a stamp.
     """
-    found = []
+    stamps = []
     for number, parts in _lines(path):
         try:
-            found.append(parse_ns(parts[0]))
+            stamps.append(parse_ns(parts[0]))
         except ValueError:
             raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds") from None
-    return np.array(found, dtype=np.int64)
+    return np.array(stamps, dtype=np.int64)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -208,11 +208,11 @@ def _parts(line: str) -> list[str]:
 
 def _line_of(path: Path, ns: int) -> int | None:
     """The last line that begins with a stamp."""
-    found = None
+    last = None
     for number, parts in _lines(path):
         with suppress(ValueError):
-            found = number if parse_ns(parts[0]) == ns else found
-    return found
+            last = number if parse_ns(parts[0]) == ns else last
+    return last
 
 
 def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[str]]:
@@ -244,9 +244,9 @@ def _plain_table(path: Path, columns: int) -> tuple[NDArray[np.float64], list[st
             text = path.read_text(encoding="utf-8-sig").replace(",", " ")
             texts = [parts[0] for line in text.splitlines() if (parts := line.partition("#")[0].split(None, 1))]
             if texts:  # numpy warns of a table of nothing
-                found = np.loadtxt(io.StringIO(text), ndmin=2)
-                if found.shape == (len(texts), columns):
-                    return found, texts
+                table = np.loadtxt(io.StringIO(text), ndmin=2)
+                if table.shape == (len(texts), columns):
+                    return table, texts
     return None
 
 
@@ -349,19 +349,10 @@ def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> T
         TrajectoryError: A file cannot be read, is malformed, or the stamps do not fit the poses.
     """
     path = Path(path)
-    if timestamps is None or _values(path) != KITTI_VALUES:
+    if timestamps is None or len(next(_lines(path), (0, []))[1]) != KITTI_VALUES:
         return load_tum(path)
     ns = read_stamps(Path(timestamps))
     seconds = to_seconds(ns)
     trajectory = read_kitti(path, seconds, described=str(timestamps))
     trajectory = trajectory.with_exact(dict(zip(seconds.tolist(), ns.tolist(), strict=True)))
     return TumFile(trajectory, FileNotes(lines=len(trajectory)))
-
-
-def _values(path: Path) -> int:
-    """Values in the first line that holds any."""
-    for line in read_lines(path, kind=TrajectoryError):
-        parts = line.partition("#")[0].replace(",", " ").split()
-        if parts:
-            return len(parts)
-    return 0
