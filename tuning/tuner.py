@@ -75,7 +75,7 @@ class Tuner:
         sampler: In place of the one that the study names.
 
     Attributes:
-        on_run: Told of every run that the study makes from now on; None for no one.
+        on_run: Called with every event of every run from now on; None for no calls.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
