@@ -8,15 +8,14 @@ from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
-from dynslam_bench.core.records import digest
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.sequences.catalogue import entry_of, open_sequence, parse_frames
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
-from dynslam_bench.sequences.view import Part, SequenceView, part_of
+from dynslam_bench.sequences.view import SequenceView
 
 FEWEST_FRAMES = 2
 """A shorter instance has no motion."""
@@ -92,16 +91,6 @@ class ProblemInstance:
         if whole.ground_truth is None:
             raise StudyError(f"'{whole.id}' has no ground truth, so nothing can be tuned on it", "leave it out")
         return cut
-
-    def part(self, data_root: str | None = None) -> Part:
-        """Which frames of which content it is, whatever it is called."""
-        return part_of(cast("Sequence", self.open(data_root)), self.offset)
-
-    def digest(self, data_root: str | None = None) -> str:
-        """Names the content: equal for two instances that show a tracker the same images with the same seed."""
-        part = self.part(data_root)
-        frames = [part.content, part.camera, part.start + self.offset, part.stop, part.stride]
-        return digest([*frames, self.degradation, self.seed], 16)
 
 
 def parse_instances(

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.passwords import without_passwords
-from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.records import Record
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
 
@@ -144,11 +144,6 @@ class StudySpec(_Part):
     def at_equal_accuracy(self) -> bool:
         """Whether a gain counts only at (nearly) the default's accuracy, as it may be paid for with the error."""
         return len(self.objectives) > 1 or self.objectives[0] not in EQUALLY_ACCURATE
-
-    def digest(self) -> str:
-        """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
-        free = {"trials", "timeout_s", "top", "storage", "pilot"}
-        return digest(self.model_dump(mode="json", exclude=free))
 
     def for_others(self) -> dict[str, Any]:
         """The study as it is written down beside its trials: without the password of its storage."""

@@ -85,14 +85,6 @@ def test_instances_are_measured_against_their_sequence(folder: str) -> None:
         ProblemInstance(folder).open()
 
 
-def test_the_digest_names_the_content(folder: str) -> None:
-    instance = ProblemInstance(folder, (0, 12), offset=2)
-    assert instance.digest() == replace(instance, frames=None).digest()
-    others = [replace(instance, **change) for change in ({"offset": 1}, {"stride": 2}, {"frames": (0, 9)}, {"seed": 1})]
-    others.append(replace(instance, degradation=(("blur", 0.5),)))
-    assert len({instance.digest(), *(other.digest() for other in others)}) == 6
-
-
 def test_instances_of_one_recording_are_apart_or_repeats(folder: str) -> None:
     one, later = ProblemInstance(folder, (0, 6)), ProblemInstance(folder, (6, 12))
     assert check_splits("s", {"tune": [one, replace(one, offset=1), later]}) == []
