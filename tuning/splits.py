@@ -178,10 +178,11 @@ def check_splits(
     opened: dict[str, Any] = {name: open_sequence(name, data_root=data_root) for name in (*tuned, *judged)}
     for instances in (tune, held_out):
         _check_repeats(instances, opened)
+    scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
-        if _overlap(opened[one], opened[other])
+        if scenes_of[one] == scenes_of[other] or _same_recording(opened[one], opened[other])
     ]
     for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
         faults += [_misplaced(name, used, own) for name in names if getattr(opened[name], "split", "") == own]
@@ -222,13 +223,9 @@ def _misplaced(name: str, used: str, own: str) -> str:
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 
-def _overlap(one: Any, other: Any) -> bool:
-    """Whether two sequences film the same: the same content by digest, or the same images along the same path."""
-    if part_of(one).scene == part_of(other).scene:
-        return True
-    if is_rendered(one) and is_rendered(other):
-        return False  # rendered scenes are told apart by their parameters
-    return same_recording(one, other)
+def _same_recording(one: Any, other: Any) -> bool:
+    """`same_recording`; rendered scenes are told apart by their parameters."""
+    return not (is_rendered(one) and is_rendered(other)) and same_recording(one, other)
 
 
 # Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.

@@ -31,8 +31,8 @@ def test_a_text_names_scenes_lengths_and_starts() -> None:
     f"{WALK}[10:40]?scene=3&frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
 ])  # fmt: skip
 def test_the_text_of_an_instance_names_it(text: str) -> None:
-    for instance in parse_instances(text):
-        assert parse_instances(str(instance)) == (instance,)
+    instances = parse_instances(text)
+    assert [parse_instances(str(instance)) for instance in instances] == [(instance,) for instance in instances] != []
 
 
 def test_parts_strides_and_degradation_reach_the_run() -> None:
