@@ -260,7 +260,8 @@ def same_recording(one: Sequence, other: Sequence) -> bool:
 def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
     shapes = [_shapes(one), _shapes(other)]
     if len(shapes[0]) and len(shapes[1]):
-        distance, nearest = cKDTree(shapes[1]).query(shapes[0])
+        distance, index = cKDTree(shapes[1]).query(shapes[0])
+        nearest = np.asarray(index, np.intp)
         relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
         yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
     if is_rendered(one) or is_rendered(other):
