@@ -81,7 +81,7 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         confirm=list(map(str, design.confirm)),
         held_out=list(map(str, design.held_out)),
         recorded=list(map(str, design.recorded)),
-        tune=list(map(str, design.race)),
+        tune=list(map(str, design.tune)),
         picks=picks,
         seen=splits_seen(tuner.defaults, design),
     )

@@ -84,7 +84,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             (str(sum(summary.trials.values())), "trials"),
             (str(summary.trials.get("pruned", 0)), "pruned"),
             (str(summary.trials.get("fail", 0)), "failed"),
-            (_size(tuner.design.race), "to tune on"),
+            (_size(tuner.design.tune), "to tune on"),
             (_size(tuner.design.confirm), "to choose on"),
             (_size(tuner.design.held_out), "held out"),
         ],
@@ -205,7 +205,7 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
 
 def fewer_starts(design: Design) -> str:
     """Why the default itself may have another ratio than 1; empty where trials ran from as many starts as it."""
-    if len(design.reference) == len(design.race):
+    if len(design.reference) == len(design.tune):
         return ""
     return (
         f" Ratios are to the median of the default over {FEWEST_STARTS} or more starts in each scene, but every trial, "

@@ -28,7 +28,7 @@ from dynslam_bench.tuning.space import distribution
 STEP = 1 / 3
 """How far a setting is moved, as a share of its range (of its logarithm where its scale is that)."""
 NEARNESS = 0.3
-"""How far from the default the further points lie, as a share of the way to a drawn one: broken systems tell little."""
+"""How far from the default the further points lie, as a share of the distance to a drawn one: broken systems tell little."""
 Values = dict[str, Scalar]
 
 
@@ -80,7 +80,7 @@ def stepped(parameter: Parameter, value: Scalar, rng: np.random.Generator) -> Sc
 
 
 def toward(parameter: Parameter, value: Scalar, rng: np.random.Generator) -> Scalar:
-    """Part of the way to a drawn value; switches and choices stay."""
+    """A value part of the distance to a drawn one; switches and choices stay."""
     if parameter.kind in ("bool", "categorical"):
         return value
     span = distribution(parameter)

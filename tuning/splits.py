@@ -30,7 +30,7 @@ from dynslam_bench.tuning.pruning import running_order
 from dynslam_bench.tuning.study_file import StudySpec
 
 FEWEST_STARTS = 3
-"""The default settings run from so many starts at every place: the luck of one would be shared by all trials."""
+"""The default settings run from so many starts at every place: all trials would share the luck of a single one."""
 ENOUGH_SCENES = 12
 """With so many tune scenes a third of them is kept for the choice; else other starts in all of them are."""
 FRESH_SEED = 1000
@@ -43,15 +43,15 @@ class Design:
     """The instances of a study.
 
     Attributes:
-        race: What trials run on, in the order of all trials.
-        reference: What the default settings run on beforehand: `race`, and more starts where those are few.
+        tune: What trials run on, in the order of all trials.
+        reference: What the default settings run on beforehand: `tune`, and more starts where those are few.
         confirm: What the best trials and the default run on for the choice; no trial has seen them.
         held_out: What judges the choice.
         recorded: Recordings on which the choice must not be worse.
         notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
     """
 
-    race: tuple[ProblemInstance, ...]
+    tune: tuple[ProblemInstance, ...]
     reference: tuple[ProblemInstance, ...]
     confirm: tuple[ProblemInstance, ...]
     held_out: tuple[ProblemInstance, ...]
@@ -79,9 +79,9 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
     if spec.recorded:
         splits = {"tune": [*tune, *confirm], "held_out": recorded}
         notes += check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
-    race = running_order(tune, spec.sampler_seed)
-    reference = with_more_starts(race)
-    return Design(tuple(race), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes))
+    tune = running_order(tune, spec.sampler_seed)
+    reference = with_more_starts(tune)
+    return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes))
 
 
 def with_more_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
@@ -334,7 +334,7 @@ def source_of_masks(settings: Settings, sequences: PySequence[str]) -> str:
 
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
-    splits = {"tune": design.race, "confirm": design.confirm, "held_out": design.held_out}
+    splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
     return [name for name, instances in splits.items() if _masks_seen(settings, instances)]
 
 

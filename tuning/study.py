@@ -255,7 +255,7 @@ def begin(tuner: Tuner, *, jobs: int = 1, on_event: OnEvent | None = None) -> No
     """
     if not tuner.spec.pilot or (tuner.folder / PILOT_FILE).is_file() or tuner.study.get_trials(deepcopy=False)[1:]:
         return
-    if len(scenes(tuner.design.race)) < FEWEST:
+    if len(scenes(tuner.design.tune)) < FEWEST:
         texts = [f"no pilot: it takes {FEWEST} scenes to tune on"]
         pilot = None
     else:
@@ -306,7 +306,7 @@ def screen_study(
     Raises:
         StudyError: See `screening.screen`.
     """
-    chosen = tuner.design.race[:instances]
+    chosen = tuner.design.tune[:instances]
     objectives = list(dict.fromkeys([*tuner.objectives, ACCURACY]))
 
     def run(values: Mapping[str, Scalar]) -> Outcomes:

@@ -221,8 +221,8 @@ class Tuner:
 
     def _steps(self) -> list[int]:
         """The steps at which every objective has an instance that counts."""
-        *early, last = steps(self.spec.pruner, len(self.design.race))
-        counted = [[objective.counts(instance) for instance in self.design.race] for objective in self.objectives]
+        *early, last = steps(self.spec.pruner, len(self.design.tune))
+        counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
         return [*(step for step in early if all(any(flags[:step]) for flags in counted)), last]
 
     def _one(self, on_event: OnEvent | None) -> None:
@@ -245,7 +245,7 @@ class Tuner:
         try:
             for step in self.steps:
                 first = len(outcomes)
-                outcomes |= self.evaluate(settings, self.design.race[first:step])
+                outcomes |= self.evaluate(settings, self.design.tune[first:step])
                 result = self.values(outcomes)
                 self._record(trial, outcomes)
                 if self._pruned(trial, outcomes, result, first) and trial.number > 0:

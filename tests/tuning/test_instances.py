@@ -107,11 +107,11 @@ def test_the_default_runs_from_three_starts_and_the_choice_is_made_on_unseen_ins
     assert fresh[:2] == [1, 2] and not set(fresh) & {0, 3}
     spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}?scene=0-3&frames=20",), recorded=())
     design = design_of(spec)
-    assert {instance.scene for instance in design.confirm} == {instance.scene for instance in design.race}
+    assert {instance.scene for instance in design.confirm} == {instance.scene for instance in design.tune}
     many = design_of(spec.model_copy(update={"tune": (f"{WALK}?scene=0-11&frames=20",)}))
-    confirm, race = ({instance.scene for instance in instances} for instances in (many.confirm, many.race))
-    assert len(confirm) == 4 and len(race) == 8 and not confirm & race
-    assert len({instance.scene for instance in many.race[:8]}) == 8, "a growing set takes one of each scene in turn"
+    confirm, tune = ({instance.scene for instance in instances} for instances in (many.confirm, many.tune))
+    assert len(confirm) == 4 and len(tune) == 8 and not confirm & tune
+    assert len({instance.scene for instance in many.tune[:8]}) == 8, "a growing set takes one of each scene in turn"
 
 
 def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -> None:

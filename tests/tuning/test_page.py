@@ -26,8 +26,8 @@ def tuner_of(study: optuna.Study, objective: str = "accuracy") -> Tuner:
 
 @pytest.mark.parametrize("offsets", [(0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)])
 def test_a_default_of_more_starts_than_the_trials_is_explained(offsets: tuple[int, ...]) -> None:
-    race = tuple(ProblemInstance("synthetic/walking_xyz?scene=0", offset=offset) for offset in offsets)
-    text = fewer_starts(Design(race, tuple(with_more_starts(race)), (), (), ()))
+    tune = tuple(ProblemInstance("synthetic/walking_xyz?scene=0", offset=offset) for offset in offsets)
+    text = fewer_starts(Design(tune, tuple(with_more_starts(tune)), (), (), ()))
     assert bool(text) == (len(offsets) < 3)
 
 

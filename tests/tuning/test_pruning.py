@@ -65,10 +65,10 @@ def test_values_are_of_the_instances_that_ran(pruner: str, objectives: list[str]
         instances = list(errors_of(trial))
         value = ACCURACY.value(tuner.evaluate(tuner.settings_of(trial), instances), tuner.reference())
         if trial.state == TrialState.COMPLETE:
-            assert instances == list(tuner.design.race), "a value is one of all instances"
+            assert instances == list(tuner.design.tune), "a value is one of all instances"
             assert trial.values[0] == pytest.approx(value, abs=1e-12)
         else:
-            assert trial.state == TrialState.PRUNED and len(instances) < len(tuner.design.race)
+            assert trial.state == TrialState.PRUNED and len(instances) < len(tuner.design.tune)
             if len(objectives) > 1:
                 assert trial.user_attrs[step_name(len(instances))][0] == pytest.approx(value, abs=1e-12)
             elif pruner == "halving":
