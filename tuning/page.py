@@ -103,7 +103,6 @@ def _size(instances: Sequence[ProblemInstance]) -> str:
 def _plots(tuner: Tuner) -> str:
     """Optuna's own plots of the study, in one HTML text that works offline; ratios in place of logarithms."""
     from optuna import visualization
-    from plotly.io import to_html
 
     names = [f"ratio of {objective.what} to the default" for objective in tuner.objectives]
     target: dict[str, Any] = {"target": lambda trial: math.exp(trial.values[0]), "target_name": names[0]}
@@ -124,7 +123,7 @@ def _plots(tuner: Tuner) -> str:
                     tuner.study, targets=lambda trial: list(map(math.exp, trial.values)), target_names=names
                 )
             )
-    return "\n".join(to_html(figure, full_html=False, include_plotlyjs=figure is figures[0]) for figure in figures)
+    return "\n".join(str(figure.to_html(full_html=False, include_plotlyjs=figure is figures[0])) for figure in figures)
 
 
 def _preset(tuner: Tuner, summary: StudySummary, settings: Table) -> list[Block]:

@@ -1,8 +1,8 @@
 """Before a study: what its instances could show at all, and what it would take to show more.
 
-How far two configurations differ on one instance is mostly chance: a start one frame later changes the result. The pilot
-measures that spread with a few changed settings, and works out the smallest effect that the study
-could tell from nothing (one-sided 2.5 %, with 80 % of the studies finding it).
+How far two configurations differ on one instance is mostly chance: a start one frame later changes the result. The
+pilot measures that spread with a few changed settings, and computes the smallest effect that the study could tell from
+nothing (one-sided 2.5 %, with 80 % of the studies finding it).
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def some_of(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
 
 
 def small_change(space: Sequence[Parameter], base: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Scalar]:
-    """Settings near the default: numbers moved part of the distance to drawn ones; choices too where there are no numbers."""
+    """Settings near the default: numbers moved toward drawn ones; choices too where there are no numbers."""
     usable = live(space, base)
     changed = {parameter.name: toward(parameter, base[parameter.name], rng) for parameter in usable}
     if any(changed[name] != base[name] for name in changed):

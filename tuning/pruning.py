@@ -61,7 +61,9 @@ def steps(name: PrunerName, count: int) -> list[int]:
 def is_dominated(trials: Sequence[FrozenTrial], number: int, step: int) -> bool:
     """Whether enough of the trials that came as far beat a trial in every objective at the same step."""
     name = step_name(step)
-    reported = {trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs}
+    reported: dict[int, list[float]] = {
+        trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs
+    }
     own, rivals = reported[number], list(reported.values())
     better = sum(values != own and all(a <= b for a, b in zip(values, own, strict=True)) for values in rivals)
     return better >= max(2, DOMINATED_SHARE * len(rivals))

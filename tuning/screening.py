@@ -28,7 +28,7 @@ from dynslam_bench.tuning.space import distribution
 STEP = 1 / 3
 """How far a setting is moved, as a share of its range (of its logarithm where its scale is that)."""
 NEARNESS = 0.3
-"""How far from the default the further points lie, as a share of the distance to a drawn one: broken systems tell little."""
+"""Distance of the further points from the default, as a share of that to a drawn one: broken systems tell little."""
 Values = dict[str, Scalar]
 
 

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/study_null.py [--studies 400]
 
-Whole studies (trials, choice, held-out check) over runs from a noise model with the measured spread between starts: each
+Whole studies (trials, choice, held-out check) over runs from a noise model with the measured spread of starts: each
 setting is as good as the default, up to a share of 0.15 in log that differs from scene to scene. `best trial` is what a
 study without the choice on unseen instances would go by: the best trial's own value. The second table compares pruners
 on settings of which the best is known; a run is one of a configuration on one instance.
