@@ -15,6 +15,8 @@ rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 compile_kernels  # cli.kernels: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
+_restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
+
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
 build_daisy  # flow.registry
