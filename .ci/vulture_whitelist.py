@@ -8,9 +8,11 @@ of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
-TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
+
 compile_kernels  # cli.kernels: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
+
+_restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry

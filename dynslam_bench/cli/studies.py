@@ -36,7 +36,7 @@ def space(study: Study, as_json: AsJson = False) -> None:
     from dynslam_bench.trackers import TRACKERS
     from dynslam_bench.tuning import read_study, search_space
 
-    spec = read_study(study, note)
+    spec = read_study(study)
     sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
     found = search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
     if as_json:
@@ -60,7 +60,7 @@ def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_j
     """Measure the spread of a study's instances: what it could show, and what 5, 10 and 20 % would take."""
     from dynslam_bench.tuning import Tuner, pilot_of, read_study
 
-    found = pilot_of(Tuner(read_study(study, note), results), jobs=jobs)
+    found = pilot_of(Tuner(read_study(study), results), jobs=jobs)
     if as_json:
         write_json(found)
         return
@@ -85,7 +85,7 @@ def screen(
     """Find which settings matter, before a study: one at a time, on several instances; print the few worth tuning."""
     from dynslam_bench.tuning import Tuner, read_study, screen_study
 
-    tuner = Tuner(read_study(study, note), results)
+    tuner = Tuner(read_study(study), results)
     with progress(f"screening {tuner.spec.name}") as advance:
         found = screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
     if as_json:
@@ -120,7 +120,7 @@ def run(
     """Run a study, or go on with it; then run the best again, check them on the held-out split, write the page."""
     from dynslam_bench.tuning import read_study, write_page
 
-    spec = read_study(study, note)
+    spec = read_study(study)
     if trials is not None:
         spec = spec.model_copy(update={"trials": trials})
     tuner = run_trials(spec, results, jobs)
@@ -133,7 +133,7 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
     """Only run trials of a study, beside other workers on the same storage."""
     from dynslam_bench.tuning import read_study
 
-    tuner = run_trials(read_study(study, note), results, jobs)
+    tuner = run_trials(read_study(study), results, jobs)
     write(f"study '{tuner.spec.name}' has its {tuner.spec.trials} trials")
 
 
@@ -143,7 +143,7 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     from dynslam_bench.tuning import Tuner, read_study
     from dynslam_bench.tuning.trials import best_trials, count_states
 
-    tuner = Tuner(read_study(study, note), results, reading=True)
+    tuner = Tuner(read_study(study), results, reading=True)
     facts: dict[str, Any] = {
         "study": tuner.spec.name,
         "folder": tuner.folder,
@@ -176,7 +176,7 @@ def best(
     from dynslam_bench.core.records import write_atomic
     from dynslam_bench.tuning import read_preset_text, read_study
 
-    text = read_preset_text(read_study(study, note), results, pick)
+    text = read_preset_text(read_study(study), results, pick)
     if output is None:
         write(text.rstrip())
     else:
@@ -190,7 +190,7 @@ def report(study: Study, results: Results = Path("results"), as_json: AsJson = F
     from dynslam_bench.tuning import StudySummary, Tuner, read_study, write_page
     from dynslam_bench.tuning.storage import study_folder
 
-    spec = read_study(study, note)
+    spec = read_study(study)
     stored = study_folder(results, spec) / "summary.json"
     tuner = Tuner(spec, results, reading=stored.is_file())
     if stored.is_file():

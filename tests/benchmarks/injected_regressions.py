@@ -1,6 +1,6 @@
-"""Studies that start from deliberately bad settings: how much of the planted loss they recover on held-out scenes.
+"""Studies that start from deliberately bad settings: how much of the injected loss they recover on held-out scenes.
 
-    python tests/benchmarks/planted_gains.py [motion features threshold dilation] [--jobs 2] [--frames 60]
+    python tests/benchmarks/injected_regressions.py [motion features threshold dilation] [--jobs 2] [--frames 60]
                                              [--scenes 8] [--trials 20] [--results FOLDER]
 
 Each case is a tracker of which one default was made bad; the study does not know which. At the end the tracker as it is
@@ -34,21 +34,21 @@ MASKED = ("features.n_features", "segmentation.dilation_px", "segmentation.confi
           "backend.keyframes.max_gap")  # fmt: skip
 
 
-def planted(name: str, tracker: str, bad: dict[str, Any]) -> TrackerSpec:
+def injected(name: str, tracker: str, bad: dict[str, Any]) -> TrackerSpec:
     """A tracker with bad default settings, under another id."""
     spec = TRACKERS.get(tracker)
     defaults = apply_overrides(spec.settings(), bad)
     fields = {
         group: (type(getattr(defaults, group)), getattr(defaults, group)) for group in type(defaults).model_fields
     }
-    worse: Any = create_model(f"Planted{name.title()}", __base__=spec.settings, **fields)
-    return replace(spec, id=f"planted-{name}", settings=worse, presets={})
+    worse: Any = create_model(f"Injected{name.title()}", __base__=spec.settings, **fields)
+    return replace(spec, id=f"injected-{name}", settings=worse, presets={})
 
 
-MOTION = planted("motion", "emfoa-oft?masks=none", {"motion.enabled": False})
-FEATURES = planted("features", "mask-rcnn", {"features.n_features": 500, "segmentation.source": "embedded"})
-THRESHOLD = planted("threshold", "emfoa-oft?masks=none", {"motion.threshold_px": 10.0})
-DILATION = planted("dilation", "mask-rcnn", {"segmentation.dilation_px": 0, "segmentation.source": "embedded"})
+MOTION = injected("motion", "emfoa-oft-no-masks", {"motion.enabled": False})
+FEATURES = injected("features", "mask-rcnn", {"features.n_features": 500, "segmentation.source": "embedded"})
+THRESHOLD = injected("threshold", "emfoa-oft-no-masks", {"motion.threshold_px": 10.0})
+DILATION = injected("dilation", "mask-rcnn", {"segmentation.dilation_px": 0, "segmentation.source": "embedded"})
 MASKED_CASES = ("features", "dilation")
 SCENES = {
     "motion": ("objects_balloon",),
@@ -69,7 +69,7 @@ def study_of(case: str, options: argparse.Namespace) -> StudySpec:
         return tuple(f"synthetic/{kind}?scene={first}-{first + share - 1}&frames={options.frames}" for kind in kinds)
 
     return StudySpec(
-        name=f"planted-{case}", tracker=f"{Path(__file__).resolve()}:{case.upper()}",
+        name=f"injected-{case}", tracker=f"{Path(__file__).resolve()}:{case.upper()}",
         tune=scenes(0), confirm=scenes(share), held_out=scenes(110), offsets=(0,), recorded=(),
         trials=options.trials, top=2, min_coverage=0.9, pilot=False,
         space=SpaceSpec(include=MASKED if masked else UNMASKED,
@@ -78,15 +78,15 @@ def study_of(case: str, options: argparse.Namespace) -> StudySpec:
 
 
 def study(case: str, options: argparse.Namespace) -> str:
-    """Look at a plant's loss; where there is one, run a study and say what it recovered."""
+    """Look at a injection's loss; where there is one, run a study and say what it recovered."""
     tuner = Tuner(study_of(case, options), options.results)
     fixed, held = tuner.spec.space.fixed, tuner.design.held_out
     good = "mask-rcnn" if case in MASKED_CASES else "emfoa-oft?masks=none"
     published = evaluate(good, fixed, held, results=tuner.store, jobs=options.jobs)
-    planted = tuner.evaluate(fixed, held, jobs=options.jobs, cache=False)
-    loss = compared(planted, published)
+    injected = tuner.evaluate(fixed, held, jobs=options.jobs, cache=False)
+    loss = compared(injected, published)
     if not loss.shows_loss:
-        time_taken = compared(planted, published, objective=SPEED)
+        time_taken = compared(injected, published, objective=SPEED)
         return (
             f"{case}: nothing to recover, no loss in {loss.n} held-out runs: {loss}, bound {loss.bound}; {time_taken}"
         )
@@ -98,7 +98,7 @@ def study(case: str, options: argparse.Namespace) -> str:
     left = compared(tuner.evaluate({**fixed, **chosen}, held, jobs=options.jobs, cache=False), published)
     share = 100 * (1 - math.log(left.ratio) / math.log(loss.ratio))
     return (
-        f"{case}: planted {loss}, after the study {left}: recovered {share:.0f} % in {minutes:.1f} min, "
+        f"{case}: injected {loss}, after the study {left}: recovered {share:.0f} % in {minutes:.1f} min, "
         f"{summary.trials}\n  {summary.conclusion}\n  {chosen}"
     )
 
@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--scenes", type=int, default=8)
     parser.add_argument("--trials", type=int, default=20)
-    parser.add_argument("--results", type=Path, default=Path("results/planted"))
+    parser.add_argument("--results", type=Path, default=Path("results/injected"))
     options = parser.parse_args()
     for case in options.cases:
         print(study(case, options), flush=True)

@@ -1,4 +1,4 @@
-"""Splits that are not apart are refused however they are spelled; repeats are what really varies."""
+"""Splits that are not apart are refused however they are spelled; scenes that a network was trained on are marked."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from pathlib import Path
 
 import cv2
 import pytest
+import simulated
 import toy_tracker
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.view import part_of
+from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, write_page
-from dynslam_bench.tuning.splits import check_splits
+from dynslam_bench.tuning.page import warnings_of
+from dynslam_bench.tuning.splits import check_splits, seen_note, splits_seen
 from dynslam_bench.tuning.trials import errors_of
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
@@ -23,7 +27,7 @@ WALK = "synthetic/walking_xyz"
 def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
         "name": "toy", "tracker": TRACKER, "tune": tune, "held_out": held_out, "trials": 2, "top": 1,
-        "space": {"include": ["gain"]}, "race": "none", "min_coverage": None, "offsets": [0], "recorded": [],
+        "space": {"include": ["gain"]}, "pruner": "none", "min_coverage": None, "offsets": [0], "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 
@@ -108,29 +112,33 @@ def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> N
         assert faults([str(copy)], [str(other)]) == []
 
 
-def test_instances_stay_in_their_split() -> None:
-    with pytest.raises(StudyError, match=r"walking_xyz\?scene=5' is used as held-out.*0-99.*into the tune split"):
-        faults([f"{WALK}?scene=1"], [f"{WALK}?scene=5"])
-    with pytest.raises(StudyError, match=r"walking_xyz\?scene=105' is used as tune.*100-199.*held-out split"):
-        faults([f"{WALK}?scene=105"], [f"{WALK}?scene=101"])
+@pytest.mark.parametrize(
+    ("tune", "held_out", "named"),
+    [
+        (["?scene=1"], ["?scene=5"], r"scene=5' is used as held-out.*0-99.*the tune split"),
+        (["?scene=105"], ["?scene=101"], r"scene=105' is used as tune.*100-199.*held-out split"),
+    ],
+)
+def test_scenes_stay_in_their_split(tune: list[str], held_out: list[str], named: str) -> None:
+    splits = [[f"{WALK}{query}" for query in queries] for queries in (tune, held_out)]
+    with pytest.raises(StudyError, match=named):
+        faults(*splits)
+    assert len(faults(*splits, accept=True)) == 1
     assert faults([f"{WALK}?scene=1", f"{WALK}?scene=1&noise=4"], [f"{WALK}?scene=101"]) == []
 
 
 def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
-    for name in ("rgbd_dataset_freiburg3_walking_rpy", "rgbd_dataset_freiburg3_walking_xyz"):
-        toy_tracker.make_sequence(tmp_path / name, 0.1 * len(name) + 0.5 * name.endswith("xyz"))
-    held, tune = "rgbd_dataset_freiburg3_walking_rpy", "rgbd_dataset_freiburg3_walking_xyz"
-    camera = (tmp_path / held / "camera.toml").read_text()
-    assert "width = 16" in camera
-    with pytest.raises(StudyError, match=r"walking_rpy' is used as tune, but the catalogue puts it into the held-out"):
-        faults([str(tmp_path / held)], [])
-    with pytest.raises(StudyError, match=r"walking_xyz' is used as held-out, but the catalogue puts it into the tune"):
-        faults([str(toy_tracker.make_sequence(tmp_path / "plain", 0.7))], [str(tmp_path / tune)])
-    assert faults([str(tmp_path / tune)], [str(tmp_path / held)]) == []
-
-
-def test_an_older_study_with_overlapping_splits_can_still_be_looked_at() -> None:
-    assert len(faults([f"{WALK}?scene=1"], [f"{WALK}?scene=5"], accept=True)) == 1
+    held, tune, plain = (
+        str(toy_tracker.make_sequence(tmp_path / name, phase))
+        for name, phase in (
+            ("rgbd_dataset_freiburg3_walking_rpy", 3.4), ("rgbd_dataset_freiburg3_walking_xyz", 3.9), ("plain", 0.7)
+        )
+    )  # fmt: skip
+    with pytest.raises(StudyError, match="the catalogue puts it into the held-out"):
+        faults([held], [])
+    with pytest.raises(StudyError, match="the catalogue puts it into the tune"):
+        faults([plain], [tune])
+    assert faults([tune], [held]) == []
 
 
 def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
@@ -138,14 +146,12 @@ def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
     copy = shutil.copytree(whole, tmp_path / "copy")
     with pytest.raises(StudyError, match="allow_overlap = true"):
         Tuner(spec([str(whole)], [str(copy)]), tmp_path / "results")
-    study = spec([str(whole)], [str(copy)], allow_overlap=True)
-    tuner = run_study(study, results=tmp_path / "results")
+    tuner = run_study(spec([str(whole)], [str(copy)], allow_overlap=True), results=tmp_path / "results")
     summary = finish(tuner)
-    assert summary.split_notes == [f"'{whole}' to tune on and '{copy}' held out are the same sequence"]
-    assert "THE SPLITS ARE NOT APART" in summary.conclusion and not summary.improves
-    assert "SPLITS ARE NOT APART" in " ".join((tuner.folder / "best.toml").read_text().split())
-    page = write_page(tuner, summary).read_text()
-    assert page.count("The splits are NOT apart") >= 2, "below each table"
+    assert len(summary.split_notes) == 1 and not summary.improves
+    for text in (summary.conclusion, (tuner.folder / "best.toml").read_text(), write_page(tuner, summary).read_text()):
+        assert "SPLITS ARE NOT APART" in " ".join(text.replace("#", " ").split())
+    assert (tuner.folder / "index.html").read_text().count("The splits are NOT apart") >= 2, "below each table"
 
 
 def test_a_tracker_without_randomness_has_repeats_that_differ(tmp_path: Path) -> None:
@@ -154,9 +160,31 @@ def test_a_tracker_without_randomness_has_repeats_that_differ(tmp_path: Path) ->
     tuner = run_study(spec([folder], [], seeds=[0, 1], offsets=[0, 2], space=fixed), results=tmp_path / "results")
     errors = errors_of(tuner.study.get_trials()[1])
     assert sorted((instance.seed, instance.offset) for instance in errors) == [(0, 0), (0, 2), (1, 0), (1, 2)]
-    by_start = {start: {ate for instance, ate in errors.items() if instance.offset == start} for start in (0, 2)}
-    assert all(len(found) == 1 for found in by_start.values()) and by_start[0] != by_start[2]
+    by_start = [{ate for instance, ate in errors.items() if instance.offset == start} for start in (0, 2)]
+    assert all(len(values) == 1 for values in by_start) and by_start[0] != by_start[1]
+    confirm = {(instance.seed, instance.offset) for instance in tuner.design.confirm}
+    assert confirm == {(1000, 1), (1001, 3), (1002, 4), (1003, 5)}
+    assert any("seeds" in note for note in warnings_of(tuner))
+
+
+@pytest.mark.parametrize(
+    ("source", "seen"), [("auto", ["tune", "confirm"]), ("embedded", ["tune", "confirm"]), ("oracle", [])]
+)
+def test_the_embedded_network_alone_was_trained_on_the_scenes(source: str, seen: list[str]) -> None:
+    study = simulated.make_spec()
+    design = simulated.simulated_design(study.tune, study.held_out)
+    settings = apply_overrides(TRACKERS.get("mask-rcnn").settings(), {"segmentation.source": source})
+    assert splits_seen(settings, design) == seen
+    assert splits_seen(TRACKERS.get(TRACKER).settings(), design) == [], "a system without masks"
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_page_summary_and_preset_mark_scenes_of_the_training(masks: bool, tmp_path: Path) -> None:
+    changes = {"tracker": "mask-rcnn", "space": {"include": ["features.n_features"]}} if masks else {}
+    tuner = simulated.SimulatedTuner(simulated.make_spec(trials=3, **changes), tmp_path)
+    tuner.run()
     summary = finish(tuner)
-    fresh = {(instance.seed, instance.offset) for instance in tuner.design.confirm}
-    assert fresh == {(1000, 1), (1001, 3), (1002, 4), (1003, 5)}
-    assert "seeds changed nothing" in write_page(tuner, summary).read_text()
+    assert summary.seen == (["tune", "confirm"] if masks else []) and bool(seen_note(summary.seen)) == masks
+    page, preset = write_page(tuner, summary).read_text(), (tuner.folder / "best.toml").read_text()
+    assert ("in the trial §" in page, "unseen instances §" in page, "held-out §" in page) == (masks, masks, False)
+    assert page.count("trained on those very scenes") >= 3 * masks and ("trained on" in preset) == masks
