@@ -1,4 +1,4 @@
-"""A wrapper that puts wall-clock times into ``info``."""
+"""Wrappers: timings, trajectories, sequences, small images, degraded and dropped frames."""
 
 from __future__ import annotations
 
@@ -49,21 +49,16 @@ class RecordTimings(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
-        return summarise(self._base.timings)
+        frames = [frame for frame in self._base.timings if frame]
+        stages = dict.fromkeys(stage for frame in frames for stage in frame)
+        series = {stage: [frame.get(stage, 0.0) for frame in frames] for stage in stages}
+        return {
+            stage: {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
+            for stage, values in series.items()
+        }
 
     def _last(self) -> dict[str, float]:
         return {stage: float(seconds) for stage, seconds in self._base.episode.outcomes[-1].timings.items()}
-
-
-def summarise(timings: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """``median`` and ``p95`` in seconds of every stage over the tracked frames; stages that did not run count as 0."""
-    frames = [frame for frame in timings if frame]
-    stages = list(dict.fromkeys(stage for frame in frames for stage in frame))
-    series = {stage: np.array([frame.get(stage, 0.0) for frame in frames]) for stage in stages}
-    return {
-        stage: {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
-        for stage, values in series.items()
-    }
 
 
 def slam_env_of(env: gym.Env[Any, Any], wrapper: str) -> SlamEnv:
@@ -76,9 +71,6 @@ def slam_env_of(env: gym.Env[Any, Any], wrapper: str) -> SlamEnv:
     if not isinstance(base, SlamEnv):
         raise SettingsError(f"{wrapper} wraps a SlamEnv, not a {type(base).__name__}")
     return base
-
-
-# A wrapper that writes each episode's trajectory to a file.
 
 
 class RecordTrajectory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -117,9 +109,6 @@ class RecordTrajectory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             write_tum(path, self._base.online_trajectory(), comment=comment)
             self.written.append(path)
         return outcome
-
-
-# A wrapper that takes another sequence for every episode.
 
 
 class SequenceSampler(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -174,9 +163,6 @@ class SequenceSampler(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return chosen
 
 
-# A wrapper that shows agents images of a size and form that networks take.
-
-
 class SmallImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """Makes ``rgbd`` observations small 8-bit images, colour and depth alike, as stable-baselines3 expects images.
 
@@ -215,9 +201,6 @@ class SmallImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
 
 
 _CHANNELS = {"rgb": 3, "depth": 1}
-
-
-# A wrapper that degrades the images before the tracker sees them, to measure robustness.
 
 
 class DegradeFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -344,8 +327,6 @@ def _motion_kernel(length: float, rng: np.random.Generator) -> NDArray[np.float3
     kernel = np.clip(1.0 - across, 0.0, 1.0) * np.clip(extent / 2 + 0.5 - np.abs(along), 0.0, 1.0)
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
-
-# A wrapper for the real-time mode: frames that arrive while the tracker is busy are dropped.
 
 WARM_UP_FRAMES = 12
 """Tracked off the clock: enough for keyframes and bundle adjustment, so every kernel and network has run once."""
