@@ -68,7 +68,7 @@ def environment() -> dict[str, str]:
 
 def command(*arguments: str) -> list[str]:
     """The command line in this interpreter."""
-    return [sys.executable, "-m", "dynslam_bench.cli", *arguments]
+    return [sys.executable, "-m", "dynslam_bench", *arguments]
 
 
 def outcome(results: Path) -> dict[str, tuple[str, str]]:

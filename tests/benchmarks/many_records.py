@@ -74,7 +74,7 @@ def fill(results: Path, records: int) -> None:
 def timed(*arguments: str) -> tuple[float, float, float]:
     """Wall and processor seconds of a command of the command line, and the megabytes of the largest process yet."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    command = [sys.executable, "-m", "dynslam_bench.cli", *arguments]
+    command = [sys.executable, "-m", "dynslam_bench", *arguments]
     subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime

@@ -367,6 +367,6 @@ def test_help_loads_nothing_heavy(arguments):
 
 
 def test_output_to_a_closed_pipe_is_no_error():
-    script = f"{sys.executable} -m dynslam_bench.cli sequences list | head -1"
+    script = f"{sys.executable} -m dynslam_bench sequences list | head -1"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stderr == "" and done.stdout.startswith("7-Scenes"), "the first data set"
