@@ -46,7 +46,7 @@ from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.segmentation.availability import segmentation_source
+from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 

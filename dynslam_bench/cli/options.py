@@ -38,8 +38,8 @@ class ShortHelp(TyperCommand):
     """A command whose ``--help`` leaves out rarely used options; ``--help-all`` shows them."""
 
     RARE = frozenset(
-        ("stride", "threads", "realtime", "drop", "degrade", "cache", "video", "rrd", "save_map", "start_map")
-        + ("localisation_only", "label", "time_limit", "memory_limit", "retry", "scheduler")
+        "stride threads realtime drop degrade cache video rrd save_map start_map localisation_only label "
+        "time_limit memory_limit retry scheduler".split()
     )
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

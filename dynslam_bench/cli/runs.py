@@ -253,9 +253,8 @@ def show_rows(rows: Sequence[Row], store: RunStore, protocol: str) -> None:
     """The same for rows that `list_runs` gave."""
 
     def show() -> None:
-        names = {
-            name: title for name, title in TITLES.items() if name != "frames" or any(row["frames"] for row in rows)
-        }
+        parts = any(row["frames"] for row in rows)
+        names = {name: title for name, title in TITLES.items() if parts or name != "frames"}
         names |= {name: title for name, title in OPTIONAL.items() if any(row.get(name) for row in rows)}
         columns = [(title, [shown_cell(name, row[name]) for row in rows]) for name, title in names.items()]
         write_columns(columns, shrink=("settings", "reason", "sequence", "run"), spare=SPARE)

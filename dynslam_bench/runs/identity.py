@@ -31,8 +31,7 @@ from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
-from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, weights_digest
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import DATASETS
 from dynslam_bench.sequences.view import part_of

@@ -45,9 +45,9 @@ def planted(name: str, tracker: str, bad: dict[str, Any]) -> TrackerSpec:
     return replace(spec, id=f"planted-{name}", settings=worse, presets={})
 
 
-MOTION = planted("motion", "emfoa-oft-no-masks", {"motion.enabled": False})
+MOTION = planted("motion", "emfoa-oft?masks=none", {"motion.enabled": False})
 FEATURES = planted("features", "mask-rcnn", {"features.n_features": 500, "segmentation.source": "embedded"})
-THRESHOLD = planted("threshold", "emfoa-oft-no-masks", {"motion.threshold_px": 10.0})
+THRESHOLD = planted("threshold", "emfoa-oft?masks=none", {"motion.threshold_px": 10.0})
 DILATION = planted("dilation", "mask-rcnn", {"segmentation.dilation_px": 0, "segmentation.source": "embedded"})
 MASKED_CASES = ("features", "dilation")
 SCENES = {
@@ -81,7 +81,7 @@ def study(case: str, options: argparse.Namespace) -> str:
     """Look at a plant's loss; where there is one, run a study and say what it recovered."""
     tuner = Tuner(study_of(case, options), options.results)
     fixed, held = tuner.spec.space.fixed, tuner.design.held_out
-    good = "mask-rcnn" if case in MASKED_CASES else "emfoa-oft-no-masks"
+    good = "mask-rcnn" if case in MASKED_CASES else "emfoa-oft?masks=none"
     published = evaluate(good, fixed, held, results=tuner.store, jobs=options.jobs)
     planted = tuner.evaluate(fixed, held, jobs=options.jobs, cache=False)
     loss = compared(planted, published)

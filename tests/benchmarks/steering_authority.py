@@ -1,6 +1,6 @@
 """What is worth steering: how far the poses of an episode move between the ends of each online setting's range.
 
-    python tests/benchmarks/steering_authority.py [--trackers emfoa-oft emfoa-oft-no-masks] [--frames 14] [--stride 3]
+    python tests/benchmarks/steering_authority.py [--trackers emfoa-oft emfoa-oft?masks=none] [--frames 14] [--stride 3]
         [--scene 'synthetic/walking_xyz?scene=103'] [--prefix flow]
 
 Each row is one setting of one tracker, alone: the mean over the frames of the distance in mm between the camera centres
@@ -38,7 +38,7 @@ def apart_mm(first, second) -> float:
 def main() -> int:
     """Print one row a setting."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trackers", nargs="+", default=["emfoa-oft", "emfoa-oft-no-masks"])
+    parser.add_argument("--trackers", nargs="+", default=["emfoa-oft", "emfoa-oft?masks=none"])
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--stride", type=int, default=STRIDE)
     parser.add_argument("--scene", default="synthetic/walking_xyz?scene=103")

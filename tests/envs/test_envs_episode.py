@@ -307,7 +307,7 @@ def test_asking_for_the_final_trajectory_changes_nothing_of_what_filters_see(mon
 
 def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path) -> None:
     (damaged := tmp_path / "damaged.npz").write_bytes(b"no map")
-    env = SlamEnv(ToySequence(12), "emfoa-oft-no-masks")
+    env = SlamEnv(ToySequence(12), "emfoa-oft?masks=none")
     env.reset(seed=0)
     settings, sequence = env.settings, env.sequence
     for options, words in (
@@ -323,7 +323,7 @@ def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path)
         with pytest.raises(DynslamError, match="before reset"):
             env.step(env.neutral_action)
     with pytest.raises(SettingsError, match="needs a map"):
-        SlamEnv(ToySequence(12), "emfoa-oft-no-masks", settings=_only_localising(settings))
+        SlamEnv(ToySequence(12), "emfoa-oft?masks=none", settings=_only_localising(settings))
     env.reset(seed=0)
     env.step(env.neutral_action)
 

@@ -13,7 +13,7 @@ from dynslam_bench.core.errors import DynslamError, SegmentationError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
-from dynslam_bench.segmentation.availability import segmentation_source
+from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.segmentation.recorded import RecordedSegmenter
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 from dynslam_bench.tuning import StudySpec, Tuner
@@ -89,7 +89,7 @@ def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_fold
             run_one(spec, store)
         return caught.value.options[-1]
 
-    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft-no-masks" in hint("mask-rcnn")
+    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft?masks=none" in hint("mask-rcnn")
 
 
 def test_a_study_refuses_it_too(toy_folder: str, mistakes, tmp_path: Path) -> None:

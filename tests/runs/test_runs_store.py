@@ -123,7 +123,9 @@ def test_a_folder_called_like_a_setting_is_no_other_run(
 
 
 def test_changed_weights_are_another_run(toy_folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dynslam_bench.segmentation.availability._check_network", lambda *_: None)  # any file will do
+    monkeypatch.setattr(
+        "dynslam_bench.segmentation.build_segmenter._check_network", lambda *_: None
+    )  # any file will do
     weights = tmp_path / "net.onnx"
     weights.write_bytes(b"one")
     spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": f"onnx:{weights}"})

@@ -125,13 +125,13 @@ def test_coco128():
 
 
 def test_rendered_frames_are_a_function_of_their_name():
-    text = "synthetic:instances=3-4,frames=2,length=30,options=0.5,seed=7"
+    text = "synthetic:scenes=3-4,frames=2,length=30,options=0.5,seed=7"
     one, two = open_labelled(text), open_labelled(text)
     assert isinstance(one, RenderedFrames) and one.name == text and len(one) == 2 * 8 * 2
     a, b = one[5], two[5]
     assert np.array_equal(a.rgb, b.rgb) and np.array_equal(a.masks, b.masks) and "person" in a.class_names
     assert not np.array_equal(a.rgb, one[4].rgb)
-    for bad in ("instances=0-200", "frames=0", "colour=1", "frames=x", "frames=40,length=30"):
+    for bad in ("scenes=0-200", "frames=0", "colour=1", "frames=x", "frames=40,length=30"):
         with pytest.raises(SegmentationError, match="synthetic:"):
             open_labelled(f"synthetic:{bad}")
     with pytest.raises(SegmentationError, match=r"did you mean 'synthetic'"):

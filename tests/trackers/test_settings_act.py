@@ -19,7 +19,7 @@ from dynslam_bench.trackers.systems.composition import SystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
 
 SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
-DENSE = "emfoa-oft-paper-no-masks"
+DENSE = "emfoa-oft-paper?masks=none"
 FRAMES, FEW = 14, 3
 
 
@@ -44,7 +44,7 @@ MANY = {
     "backend.keyframes.view_share": 0.98,
 }
 """A keyframe nearly every frame."""
-JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
+JUDGED = ("emfoa-oft?masks=none&depth=none", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
 """F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES: dict[str, tuple[str, dict[str, object]]] = {
@@ -59,7 +59,7 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "segmentation.nms_iou": NETWORK,
     "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
     **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
-    **{f"epipolar.{name}": ("emfoa-oft-paper-sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
+    **{f"epipolar.{name}": ("emfoa-oft-paper?flow=sparse", {}) for name in ("estimator", "confidence", "inlier_px", "mode")},
 }  # fmt: skip
 """Where a setting shows, if not in the first system that has it as it is: the system, and what else is set."""
 SHOWN_ALONE = frozenset({

@@ -46,15 +46,15 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
         "backend.keyframes.tracked_share": 0.95, "backend.keyframes.new_close": 400,
         "backend.keyframes.established": 5, "backend.keyframes.view_share": 0.5,
     }),
-    "epipolar.threshold_px": ("emfoa-oft-object", {}),
-    "epipolar.min_share": ("emfoa-oft-paper-no-masks", {}),
-    "free_space.threshold_m": ("emfoa-oft-no-masks", {
+    "epipolar.threshold_px": ("emfoa-oft?masks=vote&depth=none", {}),
+    "epipolar.min_share": ("emfoa-oft-paper?masks=none", {}),
+    "free_space.threshold_m": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,
     }),
-    "free_space.threshold_sigma": ("emfoa-oft-no-masks", {
+    "free_space.threshold_sigma": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01,
     }),
-    "free_space.min_votes": ("emfoa-oft-no-masks", {
+    "free_space.min_votes": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
     }),
     "segmentation.min_area_px": ("mask-rcnn", {"segmentation.classes": "all"}),
@@ -173,7 +173,7 @@ def test_only_what_differs_is_handed_on() -> None:
 
 
 def test_what_is_switched_off_needs_nobody_who_takes_it() -> None:
-    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft-no-masks"].settings())}
+    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft?masks=none"].settings())}
     assert "segmentation" not in names and {"flow", "motion"} <= names
-    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft-no-depth-test"].settings())}
+    names = {p.name.split(".")[0] for p in online_parameters(SYSTEMS["emfoa-oft?depth=none"].settings())}
     assert not {"motion", "free_space"} & names

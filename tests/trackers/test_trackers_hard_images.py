@@ -125,7 +125,7 @@ def test_a_gap_of_a_second_is_bridged_or_said(sequence) -> None:
 
 
 def test_frames_of_another_kind_are_refused_in_one_line(sequence) -> None:
-    tracker = build_tracker("emfoa-oft-no-masks", {}, TrackerContext(sequence_id=sequence.id))
+    tracker = build_tracker("emfoa-oft?masks=none", {}, TrackerContext(sequence_id=sequence.id))
     for method in (tracker.finalize, tracker.map_outputs):
         with pytest.raises(TrackerError, match=r"before reset\(\)"):
             method()
@@ -143,7 +143,7 @@ def test_frames_of_another_kind_are_refused_in_one_line(sequence) -> None:
 
 def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reused(sequence) -> None:
     def poses(missing: float, *, reuse: bool) -> bytes:
-        tracker = build_tracker("emfoa-oft-no-masks", {}, TrackerContext(sequence_id=sequence.id))
+        tracker = build_tracker("emfoa-oft?masks=none", {}, TrackerContext(sequence_id=sequence.id))
         tracker.reset(sequence.camera, rng=np.random.default_rng(0))
         found, buffer = [], np.empty_like(sequence[0].depth)
         for index in range(10):

@@ -20,8 +20,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
-from dynslam_bench.trackers.measured import epipolar_skipped
-from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.trackers.registry import all_specs, epipolar_skipped
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
 
 FRAMES = 6
@@ -211,13 +210,19 @@ def test_the_paper_is_ranked_as_the_paper_and_ours_as_ours() -> None:
     assert back_end.provenance == "own" and "no loop closing" in back_end.assumptions[0]
     flow = paper.settings().flow
     assert flow.mode == "dense" and flow.terms == 3 and flow.intensity_weight > 0 < flow.gradient_weight
-    wanted = ("emfoa-oft", "emfoa-oft-no-flow", "emfoa-oft-no-masks", "emfoa-oft-no-depth-test", "emfoa-oft-object")
+    wanted = (
+        "emfoa-oft",
+        "emfoa-oft?flow=none",
+        "emfoa-oft?masks=none",
+        "emfoa-oft?depth=none",
+        "emfoa-oft?masks=vote&depth=none",
+    )
     names = {name: {each.name for each in parameters(TRACKERS.get(name).settings)} for name in wanted}
     groups = {name: {each.split(".")[0] for each in found} for name, found in names.items()}
-    assert not groups["emfoa-oft-no-flow"] & {"flow", "epipolar", "motion", "free_space"}
-    assert "segmentation" not in groups["emfoa-oft-no-masks"]
-    assert not groups["emfoa-oft-no-depth-test"] & {"motion", "free_space"}
-    assert "segmentation.dilation_px" in names["emfoa-oft"] - names["emfoa-oft-object"]
+    assert not groups["emfoa-oft?flow=none"] & {"flow", "epipolar", "motion", "free_space"}
+    assert "segmentation" not in groups["emfoa-oft?masks=none"]
+    assert not groups["emfoa-oft?depth=none"] & {"motion", "free_space"}
+    assert "segmentation.dilation_px" in names["emfoa-oft"] - names["emfoa-oft?masks=vote&depth=none"]
     for spec in all_specs():
         assert spec.id == paper.id or "EMFOA-OFT-SLAM" not in spec.published_as
         if spec.id.startswith("emfoa-oft-") and spec.id != paper.id and spec.sensors == "rgbd":
