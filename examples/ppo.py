@@ -49,9 +49,8 @@ def main(steps: str | int = 2000, frames: int = 60, scenes: int = 4) -> None:
 
     held_out = make("synthetic/sitting_xyz?scene=100", frames)
     print(f"default settings:   {earned(held_out, lambda _: held_out.unwrapped.neutral_action):.4f} m")
-    print(
-        f"after {steps} steps:     {earned(held_out, lambda observation: agent.predict(observation, deterministic=True)[0]):.4f} m"
-    )
+    learned = earned(held_out, lambda observation: agent.predict(observation, deterministic=True)[0])
+    print(f"after {steps} steps:     {learned:.4f} m")
 
 
 if __name__ == "__main__":
