@@ -254,7 +254,7 @@ def test_reset_options() -> None:
 
 def test_a_tracker_that_cannot_be_steered(toy_folder: str) -> None:
     env = SlamEnv(toy_folder, TARGET.replace(":SPEC", ":FIXED"), control=["noise.clip"])
-    with pytest.raises(TrackerError, match="toy-fixed' cannot be steered in mid-episode"):
+    with pytest.raises(TrackerError, match="toy-fixed' cannot change its settings in mid-episode"):
         env.reset()
 
 
