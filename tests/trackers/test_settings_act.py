@@ -37,13 +37,10 @@ def offered() -> dict[str, tuple[str, Parameter]]:
 
 
 OFFERED = offered()
-MANY = {"backend.keyframes.tracked_share": 1.0}
-"""A keyframe nearly every frame."""
 JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
 """F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES: dict[str, tuple[str, dict[str, object]]] = {
-    "backend.keyframes.redundant_share": ("orb-slam2", MANY),
     "multiview.order": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
@@ -58,7 +55,7 @@ SHOWN_ALONE = frozenset({
     "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
     "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
     "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
-    "backend.keyframes.max_gap", "backend.bundle_adjustment.window",
+    "backend.keyframes.max_gap", "backend.keyframes.redundant_share", "backend.bundle_adjustment.window",
 })  # fmt: skip
 """Settings that change nothing on these few frames: most ask for long maps, for long ages, or for being lost.
 
