@@ -12,7 +12,7 @@ emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measure
 hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
-compile_kernels  # cli.kernels: .ci/run calls it, before the tests
+compile_kernels  # cli.demo: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
 # called by name: specs name their factories as "module:name"
@@ -38,6 +38,9 @@ build_masks_only  # trackers.systems.dynaslam: a variant's spec
 build_object_mode  # trackers.systems.emfoa_oft: a variant's spec
 
 # called by a library
+as_json  # options of verbs: the callback of --json switches the output
+help_all  # the same: the callback of --help-all writes the help
+__dir__  # the interpreter: dir(dynslam_bench)
 __getattr__  # Python asks it for names of a package that are loaded late
 action_space  # gymnasium.Env
 observation_space  # gymnasium.Env
