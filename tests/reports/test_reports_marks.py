@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from reports_fake_store import add_run
 
-from dynslam_bench.cli.runs import seen_note
+from dynslam_bench.cli.runs import training_scene_note
 from dynslam_bench.reports import build_report, compare, load_board
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s
 from dynslam_bench.runs.store import RunStore
@@ -86,9 +86,9 @@ def test_every_format_carries_the_mark(store, tmp_path, rank_seen):
 
 def test_run_says_it_in_one_line(store):
     records = [store.get(run) for run in store.ids()]
-    assert seen_note(records).startswith("2 of 8 runs have masks of a network that was trained on their scene")
-    assert seen_note(records).endswith("e.g. synthetic/walking_xyz?scene=100") and "\n" not in seen_note(records)
-    assert seen_note([record for record in records if record.sequence.id == NEW]) == ""
+    assert training_scene_note(records).startswith("2 of 8 runs have masks of a network that was trained on their scene")
+    assert training_scene_note(records).endswith("e.g. synthetic/walking_xyz?scene=100") and "\n" not in training_scene_note(records)
+    assert training_scene_note([record for record in records if record.sequence.id == NEW]) == ""
 
 
 def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):
