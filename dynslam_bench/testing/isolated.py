@@ -90,7 +90,7 @@ def isolated_tracker_report(
 
             outcomes = [asdict(check) for check in checks]
             job = make_job(_WORK, folder.path, spec={"threads": 1}, known=outcomes, **job_options)
-            verdict = supervise(start_child(), job, limits, receive, tick=tick, located=False)
+            verdict = supervise(Child(), job, limits, receive, tick=tick, located=False)
         if verdict.status != "ok":
             add(_failure(verdict, running, checks))
         if verdict.status == "ok" or not running:  # between two checks, another child would fail alike
