@@ -320,9 +320,9 @@ def _all_rows(
         taken[id(cache)] += rows
         loaded.unreadable += unreadable
     everything = []
-    for cache, rows in zip(caches, kept, strict=True):
+    for cache, known_rows in zip(caches, kept, strict=True):
         cache.add(taken[id(cache)])
-        everything += [*rows.values(), *(row for row, _ in taken[id(cache)])]
+        everything += [*known_rows.values(), *(row for row, _ in taken[id(cache)])]
     return everything
 
 
