@@ -9,7 +9,7 @@ from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean, median
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
