@@ -7,19 +7,16 @@ relative_to_first  # on a Trajectory, for users who compare with systems that st
 of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
-BoxFilter  # a rejection rule for systems of one's own, held to its paper by tests/culling
-emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
-hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
-TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
+
 compile_kernels  # cli.kernels: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
+
+_restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
 build_daisy  # flow.registry
-build_lucas_kanade  # flow.registry
-build_dis  # flow.registry
 build_recorded  # segmentation.registry
 build_onnx  # segmentation.registry
 build_embedded  # segmentation.registry
@@ -79,7 +76,6 @@ reward_m  # a column of frames.csv
 _.append_logs  # Optuna calls it: a backend of its journal
 _.tempdir  # tempfile reads it: where a run's temporary files go
 _.row_poses  # rendered sequences: the exact pose of every row
-_.bytes_in_files  # on a map's TableSpace: what of it lies in files (tests/benchmarks/backend_territory.py)
 pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
 _.runtest  # pytest calls it

@@ -1,4 +1,4 @@
-"""What an environment's arguments may be, as far as nothing has to be looked up for it."""
+"""The arguments of an environment: the sequence and its part, the device, and the names of modes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.view import SequenceView
 
 RENDER_MODES = ("rgb_array",)
+Frames = PySequence[int | None] | str | None
+"""Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
 
 
 def check_arguments(render_mode: str | None, observation: str, lost_after: int | None, threads: int) -> None:
-    """Refuse what no environment can be made with.
+    """Refuse arguments with which no environment can be made.
 
     Raises:
         SettingsError: Names the first such argument and its value.
@@ -37,12 +39,6 @@ def check_arguments(render_mode: str | None, observation: str, lost_after: int |
         raise SettingsError(f"threads is {threads}", "give a number >= 1")
 
 
-# Opening what an environment is named: an id, a folder, or a sequence object.
-
-Frames = PySequence[int | None] | str | None
-"""Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
-
-
 def open_frames(
     sequence: str | Sequence,
     data_root: str | Path | None,
@@ -51,16 +47,32 @@ def open_frames(
     stride: int,
     preprocessing: PreprocessingSettings | None = None,
 ) -> Sequence:
-    """The sequence, preprocessed and cut to the frames asked for.
+    """The sequence, preprocessed and cut to the chosen frames.
+
+    Args:
+        sequence: An id, a folder, or a sequence object.
+        data_root: Folder of the sequences.
+        camera: Camera of a folder that does not name its own.
+        frames: Part of the sequence.
+        stride: Take every so many frames.
+        preprocessing: Applied to every frame.
 
     Raises:
         SequenceError: Unknown, missing or damaged sequence, or no frames are left.
     """
-    start, stop = parse_frames(frames if frames is None or isinstance(frames, str) else _pair(frames))
+    if frames is not None and not isinstance(frames, str):
+        if len(frames) != 2:
+            raise SequenceError(f"frames {list(frames)} has {len(frames)} entries", "give (start, stop)")
+        frames = (int(frames[0] or 0), frames[1])
+    start, stop = parse_frames(cast("tuple[int, int | None] | str | None", frames))
     if isinstance(sequence, str | Path):
-        part = (start, stop)
         return open_sequence(
-            sequence, data_root=data_root, camera=camera, frames=part, stride=stride, preprocessing=preprocessing
+            sequence,
+            data_root=data_root,
+            camera=camera,
+            frames=(start, stop),
+            stride=stride,
+            preprocessing=preprocessing,
         )
     if stride < 1:
         raise SequenceError(f"stride is {stride}, expected at least 1")
@@ -74,11 +86,11 @@ def open_frames(
 
 
 def check_frames(sequence: Sequence) -> None:
-    """Refuse a sequence that is too short for an episode, or whose stamps tell no frame or true pose from another.
+    """Refuse a sequence that is too short for an episode, or whose stamps do not tell its frames or true poses apart.
 
     Raises:
-        SequenceError: It has fewer than two frames, stamps that do not increase, or two of the frames or of the ground
-            truth that differ by less than 1 us.
+        SequenceError: It has fewer than two frames, stamps that do not increase, or two frames or true poses less than
+            1 us apart.
     """
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
@@ -92,21 +104,14 @@ def check_frames(sequence: Sequence) -> None:
             "each frame has a stamp of its own, in seconds, ascending",
         )
     refuse_close(timestamps_ns(sequence), f"frames of '{sequence.id}'", SequenceError)
-    truth = sequence.ground_truth
-    if truth is not None:
-        refuse_close(truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError)
+    if sequence.ground_truth is not None:
+        refuse_close(sequence.ground_truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError)
 
 
 def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
     """The group ``preprocessing`` of a tracker's settings; None for trackers without one."""
-    found = getattr(settings, "preprocessing", None)
-    return found if isinstance(found, PreprocessingSettings) else None
-
-
-def _pair(frames: PySequence[int | None]) -> tuple[int, int | None]:
-    if len(frames) != 2:
-        raise SequenceError(f"frames {list(frames)} has {len(frames)} entries", "give (start, stop)")
-    return int(frames[0] or 0), frames[1]
+    group = getattr(settings, "preprocessing", None)
+    return group if isinstance(group, PreprocessingSettings) else None
 
 
 def check_same_size(old: Camera, new: Camera) -> None:
@@ -121,9 +126,6 @@ def check_same_size(old: Camera, new: Camera) -> None:
         )
 
 
-# Which device a run computes on.
-
-
 def resolve_device(name: str = "auto") -> str:
     """``cpu`` or ``cuda:N`` for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
 
@@ -136,18 +138,14 @@ def resolve_device(name: str = "auto") -> str:
         return "cpu"
     if name != "auto" and not re.fullmatch(r"cuda(:\d+)?", name):
         raise SettingsError(f"unknown device '{name}'", "write auto, cpu, cuda or cuda:N")
-    count = _cuda_devices()
+    count = 0
+    if any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")):
+        import torch
+
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
         return "cuda:0" if count else "cpu"
     index = int(name.partition(":")[2] or 0)
     if index >= count:
         raise SettingsError(f"device '{name}' was asked for, this machine has {count} CUDA devices", "use --device cpu")
     return f"cuda:{index}"
-
-
-def _cuda_devices() -> int:
-    if not any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")):
-        return 0
-    import torch
-
-    return torch.cuda.device_count() if torch.cuda.is_available() else 0

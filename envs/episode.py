@@ -1,4 +1,4 @@
-"""What an environment remembers of the episode that runs."""
+"""One episode: its frames, tracking one of them, the ``info`` of a step, and the metrics at the end."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 
 FrameState = Literal["initialising", "ok", "lost", "dropped"]
+FrameTransform = Callable[[Frame], Frame]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,81 +90,55 @@ class Episode:
         return Trajectory(stamps, poses)
 
 
-# One frame through the tracker, timed and checked.
-
-FrameTransform = Callable[[Frame], Frame]
-
-
-@dataclass(frozen=True, eq=False)
-class TimedResult:
-    """What became of a frame.
-
-    Attributes:
-        frame: The frame as the tracker saw it.
-        result: The tracker's checked result.
-        timings: Seconds: ``read``, ``total``, ``processor`` and the tracker's stages (see `FrameOutcome`).
-    """
-
-    frame: Frame
-    result: TrackResult
-    timings: dict[str, float]
-
-
 def track_one(
     tracker: Tracker, name: str, sequence: Sequence, index: int, transforms: Iterable[FrameTransform]
-) -> TimedResult:
+) -> tuple[Frame, TrackResult, dict[str, float]]:
     """Read a frame and track it.
 
     Args:
-        tracker: Who tracks.
-        name: The tracker's id, for messages.
+        tracker: The tracker.
+        name: Its id, for messages.
         sequence: Where the frame comes from.
         index: Which one.
-        transforms: Applied in order before the tracker sees it.
+        transforms: Applied in order before the tracker gets it.
+
+    Returns:
+        The transformed frame, the checked result, and the times (see `FrameOutcome.timings`).
 
     Raises:
-        SequenceError: The frame cannot be read, or is none of the sequence's camera.
+        SequenceError: The frame cannot be read, or does not fit the sequence's camera.
         TrackerContractError: The tracker broke its contract.
     """
     began = time.perf_counter()
-    frame = read_frame(sequence, index)
+    frame = _read_frame(sequence, index)
     for transform in transforms:
         frame = transform(frame)
-    read, worked = time.perf_counter(), time.process_time()
+    read, processor_began = time.perf_counter(), time.process_time()
     with tracker_code():
         result = tracker.track(frame)
-    total, processor = time.perf_counter() - read, time.process_time() - worked
+    total, processor = time.perf_counter() - read, time.process_time() - processor_began
     result = check_result(result, frame, name)
-    if result.stats.get("cached_stages"):  # the stages report what they cost without the cache
+    if result.stats.get("cached_stages"):  # the stages report their times without the cache
         uncached = max(total, sum(result.timings.values()))
         total, processor = uncached, processor + uncached - total
-    own = {"read": read - began, "total": total, "processor": processor}
-    stages = {stage: float(seconds) for stage, seconds in result.timings.items() if stage not in own}
-    return TimedResult(frame, result, own | stages)
+    stages = {stage: float(seconds) for stage, seconds in result.timings.items()}
+    measured = {"read": read - began, "total": total, "processor": processor}
+    return frame, result, measured | {name: value for name, value in stages.items() if name not in measured}
 
 
-def read_frame(sequence: Sequence, index: int) -> Frame:
-    """A frame, whatever raises while it is read, and only if it is one of the sequence's camera.
-
-    Raises:
-        SequenceError: Names the frame, the fault and the cure.
-    """
+def _read_frame(sequence: Sequence, index: int) -> Frame:
+    """A frame that fits the sequence's camera; any error in reading it becomes a `SequenceError`."""
     try:
         frame = sequence[index]
         check_frame(frame, sequence.camera)
     except MemoryError:
         raise
     except Exception as error:  # a data set of the user's may raise anything
-        words, hint = (error.args[0], error.hint) if isinstance(error, DynslamError) else (_named(error), "")
-        raise SequenceError(f"frame {index} of '{sequence.id}' cannot be read: {words}", hint) from error
+        ours = isinstance(error, DynslamError)
+        fault = error.args[0] if ours else f"{type(error).__name__}: {error}".rstrip(": ")
+        hint = getattr(error, "hint", "") if ours else ""
+        raise SequenceError(f"frame {index} of '{sequence.id}' cannot be read: {fault}", hint) from error
     return frame
-
-
-def _named(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".rstrip(": ")
-
-
-# What an environment tells of a frame: the ``info`` of `reset` and `step`.
 
 
 def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
@@ -176,22 +151,16 @@ def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
     }
     if outcome.T_world_cam is not None:
         info["pose"] = np.concatenate(se3.to_quaternion(outcome.T_world_cam))
-    return info | _defined(outcome.error)
-
-
-def _defined(error: OnlineSample | None) -> dict[str, float]:
-    if error is None:
-        return {}
-    named = {
-        "pose_error_trans_m": error.trans_m,
-        "pose_error_rot_deg": error.rot_deg,
-        "frame_error_trans_m": error.frame_trans_m,
-        "frame_error_rot_deg": error.frame_rot_deg,
-    }
-    return {name: float(value) for name, value in named.items() if value is not None}
-
-
-# The metrics of an episode under a protocol.
+    error = outcome.error
+    if error is not None:
+        errors = {
+            "pose_error_trans_m": error.trans_m,
+            "pose_error_rot_deg": error.rot_deg,
+            "frame_error_trans_m": error.frame_trans_m,
+            "frame_error_rot_deg": error.frame_rot_deg,
+        }
+        info |= {name: float(value) for name, value in errors.items() if value is not None}
+    return info
 
 
 def episode_metrics(
@@ -200,11 +169,11 @@ def episode_metrics(
     timestamps: NDArray[np.float64],
     ground_truth: Trajectory | None,
 ) -> dict[str, float]:
-    """Plain floats by name; what is not defined is left out.
+    """The metrics of an episode under a protocol: plain floats by name, without undefined ones.
 
     Args:
         protocol: How to evaluate.
-        trajectory: Poses of the tracked frames, online or final: coverage is that of what is scored.
+        trajectory: Poses of the tracked frames, online or final; coverage is that of this trajectory.
         timestamps: Stamps in seconds of all frames that were due, tracked or not.
         ground_truth: True poses; None leaves only the coverage and the counts.
 
@@ -215,7 +184,7 @@ def episode_metrics(
     frames = len(timestamps)
     try:
         tracked = int(tracked_frames(trajectory, timestamps).sum())
-    except EvaluationError:  # a final trajectory whose poses are of no frame
+    except EvaluationError:  # a final trajectory whose stamps are of no frame
         tracked = 0
     counts = {
         "coverage": tracked / frames if frames else 0.0,

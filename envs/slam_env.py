@@ -1,4 +1,4 @@
-"""Copies of an environment in mid-episode."""
+"""The Gymnasium environment: one sequence is one episode, one step runs a whole tracker on one frame."""
 
 from __future__ import annotations
 
@@ -46,38 +46,8 @@ from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.segmentation.availability import segmentation_source
+from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
-
-_SHARED = ("sequence", "_source", "tracker_spec", "protocol", "settings")
-"""What nobody writes to."""
-
-
-def deep_copy(env: SlamEnv, memo: dict[int, Any]) -> SlamEnv:
-    """The environment at the same frame of its episode, with a tracker of its own: both go on alike, apart.
-
-    What nobody writes to is shared: the sequence, the specs and the settings.
-
-    Raises:
-        TrackerError: The tracker cannot be copied, as a program of its own cannot.
-    """
-    parts = vars(env)
-    for name in _SHARED:
-        memo[id(parts[name])] = parts[name]
-    copied = memo[id(env)] = object.__new__(type(env))
-    try:
-        tracker = deepcopy(parts["_tracker"], memo)
-    except Exception as error:
-        raise TrackerError(
-            f"tracker '{env.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
-            "make a second environment, or give the tracker a __deepcopy__",
-        ) from error
-    rest = {name: value for name, value in parts.items() if name not in ("_tracker", "_canvas")}
-    vars(copied).update(deepcopy(rest, memo), _tracker=tracker, _canvas=None)
-    return copied
-
-
-# The Gymnasium environment: one sequence is one episode, one step runs a whole tracker on one frame.
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -114,7 +84,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         sequence: Id, path of a folder in TUM layout, or an opened sequence.
         tracker: Id, ``id:value``, ``module:Attr``, ``file.py:Attr``, or a spec.
         settings: Overrides of the tracker's settings by dotted name, or its complete settings.
-        control: Dotted names of the online settings that actions steer.
+        control: Dotted names of the online settings that actions change.
         observation: ``stats`` or ``rgbd``.
         reward: ``neg_rpe`` or ``neg_pose_error``.
         protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and ground truth.
@@ -182,11 +152,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._final: Trajectory | None = None
         self._canvas: Any = None
 
-    # -- what users and runs look at -------------------------------------------------------------------------------
-
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Dotted names of the steered settings, in the order of the action's coordinates."""
+        """Dotted names of the controlled settings, in the order of the action's coordinates."""
         return self._actions.names
 
     @property
@@ -239,8 +207,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             raise TrackerError(f"tracker '{self.tracker_spec.id}' {why}")
         with tracker_code():
             save(Path(path), made_by)
-
-    # -- Gymnasium -------------------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and track frame 0.
@@ -355,9 +321,27 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             with tracker_code():
                 close()
 
-    __deepcopy__ = deep_copy
+    def __deepcopy__(self, memo: dict[int, Any]) -> SlamEnv:
+        """An independent copy at the same frame of the episode, with a tracker of its own.
 
-    # -- inside ----------------------------------------------------------------------------------------------------
+        The sequence, the specs and the settings are shared: they are never changed.
+
+        Raises:
+            TrackerError: The tracker cannot be copied, e.g. because it is an external program.
+        """
+        parts = dict(vars(self), _canvas=None)
+        for name in ("sequence", "_source", "tracker_spec", "protocol", "settings"):
+            memo[id(parts[name])] = parts[name]
+        copied = memo[id(self)] = object.__new__(type(self))
+        try:
+            deepcopy(self._tracker, memo)
+        except Exception as error:
+            raise TrackerError(
+                f"tracker '{self.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
+                "make a second environment, or give the tracker a __deepcopy__",
+            ) from error
+        vars(copied).update(deepcopy(parts, memo))
+        return copied
 
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
         if isinstance(settings, Settings):
@@ -414,7 +398,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self._tracker_key = key
             if self._actions.parameters and not isinstance(self._tracker, Reconfigurable):
                 raise TrackerError(
-                    f"tracker '{self.tracker_spec.id}' cannot be steered in mid-episode",
+                    f"tracker '{self.tracker_spec.id}' cannot change its settings in mid-episode",
                     "it has no configure(settings) method: leave control empty",
                 )
         return self._tracker
@@ -429,12 +413,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _track_next(self, tracker: Tracker) -> None:
         index = self.episode.next_index
         self._final = None
-        done = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
-        frame, result = self.frame, self.result = done.frame, done.result
+        frame, result, timings = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
+        self.frame, self.result = frame, result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose, pose is not None)
         reward = self._reward(error)
-        timings = done.timings
         self.episode.add(FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error, reward))
 
     def _observe(self) -> Any:
@@ -442,6 +425,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         here = outcomes[-1].T_world_cam
         before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
         motion = se3.inverse(before) @ here if here is not None and before is not None else None
+        context = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
         make = stats_observation if self._observation == "stats" else rgbd_observation
-        seen = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
-        return make(self.frame, self.result, seen)
+        return make(self.frame, self.result, context)

@@ -1,4 +1,4 @@
-"""Steering a tracker's online settings with a normalised action."""
+"""Action space, observation space and reward of the environment. Ground truth never enters an observation."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
 _ONLY = spaces.Discrete(1)
-"""The action space without steered settings; for membership alone, since each environment seeds its own."""
+"""The action space without controlled settings; for membership alone, since each environment seeds its own."""
 
 
 class ActionMap:
     """Maps actions to settings.
 
-    Without steered settings the action space is ``Discrete(1)``: the only action lets the tracker be. Otherwise it is
+    Without controlled settings the action space is ``Discrete(1)``: its action changes nothing. Otherwise it is
     ``Box(-1, 1, (k,), float32)``, one coordinate a setting, in the order of `control`. With ``u = (a + 1) / 2``:
 
     - float: ``low + u * (high - low)``, or ``low * (high / low) ** u`` on a log scale;
@@ -47,7 +47,7 @@ class ActionMap:
     bits a coordinate, from which most values come back changed in the last places.
 
     Args:
-        settings: The settings of the episode; what is not steered stays as it is here.
+        settings: The settings of the episode; all others keep these values.
         control: Dotted names of online settings.
 
     Raises:
@@ -70,7 +70,7 @@ class ActionMap:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Dotted names of the steered settings, in the order of the action's coordinates."""
+        """Dotted names of the controlled settings, in the order of the action's coordinates."""
         return tuple(parameter.name for parameter in self.parameters)
 
     def space(self) -> spaces.Space[NDArray[np.float32]] | spaces.Discrete:
@@ -83,7 +83,7 @@ class ActionMap:
         """The settings that an action asks for.
 
         Args:
-            action: float ``[k]``; values beyond [-1, 1] are clipped. Without steered settings 0.
+            action: float ``[k]``; values beyond [-1, 1] are clipped. Without controlled settings 0.
 
         Raises:
             SettingsError: The action is none of the space: not 0, of another shape, no numbers, or NaN.
@@ -98,7 +98,7 @@ class ActionMap:
         return apply_overrides(self.base, self.values(action))
 
     def values(self, action: object) -> dict[str, Scalar]:
-        """Dotted name to value of the steered settings under an action."""
+        """Dotted name to value of the controlled settings under an action."""
         try:
             vector = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
@@ -107,7 +107,7 @@ class ActionMap:
             ) from None
         if vector.shape != (len(self.parameters),):
             raise SettingsError(
-                f"the action has shape {vector.shape}, {len(self.parameters)} settings are steered: {self.names}"
+                f"the action has shape {vector.shape}, {len(self.parameters)} settings are controlled: {self.names}"
             )
         if np.isnan(vector).any():
             raise SettingsError(f"the action holds NaN: {vector.tolist()}")
@@ -157,7 +157,7 @@ def _decode(parameter: Parameter, share: float) -> Scalar:
     assert parameter.low is not None and parameter.high is not None
     low, high = float(parameter.low), float(parameter.high)
     value = low * (high / low) ** share if parameter.scale == "log" else low + share * (high - low)
-    value = min(max(value, low), high)  # rounding may carry a power a hair beyond its end
+    value = min(max(value, low), high)  # rounding may put a power slightly beyond its end
     return round(value) if parameter.kind == "int" else value
 
 
@@ -170,8 +170,6 @@ def _encode(parameter: Parameter, value: Scalar) -> float:
         return math.log(max(x, low) / low) / math.log(high / low)
     return (x - low) / (high - low)
 
-
-# What an agent sees: a documented vector of diagnostics, or the images. Ground truth never enters it.
 
 ObservationKind = Literal["stats", "rgbd"]
 MAX_DEPTH_M = 20.0
@@ -247,7 +245,7 @@ def rgbd_space(camera: Camera) -> spaces.Dict:
 def stats_observation(frame: Frame, result: TrackResult, context: ObservationContext) -> NDArray[np.float32]:
     """The vector of `STATS_LAYOUT` for one tracked frame; finite whatever the tracker reports."""
     stats = result.stats
-    found = _stat(stats, "keypoints")
+    keypoints = _stat(stats, "keypoints")
     culled = _stat(stats, "culled")
     matches = _stat(stats, "matches")
     motion = np.zeros(6)
@@ -262,9 +260,9 @@ def stats_observation(frame: Frame, result: TrackResult, context: ObservationCon
         float(result.state == "lost"),
         _saturate(context.lost_streak, 10.0),
         context.index / max(context.last_index, 1),
-        _saturate(found, 1000.0),
-        _ratio(culled, found),
-        _ratio(matches, found - culled),
+        _saturate(keypoints, 1000.0),
+        _ratio(culled, keypoints),
+        _ratio(matches, keypoints - culled),
         _ratio(_stat(stats, "inliers"), matches),
         _saturate(_stat(stats, "residual_px"), 1.0),
         _stat(stats, "mask_fraction"),
@@ -305,8 +303,6 @@ def _saturate(value: float, scale: float) -> float:
 def _ratio(part: float, whole: float) -> float:
     return min(max(part / whole, 0.0), 1.0) if whole > 0 else 0.0
 
-
-# Named rewards.
 
 RewardKind = Literal["neg_rpe", "neg_pose_error"]
 

@@ -1,4 +1,4 @@
-"""A wrapper that puts wall-clock times into ``info``."""
+"""Wrappers: timings, trajectories, sequences, small images, degraded and dropped frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,26 @@ from dynslam_bench.envs.spaces import MAX_DEPTH_M
 from dynslam_bench.geometry.trajectory_files import write_tum
 
 
-class RecordTimings(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class SlamWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Base of the wrappers of a `SlamEnv`.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+        **arguments: Those of the wrapper's constructor, for the environment's spec.
+
+    Raises:
+        SettingsError: It is another environment.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], **arguments: Any) -> None:
+        RecordConstructorArgs.__init__(self, **arguments)
+        gym.Wrapper.__init__(self, env)
+        if not isinstance(env.unwrapped, SlamEnv):
+            raise SettingsError(f"{type(self).__name__} wraps a SlamEnv, not a {type(env.unwrapped).__name__}")
+        self._base = env.unwrapped
+
+
+class RecordTimings(SlamWrapper):
     """Adds ``info["timings"]``: seconds of the frame by stage (see `FrameOutcome.timings`).
 
     Times differ from run to run, so an environment with this wrapper is not deterministic in its ``info``.
@@ -31,11 +50,6 @@ class RecordTimings(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Args:
         env: A `SlamEnv`, wrapped or not.
     """
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
-        gym.Wrapper.__init__(self, env)
-        self._base = slam_env_of(env, "RecordTimings")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset, with the times of frame 0 in ``info``."""
@@ -49,39 +63,19 @@ class RecordTimings(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
-        return summarise(self._base.timings)
+        frames = [frame for frame in self._base.timings if frame]
+        stages = dict.fromkeys(stage for frame in frames for stage in frame)
+        series = {stage: [frame.get(stage, 0.0) for frame in frames] for stage in stages}
+        return {
+            stage: {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
+            for stage, values in series.items()
+        }
 
     def _last(self) -> dict[str, float]:
         return {stage: float(seconds) for stage, seconds in self._base.episode.outcomes[-1].timings.items()}
 
 
-def summarise(timings: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """``median`` and ``p95`` in seconds of every stage over the tracked frames; stages that did not run count as 0."""
-    frames = [frame for frame in timings if frame]
-    stages = list(dict.fromkeys(stage for frame in frames for stage in frame))
-    series = {stage: np.array([frame.get(stage, 0.0) for frame in frames]) for stage in stages}
-    return {
-        stage: {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
-        for stage, values in series.items()
-    }
-
-
-def slam_env_of(env: gym.Env[Any, Any], wrapper: str) -> SlamEnv:
-    """The `SlamEnv` below the wrappers.
-
-    Raises:
-        SettingsError: It is another environment.
-    """
-    base = env.unwrapped
-    if not isinstance(base, SlamEnv):
-        raise SettingsError(f"{wrapper} wraps a SlamEnv, not a {type(base).__name__}")
-    return base
-
-
-# A wrapper that writes each episode's trajectory to a file.
-
-
-class RecordTrajectory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class RecordTrajectory(SlamWrapper):
     """Writes the online trajectory of every episode that ends, in TUM's format.
 
     Args:
@@ -91,9 +85,7 @@ class RecordTrajectory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env[Any, Any], path: str | Path) -> None:
-        RecordConstructorArgs.__init__(self, path=str(path))
-        gym.Wrapper.__init__(self, env)
-        self._base = slam_env_of(env, "RecordTrajectory")
+        super().__init__(env, path=str(path))
         self._pattern = str(path)
         self._episode = -1
         self.written: list[Path] = []
@@ -119,10 +111,7 @@ class RecordTrajectory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return outcome
 
 
-# A wrapper that takes another sequence for every episode.
-
-
-class SequenceSampler(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class SequenceSampler(SlamWrapper):
     """Begins every episode on another sequence of a list, for training agents and for evaluation.
 
     Args:
@@ -141,9 +130,7 @@ class SequenceSampler(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         sequences: Sequence[str],
         mode: Literal["round_robin", "random"] = "round_robin",
     ) -> None:
-        RecordConstructorArgs.__init__(self, sequences=list(sequences), mode=mode)
-        gym.Wrapper.__init__(self, env)
-        slam_env_of(env, "SequenceSampler")
+        super().__init__(env, sequences=list(sequences), mode=mode)
         if not sequences:
             raise SettingsError("SequenceSampler got no sequences")
         if mode not in ("round_robin", "random"):
@@ -174,10 +161,7 @@ class SequenceSampler(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return chosen
 
 
-# A wrapper that shows agents images of a size and form that networks take.
-
-
-class SmallImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
     """Makes ``rgbd`` observations small 8-bit images, colour and depth alike, as stable-baselines3 expects images.
 
     ``rgb`` becomes uint8 ``[height, width, 3]``, averaged over the pixels that fall together; ``depth`` becomes uint8
@@ -194,9 +178,7 @@ class SmallImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env[Any, Any], width: int = 80, height: int = 60) -> None:
-        RecordConstructorArgs.__init__(self, width=width, height=height)
-        gym.ObservationWrapper.__init__(self, env)
-        slam_env_of(env, "SmallImages")
+        super().__init__(env, width=width, height=height)
         space = env.observation_space
         if not isinstance(space, spaces.Dict):
             raise SettingsError("SmallImages needs images, the observation is 'stats'", 'use observation="rgbd"')
@@ -217,10 +199,7 @@ class SmallImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
 _CHANNELS = {"rgb": 3, "depth": 1}
 
 
-# A wrapper that degrades the images before the tracker sees them, to measure robustness.
-
-
-class DegradeFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class DegradeFrames(SlamWrapper):
     """Adds seeded lighting changes, glare, shadow, motion blur and noise to every frame.
 
     The degradation of a frame depends on the seed, the strengths and the frame's index only, so all trackers see the
@@ -253,13 +232,10 @@ class DegradeFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         depth_noise: float = 0.0,
         seed: int = 0,
     ) -> None:
-        RecordConstructorArgs.__init__(
-            self, lighting=lighting, glare=glare, shadow=shadow, blur=blur, noise=noise, depth_noise=depth_noise,
-            seed=seed,
-        )  # fmt: skip
-        gym.Wrapper.__init__(self, env)
-        self.degradation = Degradation(lighting, glare, shadow, blur, noise, depth_noise, seed)
-        slam_env_of(env, "DegradeFrames").frame_transforms.append(self.degradation)
+        strengths = {"lighting": lighting, "glare": glare, "shadow": shadow, "blur": blur, "noise": noise}
+        super().__init__(env, **strengths, depth_noise=depth_noise, seed=seed)
+        self.degradation = Degradation(**strengths, depth_noise=depth_noise, seed=seed)
+        self._base.frame_transforms.append(self.degradation)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -345,13 +321,11 @@ def _motion_kernel(length: float, rng: np.random.Generator) -> NDArray[np.float3
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
-# A wrapper for the real-time mode: frames that arrive while the tracker is busy are dropped.
-
 WARM_UP_FRAMES = 12
 """Tracked off the clock: enough for keyframes and bundle adjustment, so every kernel and network has run once."""
 
 
-class DropFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class DropFrames(SlamWrapper):
     """Feeds the tracker only the frames that a live camera would have left it, or drops frames at random.
 
     Real-time mode: frame i arrives at its stamp. When the tracker is done with a frame it takes the newest one that
@@ -382,15 +356,13 @@ class DropFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         share: float | None = None,
         seed: int = 0,
     ) -> None:
-        RecordConstructorArgs.__init__(self, speed=speed, frame_time_s=frame_time_s, share=share, seed=seed)
-        gym.Wrapper.__init__(self, env)
+        super().__init__(env, speed=speed, frame_time_s=frame_time_s, share=share, seed=seed)
         if not speed > 0:
             raise SettingsError(f"speed is {speed}, expected a number > 0")
         if frame_time_s is not None and not frame_time_s >= 0:
             raise SettingsError(f"frame_time_s is {frame_time_s}, expected seconds >= 0")
         if share is not None and not 0 <= share < 1:
             raise SettingsError(f"share is {share}, expected a probability in [0, 1)")
-        self._base = slam_env_of(env, "DropFrames")
         self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
         self._free_at = 0.0
         self._warm = share is not None or frame_time_s is not None

@@ -1,4 +1,4 @@
-"""What a configuration is worth on instances: each is a run of the run store, made once, in a process of its own."""
+"""Evaluating a configuration: on each instance it is a run of the run store, made once, in its own process."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class InstanceFailedError(StudyError):
 
 
 class CancelledError(Exception):
-    """The caller wanted no more of it."""
+    """The caller cancelled the evaluation."""
 
 
 def evaluate(
@@ -81,9 +81,9 @@ def evaluate(
         threads: Threads of a run.
         cache: Whether runs use the stage cache; times are then those of when its entries were made.
         data_root: Folder of the recorded sequences.
-        study: Name of the study that the runs are made for, which their records keep.
-        cancelled: Asked many times a second; True ends the runs at once.
-        on_run: Told of every run, also while it goes on; by several threads where `jobs` is more than 1.
+        study: Name of the study that the runs are made for, which is in their records.
+        cancelled: Called many times a second; True ends the runs at once.
+        on_run: Called with every event of every run, by several threads where `jobs` is more than 1.
 
     Returns:
         The outcome on each instance, in their order.
@@ -91,7 +91,7 @@ def evaluate(
     Raises:
         InstanceFailedError: A run crashed, timed out, ran out of memory or was invalid; the others are not waited for.
         CancelledError: `cancelled` said so.
-        DynslamError: Tracker, settings or a instance are unknown or unfit; nothing ran.
+        DynslamError: Tracker, settings or an instance are unknown or unfit; nothing ran.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     held, instances, stop = held_protocol(protocol), list(instances), [False]
@@ -119,7 +119,7 @@ def evaluate(
 def outcome(
     store: RunStore, record: RunRecord, instance: ProblemInstance, protocol: Protocol, data_root: str | None
 ) -> Outcome:
-    """What a stored run amounts to; one in which nothing was tracked counts as never having moved.
+    """The outcome of a stored run; one in which nothing was tracked has the error of a static camera.
 
     Raises:
         InstanceFailedError: It did not come to its end.
@@ -145,15 +145,15 @@ def processor_seconds(record: RunRecord) -> float:
 
 def held_protocol(protocol: Protocol | str) -> Protocol:
     """The protocol with lost frames held at the last pose, so that losing track never pays."""
-    found = get_protocol(protocol)
-    if found.lost_frames == "hold":
-        return found
-    return found.model_copy(update={"id": f"{found.id}+hold", "lost_frames": "hold"})
+    protocol = get_protocol(protocol)
+    if protocol.lost_frames == "hold":
+        return protocol
+    return protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
 
 
 @lru_cache(maxsize=256)
 def static_camera_m(instance: ProblemInstance, data_root: str | None) -> float:
-    """ATE RMSE in metres of a camera that never moves on a instance, from the ground truth of its frames alone."""
+    """ATE RMSE in metres of a static camera on an instance, from the ground truth of its frames alone."""
     sequence: Any = instance.open(data_root)
     truth, stamps = sequence.ground_truth, sequence.timestamps
     positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]

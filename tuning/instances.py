@@ -1,4 +1,4 @@
-"""The unit of a study: part of a sequence, one start, ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``."""
+"""Problem instances, the units of a study: part of one sequence, from one start, with one seed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
-from dynslam_bench.core.records import digest
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.sequences.catalogue import entry_of, open_sequence, parse_frames
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
-from dynslam_bench.sequences.view import Part, SequenceView, part_of
+from dynslam_bench.sequences.view import SequenceView
 
 FEWEST_FRAMES = 2
 """A shorter instance has no motion."""
@@ -93,16 +92,6 @@ class ProblemInstance:
             raise StudyError(f"'{whole.id}' has no ground truth, so nothing can be tuned on it", "leave it out")
         return cut
 
-    def part(self, data_root: str | None = None) -> Part:
-        """Which frames of which content it is, whatever it is called."""
-        return part_of(cast("Sequence", self.open(data_root)), self.offset)
-
-    def digest(self, data_root: str | None = None) -> str:
-        """Names the content: equal for two instances that show a tracker the same images with the same seed."""
-        part = self.part(data_root)
-        seen = [part.content, part.camera, part.start + self.offset, part.stop, part.stride]
-        return digest([*seen, self.degradation, self.seed], 16)
-
 
 def parse_instances(
     text: str, *, offsets: PySequence[int] = (0,), seeds: PySequence[int] = (0,)
@@ -126,32 +115,41 @@ def parse_instances(
         StudyError: It cannot be read; says how it is written.
     """
     if Path(text).expanduser().is_dir():  # whatever its name looks like
-        return _all(text, (text,), None, {}, offsets, seeds)
+        return tuple(ProblemInstance(text, offset=offset, seed=seed) for offset, seed in product(offsets, seeds))
     match = _TEXT.fullmatch(text)
     if match is None:
         raise StudyError(f"'{text}' names no instances", _FORM)
-    options = _query(match["query"], text)
+    options = _options(match["query"], text)
     frames = None if match["frames"] is None else _frames(match["frames"], text)
-    rendered = match["name"].startswith("synthetic/")
-    if match["scenes"] is not None and not rendered:
-        return _all(text, (f"{match['name']}@{match['scenes']}",), frames, options, offsets, seeds)
-    if not rendered:
+    if match["name"].startswith("synthetic/"):
+        names = _rendered_names(match["name"], match["scenes"], options, text)
+    else:
         for option in {"scene", "noise"} & options.keys():
             raise StudyError(f"'{text}': rendered sequences alone have a {option}", _FORM)
         if "frames" in options:
             if frames is not None:
                 raise StudyError(f"'{text}' names its frames twice", "write [A:B] or ?frames=N")
             frames = (0, _number(options["frames"], "frames", text))
-        return _all(text, (match["name"],), frames, options, offsets, seeds)
-    if match["scenes"] is not None:
-        if "scene" in options:
-            raise StudyError(f"'{text}' names its scenes twice", "write ?scene=0-19")
-        options["scene"] = match["scenes"]
-    chosen = [f"scene={scene}" for scene in _numbers(options["scene"], text)] if "scene" in options else [""]
-    others = [f"{key}={options[key]}" for key in ("frames", "noise") if key in options]
-    queries = ["&".join(filter(None, [scene, *others])) for scene in chosen]
-    names = tuple(f"{match['name']}{'?' + query if query else ''}" for query in queries)
-    return _all(text, names, frames, options, offsets, seeds)
+        names = [match["name"] if match["scenes"] is None else f"{match['name']}@{match['scenes']}"]
+    stride = _number(options["stride"], "stride", text) if "stride" in options else 1
+    starts = _numbers(options["offsets"], text) if "offsets" in options else offsets
+    seeds = _numbers(options["seeds"], text) if "seeds" in options else seeds
+    strengths = _strengths(options.get("degrade", ""), text)
+    return tuple(
+        ProblemInstance(name, frames, offset, stride, strengths, seed)
+        for name, offset, seed in product(names, starts, seeds)
+    )
+
+
+def _rendered_names(name: str, scenes: str | None, options: dict[str, str], text: str) -> list[str]:
+    """Ids of a rendered sequence's scenes."""
+    if scenes is not None and "scene" in options:
+        raise StudyError(f"'{text}' names its scenes twice", "write ?scene=0-19")
+    scenes = options.get("scene", scenes)
+    rest = [f"{key}={options[key]}" for key in ("frames", "noise") if key in options]
+    numbers = [""] if scenes is None else [f"scene={scene}" for scene in _numbers(scenes, text)]
+    queries = ["&".join(filter(None, [number, *rest])) for number in numbers]
+    return [f"{name}?{query}" if query else name for query in queries]
 
 
 def scene_of(name: str) -> str:
@@ -171,44 +169,30 @@ def scene_of(name: str) -> str:
 
 def scenes(instances: Iterable[ProblemInstance]) -> dict[str, list[ProblemInstance]]:
     """Instances by their scene, both in order of appearance."""
-    found: dict[str, list[ProblemInstance]] = {}
+    groups: dict[str, list[ProblemInstance]] = {}
     for instance in instances:
-        found.setdefault(instance.scene, []).append(instance)
-    return found
+        groups.setdefault(instance.scene, []).append(instance)
+    return groups
 
 
-def _all(
-    text: str, names: PySequence[str], frames: tuple[int, int | None] | None, options: dict[str, str],
-    offsets: PySequence[int], seeds: PySequence[int],
-) -> tuple[ProblemInstance, ...]:  # fmt: skip
-    stride = _number(options["stride"], "stride", text) if "stride" in options else 1
-    starts = _numbers(options["offsets"], text) if "offsets" in options else offsets
-    drawn = _numbers(options["seeds"], text) if "seeds" in options else seeds
-    strengths = _strengths(options.get("degrade", ""), text)
-    return tuple(
-        ProblemInstance(name, frames, offset, stride, strengths, seed)
-        for name, offset, seed in product(names, starts, drawn)
-    )
-
-
-def _query(query: str | None, text: str) -> dict[str, str]:
-    found: dict[str, str] = {}
+def _options(query: str | None, text: str) -> dict[str, str]:
+    options: dict[str, str] = {}
     for option in [] if query is None else query.split("&"):
-        key, separator, value = option.partition("=")
-        if key not in _OPTIONS or not separator or not value:
+        key, _, value = option.partition("=")
+        if key not in _OPTIONS or not value:
             raise StudyError(f"'{text}' has an unknown option '{option}'", did_you_mean(key, list(_OPTIONS)))
-        if key in found:
+        if key in options:
             raise StudyError(f"'{text}' names {key} twice", "leave one out")
-        found[key] = value
-    return found
+        options[key] = value
+    return options
 
 
 def _frames(text: str, whole: str) -> tuple[int, int | None] | None:
     try:
-        found = parse_frames(text)
+        frames = parse_frames(text)
     except SequenceError as error:
         raise StudyError(f"'{whole}': {error.args[0]}", error.hint) from error
-    return None if found == (0, None) else found
+    return None if frames == (0, None) else frames
 
 
 def _number(text: str, what: str, whole: str) -> int:
@@ -219,29 +203,29 @@ def _number(text: str, what: str, whole: str) -> int:
 
 def _numbers(text: str, whole: str) -> list[int]:
     """``0-4,7`` as ``[0, 1, 2, 3, 4, 7]``."""
-    found: list[int] = []
+    numbers: list[int] = []
     for piece in text.split(","):
         match = re.fullmatch("([0-9]{1,9})(?:-([0-9]{1,9}))?", piece)
         if match is None or int(match[2] or match[1]) < int(match[1]):
             raise StudyError(f"'{piece}' of '{whole}' is neither a number nor a range of numbers", "write 0-4,7")
-        found += range(int(match[1]), int(match[2] or match[1]) + 1)
-    if len(set(found)) < len(found):
+        numbers += range(int(match[1]), int(match[2] or match[1]) + 1)
+    if len(set(numbers)) < len(numbers):
         raise StudyError(f"'{text}' of '{whole}' names a number twice", "leave one out")
-    return found
+    return numbers
 
 
 def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     from dynslam_bench.envs import Degradation
 
-    found: dict[str, float] = {}
+    strengths: dict[str, float] = {}
+    kinds = [name for name in Degradation.__dataclass_fields__ if name != "seed"]
     for piece in text.split(",") if text else ():
         kind, _, strength = piece.partition(":")
-        known = [name for name in Degradation.__dataclass_fields__ if name != "seed"]
-        if kind not in known:
-            raise StudyError(f"'{whole}': unknown degradation '{kind}'", did_you_mean(kind, known))
+        if kind not in kinds:
+            raise StudyError(f"'{whole}': unknown degradation '{kind}'", did_you_mean(kind, kinds))
         try:
-            found[kind] = float(strength)
+            strengths[kind] = float(strength)
         except ValueError:
             raise StudyError(f"'{whole}': strength '{strength}' of {kind} is no number", "degrade=blur:0.5") from None
-        Degradation(**{kind: found[kind]})  # type: ignore[arg-type]  # a strength out of range is refused here
-    return tuple(sorted(found.items()))
+    Degradation(**strengths)  # type: ignore[arg-type]  # refuses a strength out of range
+    return tuple(sorted(strengths.items()))

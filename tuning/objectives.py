@@ -1,4 +1,4 @@
-"""What users want of a configuration: each objective is a cost of a run, compared with the default's in each scene.
+"""Objectives and constraints: each objective is a cost of a run, compared with the default's in each scene.
 
 All objectives are natural logarithms of ratios to the default settings: less is better, 0 is the default's own.
 """
@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
@@ -47,14 +46,14 @@ class Objective:
 
     def by_start(self, outcomes: Outcomes, default: Outcomes) -> list[float]:
         """Natural logarithm of the ratio on each instance that counts and that both ran."""
-        own = {instance: self.cost(outcome) for instance, outcome in outcomes.items() if self.counts(instance)}
-        return by_start(own, {instance: self.cost(outcome) for instance, outcome in default.items()})
+        return by_start(self._costs(outcomes), self._costs(default))
 
     def ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[str, float]:
         """Natural logarithm of the ratio to the default by scene; empty without any instance that counts."""
-        own = {instance: self.cost(outcome) for instance, outcome in outcomes.items() if self.counts(instance)}
-        other = {instance: self.cost(outcome) for instance, outcome in default.items() if self.counts(instance)}
-        return by_scene(own, other)
+        return by_scene(self._costs(outcomes), self._costs(default))
+
+    def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
+        return {instance: self.cost(outcome) for instance, outcome in outcomes.items() if self.counts(instance)}
 
     def value(self, outcomes: Outcomes, default: Outcomes) -> float:
         """Natural logarithm of the ratio to the default over the scenes; below 0 is better.
@@ -76,13 +75,13 @@ class Objective:
         return ranked[: max(1, round(WORST_SHARE * len(ranked)))] if self.worst else ranked
 
     def counts(self, instance: ProblemInstance) -> bool:
-        """Whether a instance counts."""
+        """Whether an instance counts."""
         return not self.degraded or any(strength > 0 for _, strength in instance.degradation)
 
 
 OBJECTIVES = {
-    each.name: each
-    for each in (
+    objective.name: objective
+    for objective in (
         Objective("accuracy", "ATE", lambda run: run.ate_m),
         Objective("speed", "processor time", lambda run: run.processor_s),
         Objective("worst", "ATE in the worst quarter of the scenes", lambda run: run.ate_m, worst=True),
@@ -100,8 +99,8 @@ def together(objectives: Sequence[Objective]) -> Objective:
         return objectives[0]
     return Objective(
         "balance",
-        f"geometric mean of {' and '.join(each.what for each in objectives)}",
-        lambda run: math.exp(sum(math.log(each.cost(run)) for each in objectives) / len(objectives)),
+        f"geometric mean of {' and '.join(objective.what for objective in objectives)}",
+        lambda run: math.exp(sum(math.log(objective.cost(run)) for objective in objectives) / len(objectives)),
     )
 
 
@@ -117,7 +116,7 @@ def find_objective(name: str) -> Objective:
 
 
 def own_objective(cost: Cost) -> Objective:
-    """An objective of one's own, from what a run costs.
+    """A user's objective, from what a run costs.
 
     Args:
         cost: Positive number of a run, less is better, e.g. ``lambda run: run.ate_m * run.processor_s``.
@@ -128,12 +127,12 @@ def own_objective(cost: Cost) -> Objective:
         value = float(cost(run))
         if not (math.isfinite(value) and value > 0):
             raise StudyError(f"objective '{name}' gives {value:g} on instance '{run.instance}'", "give numbers above 0")
-        return _MANY * value  # ratios do not mind, and the floor of errors in metres is none of this cost
+        return _MANY * value  # the floor of errors in metres does not apply; ratios stay as they are
 
     return Objective(name, name.replace("_", " "), checked)
 
 
-# What a configuration must fulfil, whatever it gains.
+# Constraints.
 
 
 def coverage(outcomes: Outcomes) -> float:
@@ -155,20 +154,20 @@ def violations(spec: StudySpec, outcomes: Outcomes, default: Outcomes | None = N
         outcomes: Of a configuration.
         default: Of the default settings at the same places, for that ratio; None to leave it out.
     """
-    found = {}
+    values = {}
     if spec.min_coverage is not None:
-        found["coverage"] = spec.min_coverage - coverage(outcomes)
+        values["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
-        found["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
+        values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
     if default is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
-        found["ate"] = ACCURACY.value(outcomes, default) - math.log1p(spec.ate_margin)
-    return found
+        values["ate"] = ACCURACY.value(outcomes, default) - math.log1p(spec.ate_margin)
+    return values
 
 
 # Comparing a configuration with the default: paired by place, robust to single runs, with intervals that cover.
 
 FLOOR_M = 1e-4
-"""Errors below a tenth of a millimetre count as that: a ratio of two perfect runs is no news."""
+"""Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
 FEWEST_SCENES = 3
 """With fewer scenes an interval over scenes means nothing."""
 TRIMMED = 0.1
@@ -183,19 +182,11 @@ def place_of(instance: ProblemInstance) -> ProblemInstance:
     return replace(instance, offset=0, seed=0)
 
 
-def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
-    """Natural logarithms of the errors in metres, by place."""
-    found: dict[ProblemInstance, list[float]] = {}
-    for instance, error in errors.items():
-        found.setdefault(place_of(instance), []).append(math.log(max(error, FLOOR_M)))
-    return found
-
-
 def by_scene(errors: Errors, default: Errors) -> dict[str, float]:
     """Log ATE ratio of a configuration to the default in each scene.
 
     At each place the median over the configuration's starts is compared with the median over all of the default's, so
-    that neither's luck with one start decides; a scene is the mean of its places.
+    that no single start decides; a scene is the mean of its places.
 
     Args:
         errors: Of the configuration.
@@ -204,16 +195,23 @@ def by_scene(errors: Errors, default: Errors) -> dict[str, float]:
     Returns:
         Natural logarithm by scene, below 0 is better than the default.
     """
-    reference = log_errors(default)
-    found: dict[str, list[float]] = {}
-    for place, values in log_errors(errors).items():
-        ratio = float(np.median(values) - np.median(reference[place]))
-        found.setdefault(place.scene, []).append(ratio)
-    return {scene: float(np.mean(values)) for scene, values in found.items()}
+    reference = _log_errors(default)
+    ratios: dict[str, list[float]] = {}
+    for place, values in _log_errors(errors).items():
+        ratios.setdefault(place.scene, []).append(float(np.median(values) - np.median(reference[place])))
+    return {scene: float(np.mean(values)) for scene, values in ratios.items()}
+
+
+def _log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
+    """Natural logarithms of the errors in metres, by place."""
+    logs: dict[ProblemInstance, list[float]] = {}
+    for instance, error in errors.items():
+        logs.setdefault(place_of(instance), []).append(math.log(max(error, FLOOR_M)))
+    return logs
 
 
 def by_start(errors: Errors, default: Errors) -> list[float]:
-    """Log ATE ratio on each instance that both ran: what one or two scenes can tell, of themselves alone."""
+    """Log ATE ratio on each instance that both ran: all that one or two scenes tell."""
     return [
         math.log(max(error, FLOOR_M) / max(default[instance], FLOOR_M))
         for instance, error in errors.items()
@@ -223,7 +221,7 @@ def by_start(errors: Errors, default: Errors) -> list[float]:
 
 def centre(values: Iterable[float]) -> float:
     """Trimmed mean; the mean of fewer than ten."""
-    sample = np.sort(_array(values))
+    sample = np.sort(np.fromiter(values, np.float64))
     cut = int(TRIMMED * len(sample))
     return float(sample[cut : len(sample) - cut].mean())
 
@@ -238,7 +236,7 @@ def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, fl
     Returns:
         Lower and upper end; None for fewer than two values.
     """
-    sample = np.sort(_array(values))
+    sample = np.sort(np.fromiter(values, np.float64))
     count = len(sample)
     if count < 2:
         return None
@@ -253,9 +251,5 @@ def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, fl
 
 def upper(values: Iterable[float], confidence: float) -> float:
     """One-sided upper confidence bound of the centre; infinite for fewer than two values."""
-    found = bounds(values, 2 * confidence - 1)
-    return math.inf if found is None else found[1]
-
-
-def _array(values: Iterable[float]) -> NDArray[np.float64]:
-    return np.array(list(values), dtype=np.float64)
+    interval = bounds(values, 2 * confidence - 1)
+    return math.inf if interval is None else interval[1]

@@ -1,14 +1,15 @@
 """Before a study: what its instances could show at all, and what it would take to show more.
 
-How far two configurations differ on one instance is mostly chaos: the same settings, begun a frame later, come out
-otherwise. The pilot measures that spread with a few changed settings, and works out the smallest effect that the study
-could tell from nothing (one-sided 2.5 %, with 80 % of the studies finding it).
+How far two configurations differ on one instance is mostly chance: a start one frame later changes the result. The
+pilot measures that spread with a few changed settings, and computes the smallest effect that the study could tell from
+nothing (one-sided 2.5 %, with 80 % of the studies finding it).
 """
 
 from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -56,7 +57,7 @@ class Need(Record):
 
 
 class Pilot(Record):
-    """What a pilot found; all spreads are of natural logarithms of ratios.
+    """The result of a pilot; all spreads are of natural logarithms of ratios.
 
     Attributes:
         objective: What the ratio is one of.
@@ -129,16 +130,9 @@ def detectable(within: float, between: float, count: int, starts: float) -> floa
 
 
 def scenes_needed(effect: float, within: float, between: float, starts: float) -> int:
-    """How many scenes tell a gain from nothing."""
-    low, high = 1, 2
-    while detectable(within, between, high, starts) > effect:
-        low, high = high, 2 * high
-        if high > _MOST_SCENES:
-            return high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if detectable(within, between, middle, starts) <= effect else (middle, high)
-    return high
+    """The fewest scenes that tell a gain from nothing, at most `_MOST_SCENES`."""
+    counts = range(2, _MOST_SCENES)
+    return 2 + bisect_left(counts, True, key=lambda count: detectable(within, between, count, starts) <= effect)
 
 
 def judge_pilot(
@@ -170,17 +164,14 @@ def judge_pilot(
             f"a pilot over {count} scene{'s' * (count != 1)} says nothing, it takes {FEWEST}",
             'name more scenes, e.g. "synthetic/walking_xyz?scene=0-5&frames=80&offsets=0-2"',
         )
-    found = np.array([spread(logs) for logs in pairs])
-    within, between = (float(value) for value in np.sqrt((found**2).mean(axis=0)))
+    within, between = np.sqrt(np.square([spread(logs) for logs in pairs]).mean(axis=0)).tolist()
     judged = scenes(split if split is not None else list(pairs[0]))
     starts = sum(map(len, judged.values())) / len(judged)
     needs = []
     for effect in EFFECTS:
-        needed = scenes_needed(effect, within, between, starts)
-        instances = math.ceil(needed * starts)
-        needs.append(
-            Need(effect=effect, scenes=needed, instances=instances, minutes=math.ceil(instances / jobs) * run_s / 60)
-        )
+        count = scenes_needed(effect, within, between, starts)
+        runs = math.ceil(count * starts)
+        needs.append(Need(effect=effect, scenes=count, instances=runs, minutes=math.ceil(runs / jobs) * run_s / 60))
     return Pilot(
         objective=objective.what, scenes=len(judged), starts=round(starts, 2), within=within,
         between=between, run_s=run_s, detectable=detectable(within, between, len(judged), starts), needs=needs,
@@ -247,12 +238,12 @@ def some_of(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
 
 
 def small_change(space: Sequence[Parameter], base: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Scalar]:
-    """Settings near the default: numbers part of the way to drawn ones; choices too where there are no numbers."""
+    """Settings near the default: numbers moved toward drawn ones; choices too where there are no numbers."""
     usable = live(space, base)
-    found = {each.name: toward(each, base[each.name], rng) for each in usable}
-    if all(found[each.name] == base[each.name] for each in usable):
-        found = {each.name: stepped(each, base[each.name], rng) for each in usable}
-    return found
+    changed = {parameter.name: toward(parameter, base[parameter.name], rng) for parameter in usable}
+    if any(changed[name] != base[name] for name in changed):
+        return changed
+    return {parameter.name: stepped(parameter, base[parameter.name], rng) for parameter in usable}
 
 
 def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict[ProblemInstance, float]:

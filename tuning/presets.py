@@ -23,12 +23,12 @@ def write_presets(tuner: Tuner, summary: StudySummary) -> None:
     """Write every pick as a preset: tuned settings alone, with what they are worth and where that was seen."""
     spec = tuner.spec
     for name, number in summary.picks.items():
-        candidate = next((each for each in summary.candidates if each.trial == number), None)
-        found = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
+        candidate = next((one for one in summary.candidates if one.trial == number), None)
+        remark = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
         text = preset_text(
             {} if candidate is None else candidate.params,
             spec.tracker,
-            " ".join(filter(None, (found, seen_note(summary.seen)))),
+            " ".join(filter(None, (remark, seen_note(summary.seen)))),
             fixed=spec.space.fixed,
             tuned_on=[*summary.tune, *summary.confirm],
             judged_on=[*summary.held_out, *summary.recorded] if candidate is not None else (),
@@ -56,14 +56,14 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", pick: str
         return read_text(folder / f"{pick}.toml", kind=StudyError)
     if pick != "best":
         raise StudyError(f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml")
-    found = best_trials(Tuner(spec, results, reading=True).study, 1)
-    if not found:
+    best = best_trials(Tuner(spec, results, reading=True).study, 1)
+    if not best:
         raise StudyError(f"study '{spec.name}' has no finished trial", "dynslam-bench tune run STUDY.toml")
-    remark = f"Trial {found[0].number}, the best so far; not judged on instances that no trial has seen."
-    return preset_text(found[0].params, spec.tracker, remark, fixed=spec.space.fixed)
+    remark = f"Trial {best[0].number}, the best so far; not judged on instances that no trial has seen."
+    return preset_text(best[0].params, spec.tracker, remark, fixed=spec.space.fixed)
 
 
-# Tuned settings as a TOML preset that ``run --settings`` takes: what was tuned, and nothing else.
+# The text of a preset.
 
 
 def preset_text(
@@ -77,8 +77,8 @@ def preset_text(
 ) -> str:
     """TOML text of tuned settings, dotted name to value, grouped into tables.
 
-    What a study had fixed (where its masks came from, for one) belongs to the study and not to the preset: it stands
-    there as a remark, so that the preset runs wherever the tracker does.
+    What a study had fixed, for example the source of its masks, is only a comment, so that the preset runs wherever
+    the tracker does.
 
     Args:
         tuned: The tuned settings; empty for the default.

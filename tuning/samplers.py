@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import pickle
 import warnings
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -19,11 +21,8 @@ from optuna.trial import FrozenTrial, TrialState
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
-from dynslam_bench.tuning import storage as cmaes_state
 from dynslam_bench.tuning.study_file import StudySpec
 
-CONSTRAINTS = "constraints"
-"""User attribute of a trial: how far each constraint is violated; <= 0 is fulfilled."""
 _STARTUP_TRIALS = 8
 
 
@@ -52,45 +51,37 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         self._build, self._seed = build, seed
         self._samplers: dict[int, optuna.samplers.BaseSampler] = {}
 
-    def _of(self, trial: FrozenTrial) -> optuna.samplers.BaseSampler:
-        if trial.number not in self._samplers:
-            seed = int(stream(self._seed, "sampler", trial.number).integers(2**31))
-            self._samplers[trial.number] = self._build(seed)
-        return self._samplers[trial.number]
-
     def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
-        """See Optuna."""
-        self._of(trial).before_trial(study, trial)
+        """Make the trial's sampler."""
+        seed = int(stream(self._seed, "sampler", trial.number).integers(2**31))
+        self._samplers[trial.number] = self._build(seed)
+        self._samplers[trial.number].before_trial(study, trial)
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         """See Optuna."""
-        return self._of(trial).infer_relative_search_space(study, trial)
+        return self._samplers[trial.number].infer_relative_search_space(study, trial)
 
     def sample_relative(
         self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
         """See Optuna."""
-        return self._of(trial).sample_relative(study, trial, search_space)
+        return self._samplers[trial.number].sample_relative(study, trial, search_space)
 
     def sample_independent(
         self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
         """See Optuna."""
-        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
+        return self._samplers[trial.number].sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
         self, study: optuna.Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """See Optuna."""
-        self._of(trial).after_trial(study, trial, state, values)
-        del self._samplers[trial.number]
+        """Drop the trial's sampler; a trial of a dead worker of another process has none here."""
+        if sampler := self._samplers.pop(trial.number, None):
+            sampler.after_trial(study, trial, state, values)
 
 
 def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
-    constrained = spec.min_coverage is not None or spec.min_fps is not None
-    options: dict[str, Any] = {"seed": seed}
-    if constrained and not hasattr(optuna.trial.Trial, "set_constraint"):
-        options["constraints_func"] = violations  # Optuna < 5
     if spec.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     if spec.sampler == "tpe":
@@ -101,12 +92,12 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
                 multivariate=True,
                 group=True,
                 constant_liar=True,
-                **options,
+                seed=seed,
             )
     if spec.sampler == "nsga2":
-        return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), **options)
+        return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed)
     if spec.sampler == "gp":
-        return optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, **options)
+        return optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed)
     if len(spec.objectives) > 1:
         raise StudyError(
             f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
@@ -115,27 +106,58 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
     if spec.sampler == "cmaes":
         if find_spec("cmaes") is None:
             raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
-        cmaes_state.restrict()
-        return optuna.samplers.CmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS)
+        return RestrictedCmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS)
     return EmfoaSampler(seed=seed, n_trials=spec.trials)
 
 
-def violations(trial: FrozenTrial) -> Sequence[float]:
-    """The constraint values that a finished trial carries, for samplers of Optuna before 5."""
-    return [float(value) for value in trial.user_attrs.get(CONSTRAINTS, {}).values()]
-
-
-def set_constraints(trial: optuna.trial.Trial, values: dict[str, float], *, final: bool) -> None:
-    """Attach constraint values to a trial, in whichever way this Optuna knows; it takes only the `final` ones."""
-    trial.set_user_attr(CONSTRAINTS, values)
-    if final and hasattr(trial, "set_constraint"):
-        for name, value in values.items():
-            trial.set_constraint(name, value)
-
-
 def is_feasible(trial: FrozenTrial) -> bool:
-    """Whether a finished trial fulfils all constraints."""
-    return all(value <= 0 for value in trial.user_attrs.get(CONSTRAINTS, {}).values())
+    """Whether a trial fulfils all constraints."""
+    return all(value <= 0 for value in trial.constraints.values())
+
+
+# CMA-ES: Optuna keeps its state in the storage as a pickle, which whoever writes to the storage could replace.
+
+_NUMPY = ("numpy._core", "numpy.core")
+_CMA_CLASSES = {
+    ("cmaes._cma", "CMA"),
+    ("numpy", "dtype"),
+    ("numpy", "ndarray"),
+    *((f"{core}.multiarray", name) for core in _NUMPY for name in ("_reconstruct", "scalar")),
+    *((f"{core}.numeric", "_frombuffer") for core in _NUMPY),
+}
+
+
+class _CmaUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _CMA_CLASSES:
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
+        return super().find_class(module, name)
+
+
+def restore_cma(data: bytes) -> Any:
+    """A state of CMA-ES from its pickle, made of nothing but the classes that such a state has.
+
+    Raises:
+        StudyError: It is something else.
+    """
+    try:
+        return _CmaUnpickler(io.BytesIO(data)).load()
+    except Exception as error:  # a forged pickle raises anything
+        raise StudyError(
+            f"the study's storage holds no state of CMA-ES but something else: {str(error)[:200]}",
+            "it was tampered with or is damaged; use another sampler, or a storage of your own",
+        ) from error
+
+
+class RestrictedCmaEsSampler(optuna.samplers.CmaEsSampler):
+    """Optuna's CMA-ES, which restores nothing but its own state (`restore_cma`)."""
+
+    def _restore_optimizer(self, completed_trials: list[FrozenTrial]) -> Any:
+        for trial in reversed(completed_trials):
+            parts = {key: part for key, part in trial.system_attrs.items() if key.startswith(self._attr_key_optimizer)}
+            if parts:
+                return restore_cma(bytes.fromhex(self._concat_optimizer_attrs(parts)))
+        return None
 
 
 # The elite moth-flame algorithm as an Optuna sampler: one trial is one flight of one moth.
@@ -178,8 +200,8 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         """The parameters that all finished trials share."""
-        found = self._space.calculate(study)
-        return {name: each for name, each in found.items() if not each.single()}
+        space = self._space.calculate(study)
+        return {name: distribution for name, distribution in space.items() if not distribution.single()}
 
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
@@ -189,20 +211,23 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
             raise ValueError("EmfoaSampler takes one objective")
         if not search_space:
             return {}
-        finished = [each for each in _finished(study) if search_space.keys() <= each.params.keys()]
+        finished = [trial for trial in _finished(study) if search_space.keys() <= trial.params.keys()]
         if len(finished) < self._population:
-            return self._found(finished, search_space)
+            return self._first_population(finished, search_space)
         names = sorted(search_space)
-        moths = np.array([[_to_unit(each.params[n], search_space[n]) for n in names] for each in finished])
-        order = np.argsort([each[0] for each in _ranked(study, finished)], kind="stable")
+        moths = np.array([[to_unit(trial.params[name], search_space[name]) for name in names] for trial in finished])
+        sign = 1.0 if study.direction == StudyDirection.MINIMIZE else -1.0
+        order = np.argsort([sign * _value(trial) for trial in finished], kind="stable")
         flames = moths[order[: self._population]]
         index = trial.number % self._population
-        position = moths[[i for i, each in enumerate(finished) if each.number % self._population == index][-1:] or [-1]]
-        population_positions = self._fly(position[0], flames, index, min(trial.number, self._n_trials))
-        best = [finished[i] for i in order[: self._population]]
+        own = [row for row, other in enumerate(finished) if other.number % self._population == index]
+        moth = moths[own[-1] if own else -1]
+        landed = self._fly(moth, flames, index, min(trial.number, self._n_trials))
+        best = [finished[row] for row in order[: self._population]]
+        flame = best[min(index, len(best) - 1)]
         return {
-            name: self._land(value, search_space[name], best[min(index, len(best) - 1)].params[name])
-            for name, value in zip(names, population_positions, strict=True)
+            name: self._land(value, search_space[name], flame.params[name])
+            for name, value in zip(names, landed, strict=True)
         }
 
     def sample_independent(
@@ -211,15 +236,15 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         """Uniformly, for parameters outside the shared space."""
         return self._independent.sample_independent(study, trial, param_name, param_distribution)
 
-    def _found(self, finished: list[FrozenTrial], space: dict[str, BaseDistribution]) -> dict[str, Any]:
+    def _first_population(self, finished: list[FrozenTrial], space: dict[str, BaseDistribution]) -> dict[str, Any]:
         """A member of the first population: uniform, or the elite opposite of an earlier member."""
         names = sorted(space)
         unit = self._rng.random(len(names))
         if len(finished) >= self._population // 2:
-            members = np.array([[_to_unit(each.params[n], space[n]) for n in names] for each in finished])
+            members = np.array([[to_unit(trial.params[name], space[name]) for name in names] for trial in finished])
             low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
             unit = opposites(np, members[len(finished) % len(members)], low, high, low, high, self._rng.random)
-        return {name: _from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
+        return {name: from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
 
     def _fly(self, moth: Array, flames: Array, index: int, trial: int) -> Array:
         """Where the moth of that index lands in a trial of the budget; `flames` best first."""
@@ -234,30 +259,20 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
             if 0.0 <= value <= 1.0 and self._rng.random() > 0.1:
                 return flame
             return distribution.choices[int(self._rng.integers(len(distribution.choices)))]
-        return _from_unit(float(np.clip(value, 0.0, 1.0)), distribution)
+        return from_unit(float(np.clip(value, 0.0, 1.0)), distribution)
 
 
 def _finished(study: Study) -> list[FrozenTrial]:
     states = (TrialState.COMPLETE, TrialState.PRUNED)
     trials = study._get_trials(deepcopy=False, states=states, use_cache=True)
-    return [each for each in trials if _value(each) is not None]
+    return [trial for trial in trials if not np.isnan(_value(trial))]
 
 
-def _ranked(study: Study, trials: Sequence[FrozenTrial]) -> list[tuple[float, int]]:
-    sign = 1.0 if study.direction == StudyDirection.MINIMIZE else -1.0
-    ranked = []
-    for each in trials:
-        value = _value(each)
-        assert value is not None
-        ranked.append((sign * value, each.number))
-    return ranked
-
-
-def _value(trial: FrozenTrial) -> float | None:
+def _value(trial: FrozenTrial) -> float:
+    """The value of a complete trial, the last intermediate one of a pruned trial; NaN without any."""
     if trial.state == TrialState.COMPLETE:
-        return trial.value
-    last = trial.intermediate_values[max(trial.intermediate_values)] if trial.intermediate_values else None
-    return None if last is None or np.isnan(last) else last
+        return float(trial.value)  # type: ignore[arg-type]  # one objective
+    return trial.intermediate_values[max(trial.intermediate_values)] if trial.intermediate_values else np.nan
 
 
 def _scaled_bounds(distribution: Any) -> tuple[float, float]:
@@ -270,7 +285,8 @@ def _scaled_bounds(distribution: Any) -> tuple[float, float]:
     return low - half, high + half
 
 
-def _to_unit(value: Any, distribution: BaseDistribution) -> float:
+def to_unit(value: Any, distribution: BaseDistribution) -> float:
+    """Where a value lies in its range, 0 to 1; of a category the middle of its share."""
     if isinstance(distribution, CategoricalDistribution):
         return (distribution.to_internal_repr(value) + 0.5) / len(distribution.choices)
     low, high = _scaled_bounds(distribution)
@@ -278,7 +294,8 @@ def _to_unit(value: Any, distribution: BaseDistribution) -> float:
     return float((scaled - low) / (high - low))
 
 
-def _from_unit(unit: float, distribution: BaseDistribution) -> Any:
+def from_unit(unit: float, distribution: BaseDistribution) -> Any:
+    """The value that lies at `unit` of its range."""
     if isinstance(distribution, CategoricalDistribution):
         return distribution.choices[min(int(unit * len(distribution.choices)), len(distribution.choices) - 1)]
     low, high = _scaled_bounds(distribution)

@@ -1,4 +1,4 @@
-"""From the settings' annotations to what a sampler draws."""
+"""The search space: from the settings' annotations to Optuna's distributions."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def suggest(trial: optuna.trial.BaseTrial, space: list[Parameter], base: Mapping
     """
     values: dict[str, Scalar] = {}
     for parameter in space:
-        if all((values.get(name, base.get(name))) in allowed for name, allowed in parameter.when):
+        if _takes_part(parameter, {**base, **values}):
             values[parameter.name] = _draw(trial, parameter)
     return values
 
@@ -93,11 +93,12 @@ def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
 
 def default_configuration(space: list[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
     """The default settings as a configuration: what trial 0 runs."""
-    values: dict[str, Scalar] = {}
-    for parameter in space:
-        if all((values.get(name, base.get(name))) in allowed for name, allowed in parameter.when):
-            values[parameter.name] = base[parameter.name]
-    return values
+    return {parameter.name: base[parameter.name] for parameter in space if _takes_part(parameter, base)}
+
+
+def _takes_part(parameter: Parameter, values: Mapping[str, Any]) -> bool:
+    """Whether the conditions of a parameter hold."""
+    return all(values.get(name) in allowed for name, allowed in parameter.when)
 
 
 def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
@@ -127,7 +128,7 @@ def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
     return settings
 
 
-# Beginning a study from settings that are known to be good.
+# Starting points.
 
 
 def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
@@ -144,9 +145,7 @@ def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: 
     tuned = {parameter.name: parameter for parameter in space}
     for name, value in preset.items():
         if name not in base:
-            raise StudyError(
-                f"the preset to start from sets '{name}', which there is not", did_you_mean(name, list(base))
-            )
+            raise StudyError(f"the preset to start from sets an unknown '{name}'", did_you_mean(name, list(base)))
         if name not in tuned and base[name] != value:
             raise StudyError(
                 f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
@@ -156,9 +155,7 @@ def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: 
             raise StudyError(
                 f"the preset to start from sets {name} = {value!r}, outside the range that the study tunes"
             )
-    given = {**base, **preset}
-    live = default_configuration(list(space), given)
-    return {name: given[name] for name in live}
+    return default_configuration(list(space), {**base, **preset})
 
 
 def _fits(parameter: Parameter, value: Any) -> bool:

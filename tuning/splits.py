@@ -1,8 +1,10 @@
-"""Which instances of a study are for what: to race on, to choose on, to be judged on."""
+"""The splits of a study: instances to tune on, to choose on and to judge on, and whether they are apart."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, islice, product
@@ -28,7 +30,7 @@ from dynslam_bench.tuning.pruning import running_order
 from dynslam_bench.tuning.study_file import StudySpec
 
 FEWEST_STARTS = 3
-"""The default settings run from so many starts at every place: the luck of one would be shared by all trials."""
+"""The default settings run from so many starts at every place: all trials would share the luck of a single one."""
 ENOUGH_SCENES = 12
 """With so many tune scenes a third of them is kept for the choice; else other starts in all of them are."""
 FRESH_SEED = 1000
@@ -41,15 +43,15 @@ class Design:
     """The instances of a study.
 
     Attributes:
-        race: What trials run on, in the order in which all meet them.
-        reference: What the default settings run on beforehand: `race`, and more starts where those are few.
+        tune: What trials run on, in the order of all trials.
+        reference: What the default settings run on beforehand: `tune`, and more starts where those are few.
         confirm: What the best trials and the default run on for the choice; no trial has seen them.
         held_out: What judges the choice.
         recorded: Recordings on which the choice must not be worse.
         notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
     """
 
-    race: tuple[ProblemInstance, ...]
+    tune: tuple[ProblemInstance, ...]
     reference: tuple[ProblemInstance, ...]
     confirm: tuple[ProblemInstance, ...]
     held_out: tuple[ProblemInstance, ...]
@@ -67,62 +69,62 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
     Raises:
         DynslamError: See `splits.check_splits`.
     """
-    race, confirm = _race_and_confirm(spec.instances(*spec.tune), spec.instances(*spec.confirm))
+    accept = accept or spec.allow_overlap
+    tune, confirm = _tune_and_confirm(spec.instances(*spec.tune), spec.instances(*spec.confirm))
     held_out = spec.instances(*spec.held_out)
-    notes = check_splits(
-        spec.name,
-        {"tune": race, "confirm": confirm, "held_out": held_out},
-        data_root=spec.data_root,
-        accept=accept or spec.allow_overlap,
-    )
-    taken = {instance.scene for instance in (*race, *confirm, *held_out)}
+    splits: dict[Split, list[ProblemInstance]] = {"tune": tune, "confirm": confirm, "held_out": held_out}
+    notes = check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
+    taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
     recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
     if spec.recorded:
-        apart: dict[Split, list[ProblemInstance]] = {"tune": [*race, *confirm], "held_out": recorded}
-        notes += check_splits(spec.name, apart, data_root=spec.data_root, accept=accept or spec.allow_overlap)
-    race = running_order(race, spec.sampler_seed)
-    return Design(
-        tuple(race), tuple(with_more_starts(race)), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes)
-    )
+        splits = {"tune": [*tune, *confirm], "held_out": recorded}
+        notes += check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
+    tune = running_order(tune, spec.sampler_seed)
+    reference = with_more_starts(tune)
+    return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes))
 
 
-def with_more_starts(instances: Collection[ProblemInstance]) -> list[ProblemInstance]:
+def with_more_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
     """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
-    found = list(instances)
-    for place in dict.fromkeys(place_of(instance) for instance in instances):
-        own = [instance for instance in instances if place_of(instance) == place]
+    more = []
+    for own in _places(instances).values():
         missing = FEWEST_STARTS - len({instance.offset for instance in own})
-        found += [replace(own[0], offset=offset) for offset in _unused(own, missing)]
-    return found
+        more += [replace(own[0], offset=offset) for offset in _unused(own, missing)]
+    return [*instances, *more]
 
 
-def fresh_starts(instances: Collection[ProblemInstance]) -> list[ProblemInstance]:
+def fresh_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
     """As many instances at each place from starts, and with seeds, that none of the instances has."""
-    found = []
-    for place in dict.fromkeys(place_of(instance) for instance in instances):
-        own = [instance for instance in instances if place_of(instance) == place]
-        offsets = _unused(own, len(own))
-        found += [replace(place, offset=offset, seed=FRESH_SEED + index) for index, offset in enumerate(offsets)]
-    return found
+    return [
+        replace(place, offset=offset, seed=FRESH_SEED + index)
+        for place, own in _places(instances).items()
+        for index, offset in enumerate(_unused(own, len(own)))
+    ]
 
 
-def _unused(instances: Collection[ProblemInstance], count: int) -> list[int]:
+def _places(instances: Iterable[ProblemInstance]) -> dict[ProblemInstance, list[ProblemInstance]]:
+    places: dict[ProblemInstance, list[ProblemInstance]] = {}
+    for instance in instances:
+        places.setdefault(place_of(instance), []).append(instance)
+    return places
+
+
+def _unused(instances: PySequence[ProblemInstance], count: int) -> list[int]:
+    """The first `count` offsets that no instance has."""
     used = {instance.offset for instance in instances}
-    return [offset for offset in range(len(used) + max(count, 0)) if offset not in used][: max(count, 0)]
+    return list(islice((offset for offset in itertools.count() if offset not in used), max(count, 0)))
 
 
-def _race_and_confirm(
+def _tune_and_confirm(
     tune: list[ProblemInstance], confirm: list[ProblemInstance]
 ) -> tuple[list[ProblemInstance], list[ProblemInstance]]:
+    groups = list(scenes(tune).values())
     if confirm:
         return tune, confirm
-    groups = list(scenes(tune).values())
     if len(groups) < ENOUGH_SCENES:
         return tune, fresh_starts(tune)
-    kept = groups[2::3]
-    return [instance for group in groups if group not in kept for instance in group], [
-        b for group in kept for b in group
-    ]
+    confirm = [instance for group in groups[2::3] for instance in group]
+    return [instance for instance in tune if instance not in confirm], confirm
 
 
 def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
@@ -137,14 +139,14 @@ def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
 
 # Whether a study's instances are what they say: apart by content, by the catalogue, by the scenes.
 
-OVERRIDE = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
+ACCEPT = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
 
 Split = Literal["tune", "confirm", "held_out"]
 
 
 def check_splits(
     name: str,
-    splits: Mapping[Split, Collection[ProblemInstance]],
+    splits: Mapping[Split, PySequence[ProblemInstance]],
     *,
     data_root: str | None = None,
     accept: bool = False,
@@ -166,60 +168,51 @@ def check_splits(
         What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, a split names the same frames twice, or a instance is longer than
-            its sequence, too short or without ground truth; names both spellings.
+        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is too
+            long, too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
     tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
     tuned = dict.fromkeys(instance.sequence for instance in tune)
     judged = dict.fromkeys(instance.sequence for instance in held_out)
-    whole: dict[str, Any] = {each: open_sequence(each, data_root=data_root) for each in (*tuned, *judged)}
-    for own in (tune, held_out):
-        _check_repeats(own, whole)
-    parts = {name: part_of(found) for name, found in whole.items()}
+    opened: dict[str, Any] = {name: open_sequence(name, data_root=data_root) for name in (*tuned, *judged)}
+    for instances in (tune, held_out):
+        _check_repeats(instances, opened)
+    scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
-        if _overlap(whole[one], parts[one], whole[other], parts[other])
+        if scenes_of[one] == scenes_of[other] or _same_recording(opened[one], opened[other])
     ]
-    faults += [_misplaced(each, "tune", "held-out") for each in tuned if _split(whole[each]) == "held-out"]
-    faults += [_misplaced(each, "held-out", "tune") for each in judged if _split(whole[each]) == "tune"]
+    for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
+        faults += [_misplaced(name, used, own) for name in names if getattr(opened[name], "split", "") == own]
     if faults and not accept:
         more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}{more}", OVERRIDE)
+        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}{more}", ACCEPT)
     return faults
 
 
-def _check_repeats(instances: Collection[ProblemInstance], whole: Mapping[str, Any]) -> None:
+def _check_repeats(instances: PySequence[ProblemInstance], opened: Mapping[str, Any]) -> None:
     """Within a split, instances of one scene are repeats of the same frames or share no frame."""
-    if len(set(instances)) < len(instances):
-        twice = next(instance for instance in instances if list(instances).count(instance) > 1)
-        raise StudyError(f"instance '{twice}' is named twice", "leave one out")
-    by_scene: dict[str, list[tuple[ProblemInstance, Part]]] = {}
+    parts: dict[ProblemInstance, Part] = {}
     for instance in instances:
-        part = part_of(cast("Any", instance.cut(whole[instance.sequence])), instance.offset)
-        by_scene.setdefault(part.scene, []).append((instance, part))
-    for same in by_scene.values():
-        for (one, here), (other, there) in combinations(same, 2):
-            if _seen(one, here) == _seen(other, there):
-                raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
-            if (here.start, here.stop) != (there.start, there.stop) and _common(here, there) > 0:
-                raise StudyError(
-                    f"'{one}' and '{other}' share {_common(here, there)} frames", "write instances of a sequence apart"
-                )
+        if instance in parts:
+            raise StudyError(f"instance '{instance}' is named twice", "leave one out")
+        parts[instance] = part_of(cast("Any", instance.cut(opened[instance.sequence])), instance.offset)
+    for (one, here), (other, there) in combinations(parts.items(), 2):
+        if here.scene != there.scene:
+            continue
+        if _content(one, here) == _content(other, there):
+            raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
+        shared = min(here.stop, there.stop) - max(here.start, there.start)
+        if (here.start, here.stop) != (there.start, there.stop) and shared > 0:
+            raise StudyError(f"'{one}' and '{other}' share {shared} frames", "write instances of a sequence apart")
 
 
-def _seen(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
-    own = (instance.offset, instance.degradation, instance.seed, part.noise, part.start, part.stop, part.stride)
-    return (part.content, *own)
-
-
-def _common(one: Part, other: Part) -> int:
-    return min(one.stop, other.stop) - max(one.start, other.start)
-
-
-def _split(sequence: Any) -> str:
-    return str(getattr(sequence, "split", ""))
+def _content(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
+    """What a tracker sees of an instance."""
+    own = (instance.offset, instance.degradation, instance.seed)
+    return (part.content, part.noise, part.start, part.stop, part.stride, *own)
 
 
 def _misplaced(name: str, used: str, own: str) -> str:
@@ -230,28 +223,24 @@ def _misplaced(name: str, used: str, own: str) -> str:
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 
-def _overlap(one: Any, part: Part, other: Any, other_part: Part) -> bool:
-    """Whether two sequences film the same: the same content by digest, or the same images on the same way."""
-    if part.scene == other_part.scene:
-        return True
-    if is_rendered(one) and is_rendered(other):
-        return False  # rendered scenes are told apart by their parameters
-    return same_recording(one, other)
+def _same_recording(one: Any, other: Any) -> bool:
+    """`same_recording`; rendered scenes are told apart by their parameters."""
+    return not (is_rendered(one) and is_rendered(other)) and same_recording(one, other)
 
 
 # Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.
 
 _AROUND_S = np.array([-0.1, -0.05, 0.05, 0.1])
-"""The camera's distances from where it was and will be so long before and after a frame are the shape of its way."""
+"""The shape of a path at a frame: the camera's distances from its positions so long before and after it."""
 _PAIRS = 6
-"""So many pairs of frames with the likest shapes, and as many with equal stamps, are compared by what they show."""
+"""So many pairs of frames with the most similar shapes, and as many with equal stamps, are compared by their images."""
 _LEAST_M = 1e-3
-"""Of a way shorter than this the shape is the ground truth's rounding."""
+"""The shape of a shorter path is the ground truth's rounding."""
 _THUMB = (32, 24)
 _GREY_LEVELS = 1.5
 _DEPTH_SHARE = 0.002
 _ENOUGH = 3
-"""Pairs that are alike; fewer may be a chance, as two ways may cross."""
+"""Pairs with equal images; fewer may be chance, as two paths may cross."""
 
 
 def same_recording(one: Sequence, other: Sequence) -> bool:
@@ -269,17 +258,16 @@ def same_recording(one: Sequence, other: Sequence) -> bool:
 
 
 def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
-    shapes = [_shapes(each) for each in (one, other)]
+    shapes = [_shapes(one), _shapes(other)]
     if len(shapes[0]) and len(shapes[1]):
-        found = cKDTree(shapes[1]).query(shapes[0])
-        likest = np.asarray(found[1], np.intp)
-        apart = np.asarray(found[0], np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
-        yield from ((int(here), int(likest[here])) for here in np.argsort(apart, kind="stable")[:_PAIRS])
+        distance, index = cKDTree(shapes[1]).query(shapes[0])
+        nearest = np.asarray(index, np.intp)
+        relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+        yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
     if is_rendered(one) or is_rendered(other):
         return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
-    stamps: NDArray[np.float64] = np.round(one.timestamps, 6)
-    twins: NDArray[np.float64] = np.round(other.timestamps, 6)
-    _, here, there = np.intersect1d(stamps, twins, assume_unique=True, return_indices=True)
+    stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
+    _, here, there = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
     spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
     yield from ((int(here[k]), int(there[k])) for k in spread)
     yield from ((0, 0), (len(one) - 1, len(other) - 1))
@@ -329,7 +317,7 @@ def _alike(
 # Which instances of a study show scenes that the network behind the masks was trained on: a best case there.
 
 
-def source_of_masks(settings: Settings, sequences: Collection[str]) -> str:
+def source_of_masks(settings: Settings, sequences: PySequence[str]) -> str:
     """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
 
     Args:
@@ -346,24 +334,24 @@ def source_of_masks(settings: Settings, sequences: Collection[str]) -> str:
 
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
-    splits = {"tune": design.race, "confirm": design.confirm, "held_out": design.held_out}
-    return [name for name, instances in splits.items() if any(_masks_seen(settings, instances))]
+    splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
+    return [name for name, instances in splits.items() if _masks_seen(settings, instances)]
 
 
-def seen_note(splits: Collection[str]) -> str:
+def seen_note(splits: PySequence[str]) -> str:
     """What such splits mean for a study, in one sentence; empty without any."""
     if not splits:
         return ""
-    named = " and ".join(
-        {"tune": "race", "confirm": "choice", "held_out": "held-out instances"}[name] for name in splits
-    )
+    names = {"tune": "trials", "confirm": "choice", "held_out": "held-out instances"}
+    named = " and ".join(names[split] for split in splits)
     judged = (
         "so nothing here judges the masks: held-out instances are rendered scenes from 100 on"
         if "held_out" in splits
-        else "so the errors there flatter it, and the held-out instances, which it has not seen, may gain less"
+        else "so the errors there are optimistic, and the held-out instances, which it has not seen, may gain less"
     )
     return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."
 
 
-def _masks_seen(settings: Settings, instances: Iterable[ProblemInstance]) -> Iterable[bool]:
-    return (seen_in_training(source_of_masks(settings, [each.sequence]), each.sequence) for each in instances)
+def _masks_seen(settings: Settings, instances: Iterable[ProblemInstance]) -> bool:
+    names = [instance.sequence for instance in instances]
+    return any(seen_in_training(source_of_masks(settings, [name]), name) for name in names)

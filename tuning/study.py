@@ -1,4 +1,4 @@
-"""Studies from Python: instances, objectives, samplers and callbacks of one's own, and stored studies to look at."""
+"""Studies: run one from Python with custom objectives, samplers and callbacks, open a stored one, run its stages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from dynslam_bench.core.reading import read_json
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.core.toml import read_toml
-from dynslam_bench.core.version import install_hint
 from dynslam_bench.tuning.final_runs import finish
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.objectives import ACCURACY, Cost, Objective, Outcomes, find_objective, own_objective, together
@@ -23,7 +22,7 @@ from dynslam_bench.tuning.pilot import FEWEST, Pilot, refuse_hopeless, run_pilot
 from dynslam_bench.tuning.screening import Screening, live, plan, screen
 from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import open_storage, study_folder
-from dynslam_bench.tuning.study_file import StudySpec, converted, make_spec, read_study
+from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study
 from dynslam_bench.tuning.summary import StudySummary
 from dynslam_bench.tuning.trials import trials_frame
 from dynslam_bench.tuning.tuner import OnEvent, OnRun, StudyEvent, Tuner
@@ -46,8 +45,8 @@ class Study:
     Args:
         spec: The study, or its TOML file; None if the fields say it all.
         results: The results folder.
-        objective: In place of the spec's: names of objectives, or functions of one's own that give what a run costs
-            (`evaluate.Outcome` to a number above 0), one or several.
+        objective: In place of the spec's: names of objectives, or functions from
+            `evaluate.Outcome` to a cost above 0, one or several.
         sampler: Any of Optuna's, in place of the spec's.
         callbacks: Called with Optuna's study and the trial after each trial.
         start: Presets (TOML files, or settings by dotted name) that are tried right after the default.
@@ -78,18 +77,18 @@ class Study:
     ) -> None:
         base = read_study(spec) if isinstance(spec, Path | str) else spec
         objectives = _objectives(objective)
-        given = {key: _texts(value) for key, value in fields.items()}
+        changes = {key: _texts(value) for key, value in fields.items()}
         if objectives is not None:
-            given["objectives"] = tuple(each.name for each in objectives)
-        known = {} if base is None else base.model_dump()
-        self.spec = make_spec({"name": "study", **known, **given}, "the study")
+            changes["objectives"] = tuple(objective.name for objective in objectives)
+        values = {} if base is None else base.model_dump()
+        self.spec = make_spec({"name": "study", **values, **changes}, "the study")
         self._tuner = tuner = Tuner(self.spec, results, objectives=objectives, sampler=sampler)
         self.study = tuner.study
         self._callbacks = tuple(callbacks)
         self._summary: StudySummary | None = None
         for preset in start:
-            values = preset if isinstance(preset, Mapping) else read_preset(Path(preset))
-            tuner.study.enqueue_trial(starting_point(values, tuner.space, tuner.base), skip_if_exists=True)
+            settings = preset if isinstance(preset, Mapping) else read_preset(Path(preset))
+            tuner.study.enqueue_trial(starting_point(settings, tuner.space, tuner.base), skip_if_exists=True)
 
     @classmethod
     def open(cls, study: StudySpec | Path | str, results: Path | str = "results") -> Study:
@@ -124,7 +123,7 @@ class Study:
         """
         tuner = self._running()
         begin(tuner, jobs=jobs)
-        tuner.run(jobs=jobs, on_event=self._told)
+        tuner.run(jobs=jobs, on_event=self._call_back)
         return self
 
     def finish(self, *, jobs: int = 1) -> StudySummary:
@@ -135,15 +134,15 @@ class Study:
         return summary
 
     def pilot(self, *, jobs: int = 1) -> Pilot:
-        """What the study's instances could show; see `starting.pilot_of`."""
+        """What the study's instances could show; see `pilot_of`."""
         return pilot_of(self._running(), jobs=jobs)
 
     def screen(self, *, points: int = 2, instances: int = 4, jobs: int = 1) -> Screening:
-        """Which settings matter; see `starting.screen_study`."""
+        """Which settings matter; see `screen_study`."""
         return screen_study(self._running(), points=points, instances=instances, jobs=jobs)
 
     def frame(self) -> pd.DataFrame:
-        """All trials; see `frame.trials_frame`.
+        """All trials; see `trials.trials_frame`.
 
         Raises:
             StudyError: The storage holds something else than this package stores of a trial.
@@ -158,7 +157,7 @@ class Study:
             raise StudyError(f"study '{self.spec.name}' was opened to be looked at", "Study(...) makes one to run")
         return self._tuner
 
-    def _told(self, event: StudyEvent) -> None:
+    def _call_back(self, event: StudyEvent) -> None:
         if event.kind == "finished" and self._callbacks:
             trial = self.study.get_trials(deepcopy=False)[event.number]
             for callback in self._callbacks:
@@ -172,10 +171,9 @@ def read_preset(path: Path) -> dict[str, Scalar]:
         SettingsError: It cannot be read, or is no TOML.
     """
     try:
-        document = read_toml(path.expanduser())
+        return dict(_flat(read_toml(path.expanduser())))
     except SequenceError as error:
         raise SettingsError(str(error)) from None
-    return dict(_flat(document))
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
@@ -189,16 +187,14 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, An
 def _objectives(given: str | Cost | Sequence[str | Cost] | None) -> list[Objective] | None:
     if given is None:
         return None
-    several = [given] if isinstance(given, str) or callable(given) else list(given)
-    return [find_objective(each) if isinstance(each, str) else own_objective(each) for each in several]
+    several = [given] if isinstance(given, str) or callable(given) else given
+    return [find_objective(one) if isinstance(one, str) else own_objective(one) for one in several]
 
 
 def _texts(value: Any) -> Any:
-    """Instances as the texts that name them."""
-    if isinstance(value, ProblemInstance):
-        return (str(value),)
-    several = isinstance(value, list | tuple) and any(isinstance(each, ProblemInstance) for each in value)
-    return tuple(map(str, value)) if several else value
+    """Instances as the texts that name them; any other value as it is."""
+    values = value if isinstance(value, list | tuple) else [value]
+    return tuple(map(str, values)) if any(isinstance(item, ProblemInstance) for item in values) else value
 
 
 def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, Path]:
@@ -208,10 +204,7 @@ def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, P
     path = Path(study).expanduser()
     stored = path / _SPEC_FILE
     if stored.is_file():
-        values = read_json(stored, kind=StudyError)
-        return make_spec(
-            converted(values)[0] if isinstance(values, dict) else values, str(stored)
-        ), path.absolute().parents[1]
+        return make_spec(read_json(stored, kind=StudyError), str(stored)), path.absolute().parents[1]
     if path.is_dir():
         raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
     return read_study(path), results
@@ -238,8 +231,8 @@ def run_study(
         spec: The study.
         results: The results folder; the study's own files lie in ``studies/<name>``.
         jobs: Trials at a time.
-        on_event: Told of everything that happens.
-        on_run: Told of every run, those of `finish` among them.
+        on_event: Called with every event.
+        on_run: Called with every event of every run, those of `finish` included.
 
     Returns:
         The study, for `finish`.
@@ -255,34 +248,30 @@ def run_study(
 
 
 def begin(tuner: Tuner, *, jobs: int = 1, on_event: OnEvent | None = None) -> None:
-    """Run a new study's pilot, if it asks for one, and say what it found.
+    """Run a new study's pilot, if it asks for one, and report what it shows.
 
     Raises:
         StudyError: The study could find nothing.
     """
     if not tuner.spec.pilot or (tuner.folder / PILOT_FILE).is_file() or tuner.study.get_trials(deepcopy=False)[1:]:
         return
-
-    def say(text: str) -> None:
+    if len(scenes(tuner.design.tune)) < FEWEST:
+        texts = [f"no pilot: it takes {FEWEST} scenes to tune on"]
+        pilot = None
+    else:
+        pilot = pilot_of(tuner, jobs=jobs)
+        texts = [pilot.sentence, *filter(None, [pilot.warning])]
+    for text in texts:
         if on_event is not None:
             on_event(StudyEvent("pilot", 0, 1, text))
-
-    if len(scenes(tuner.design.race)) < FEWEST:
-        say(f"no pilot: it takes {FEWEST} scenes to tune on")
-        return
-    found = pilot_of(tuner, jobs=jobs)
-    say(found.sentence)
-    if found.warning:
-        say(found.warning)
-    if not tuner.spec.at_equal_accuracy:  # settings that leave the poses alone show their speed in any case
-        refuse_hopeless(found)
+    if pilot is not None and not tuner.spec.at_equal_accuracy:  # settings that leave the poses alone show their speed
+        refuse_hopeless(pilot)
 
 
 def pilot_of(tuner: Tuner, *, jobs: int = 1) -> Pilot:
     """Run a study's pilot; `pilot.json` in its folder holds it.
 
-    It looks at the study's own objectives, or at accuracy where a gain counts only at equal accuracy: that is then the
-    hard part.
+    It looks at the study's own objectives, or at accuracy where a gain counts only at equal accuracy.
 
     Raises:
         StudyError: The default settings fail, or there are too few scenes.
@@ -293,18 +282,12 @@ def pilot_of(tuner: Tuner, *, jobs: int = 1) -> Pilot:
 
     objective = ACCURACY if tuner.spec.at_equal_accuracy else together(tuner.objectives)
     split = tuner.design.held_out if len(scenes(tuner.design.held_out)) >= FEWEST else None
-    found = run_pilot(
-        tuner.space,
-        tuner.base,
-        run,
-        tuner.design.reference,
-        objective,
-        seed=tuner.spec.sampler_seed,
-        jobs=jobs,
-        split=split,
-    )
-    write_atomic(tuner.folder / PILOT_FILE, found.to_json())
-    return found
+    pilot = run_pilot(
+        tuner.space, tuner.base, run, tuner.design.reference, objective,
+        seed=tuner.spec.sampler_seed, jobs=jobs, split=split,
+    )  # fmt: skip
+    write_atomic(tuner.folder / PILOT_FILE, pilot.to_json())
+    return pilot
 
 
 def screen_study(
@@ -318,13 +301,13 @@ def screen_study(
         points: From how many points settings are moved: the default and others near it.
         instances: On how many of its instances, of different scenes where there are so many.
         jobs: Runs at a time.
-        on_done: Told how many configurations of how many are done.
+        on_done: Called with the number of finished configurations and of all.
 
     Raises:
         StudyError: See `screening.screen`.
     """
-    chosen = tuner.design.race[:instances]
-    objectives: list[Objective] = list(dict.fromkeys([*tuner.objectives, ACCURACY]))
+    chosen = tuner.design.tune[:instances]
+    objectives = list(dict.fromkeys([*tuner.objectives, ACCURACY]))
 
     def run(values: Mapping[str, Scalar]) -> Outcomes:
         return tuner.evaluate({**tuner.spec.space.fixed, **values}, chosen)
@@ -332,44 +315,7 @@ def screen_study(
     usable = live(tuner.space, tuner.base)
     if not usable:
         raise StudyError("no setting of the space has an effect at the default", "fix what switches them on")
-    found = screen(
-        plan(usable, tuner.base, points, tuner.spec.sampler_seed), run, objectives, jobs=jobs, on_done=on_done
-    )
-    write_atomic(tuner.folder / SCREENING_FILE, found.to_json())
-    return found
-
-
-# Callbacks for studies: trials as runs in TensorBoard (for MLflow Optuna has its own, see docs/tuning.md).
-
-
-class TensorBoard:
-    """Writes each complete trial as a run of TensorBoard: its settings as hyper-parameters, its values as metrics.
-
-    Example:
-        ``Study(..., callbacks=[TensorBoard("board")]).run()``, then point TensorBoard at that folder
-
-    Args:
-        folder: Where; one folder a trial is made in it.
-
-    Raises:
-        StudyError: The package ``tensorboard`` is not installed.
-    """
-
-    def __init__(self, folder: Path | str) -> None:
-        self._folder = Path(folder).expanduser()
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise StudyError("the callback needs the package tensorboard", install_hint("tensorboard")) from error
-        self._writer: Any = SummaryWriter
-
-    def __call__(self, study: optuna.Study, trial: FrozenTrial) -> None:
-        """Take in a trial; those that failed or were stopped have no values and are left out."""
-        if trial.values is None or trial.state != optuna.trial.TrialState.COMPLETE:
-            return
-        names = study.metric_names or [f"value_{index}" for index in range(len(trial.values))]
-        settings = {key: value if isinstance(value, int | float) else str(value) for key, value in trial.params.items()}
-        with self._writer(str(self._folder / f"trial-{trial.number:04d}")) as writer:
-            writer.add_hparams(settings, dict(zip(names, trial.values, strict=True)), run_name=".")
-            for name, value in zip(names, trial.values, strict=True):
-                writer.add_scalar(f"study/{name}", value, trial.number)
+    steps = plan(usable, tuner.base, points, tuner.spec.sampler_seed)
+    screening = screen(steps, run, objectives, jobs=jobs, on_done=on_done)
+    write_atomic(tuner.folder / SCREENING_FILE, screening.to_json())
+    return screening

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,12 +9,12 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.passwords import without_passwords
-from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.records import Record
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
-PrunerName = Literal["halving", "rejection", "wilcoxon", "none"]
+PrunerName = Literal["halving", "wilcoxon", "none"]
 EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
 """Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
@@ -47,8 +46,8 @@ class StudySpec(_Part):
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
         tune: Instances that trials run on, written as `instances.parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Instances that no trial runs on, on which the best of them are judged again and the choice is made. Empty
-            for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
+        confirm: Instances that no trial runs on. The best trials are judged again on them, and one is chosen. Empty for
+            a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
         held_out: Instances that decide at the end whether tuning helped; neither trials nor the choice see them.
         recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.
@@ -56,7 +55,7 @@ class StudySpec(_Part):
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their scene gives to the
             other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
-            minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
+            minimised, see `objectives.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
             the worst quarter of the scenes; ``robustness``: ATE on the degraded instances; ``coverage``: share of lost
             frames.
         ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
@@ -71,8 +70,8 @@ class StudySpec(_Part):
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
-        race: How trials drop out: by sequential ``halving`` over growing sets of instances, by successive ``rejection``
-            after every instance, by ``wilcoxon``'s test against the best one, or ``none``.
+        pruner: ``halving`` is Optuna's `SuccessiveHalvingPruner` over growing sets of instances, ``wilcoxon`` its
+            `WilcoxonPruner` over the single instances, ``none`` its `NopPruner`.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
             ``~/.pgpass``): it is in no file that is written.
@@ -102,7 +101,7 @@ class StudySpec(_Part):
     top: int = Field(default=3, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
-    race: PrunerName = "halving"
+    pruner: PrunerName = "halving"
     storage: str = ""
     protocol: str = "tum-rgbd/v1"
     cache: bool = True
@@ -112,17 +111,23 @@ class StudySpec(_Part):
     @model_validator(mode="after")
     def _splits_are_apart(self) -> StudySpec:
         for name in ("tune", "confirm", "held_out", "recorded", "seeds", "offsets", "objectives"):
-            values = getattr(self, name) or ()
-            twice = sorted({str(value) for value in values if list(values).count(value) > 1})
-            if twice:
-                raise ValueError(f"{name} names '{twice[0]}' twice")
-        judged = {instance.scene: text for text in reversed(self.held_out) for instance in self.instances(text)}
-        both = {instance.scene: text for text in (*self.tune, *self.confirm) for instance in self.instances(text)
-                if instance.scene in judged}  # fmt: skip
-        if both and not self.allow_overlap:
-            scene, one = next(iter(both.items()))
-            spelled = "" if one == judged[scene] else f", held out as '{judged[scene]}'"
-            raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{one}'{spelled}")
+            values = [str(value) for value in getattr(self, name) or ()]
+            repeated = next((value for value in values if values.count(value) > 1), None)
+            if repeated is not None:
+                raise ValueError(f"{name} names '{repeated}' twice")
+        held_out = {instance.scene: text for text in reversed(self.held_out) for instance in self.instances(text)}
+        shared = {
+            instance.scene: text
+            for text in (*self.tune, *self.confirm)
+            for instance in self.instances(text)
+            if instance.scene in held_out
+        }
+        if shared and not self.allow_overlap:
+            scene, text = next(iter(shared.items()))
+            other = "" if text == held_out[scene] else f", held out as '{held_out[scene]}'"
+            raise ValueError(
+                f"the tune and held_out splits share {len(shared)} sequences, the first is '{text}'{other}"
+            )
         return self
 
     def instances(self, *texts: str) -> list[ProblemInstance]:
@@ -140,32 +145,19 @@ class StudySpec(_Part):
         """Whether a gain counts only at (nearly) the default's accuracy, as it may be paid for with the error."""
         return len(self.objectives) > 1 or self.objectives[0] not in EQUALLY_ACCURATE
 
-    def digest(self) -> str:
-        """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
-        free = {"trials", "timeout_s", "top", "storage", "pilot"}
-        return digest(self.model_dump(mode="json", exclude=free))
-
     def for_others(self) -> dict[str, Any]:
         """The study as it is written down beside its trials: without the password of its storage."""
         return self.model_dump(mode="json") | {"storage": without_passwords(self.storage)}
 
 
-def read_study(path: str | Path, on_note: Callable[[str], None] | None = None) -> StudySpec:
+def read_study(path: str | Path) -> StudySpec:
     """Read a study file.
-
-    Args:
-        path: The file.
-        on_note: Told what was converted, if the file has an old form.
 
     Raises:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    values, notes = converted({"name": path.stem, **read_toml(path, kind=StudyError)})
-    if on_note is not None:
-        for text in notes:
-            on_note(f"{path} has an old form: {text}")
-    return make_spec(values, str(path))
+    return make_spec({"name": path.stem, **read_toml(path, kind=StudyError)}, str(path))
 
 
 def make_spec(values: Any, where: str) -> StudySpec:
@@ -190,31 +182,3 @@ def make_spec(values: Any, where: str) -> StudySpec:
             raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, known)) from None
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None
-
-
-# Study files of before there were instances and races, in today's form.
-
-RACES = {"median": "halving", "hyperband": "halving", "wilcoxon": "wilcoxon", "none": "none"}
-"""Who ends trials early now, by the `pruner` that did."""
-NEW = ("confirm", "recorded", "race", "ate_margin")
-"""What the old form could not say."""
-
-
-def is_old(values: Mapping[str, Any]) -> bool:
-    """Whether a study, or its stored identity, has the old form."""
-    return "pruner" in values
-
-
-def converted(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """A study's values in today's form, and what was changed, a line each.
-
-    The names of sequences are instances as they stand. What cannot be converted is left for the validation to refuse.
-    """
-    found, notes = dict(values), []
-    if is_old(found):
-        pruner = found.pop("pruner")
-        found.setdefault("race", RACES.get(str(pruner), pruner))
-        notes.append(f'pruner = "{pruner}" became race = "{found["race"]}"')
-        if "speed" in str(found.get("objectives", "")):
-            notes.append('objective "speed" is the processor time beside the default\'s, no real-time factor')
-    return found, notes

@@ -1,4 +1,4 @@
-"""A ratio to the default settings, with its interval."""
+"""The result of a study: ratios to the default with their intervals, the choice, the conclusion, the picks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dynslam_bench.core.records import Record
 from dynslam_bench.tuning.objectives import ACCURACY, FEWEST_SCENES, Objective, Outcomes, bounds, centre, upper
@@ -22,9 +22,8 @@ class Ratio(Record):
 
     Attributes:
         ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the default.
-        low: Lower end of the interval over scenes (`statistics.bounds`); below three scenes over starts, which tells
-            nothing of other scenes. None for a single run. Summaries of older versions hold a bootstrap interval, which
-            was too narrow.
+        low: Lower end of the interval over scenes (`objectives.bounds`); below three scenes over starts, which tells
+            nothing of other scenes. None for a single run.
         high: Upper end.
         n: Paired runs.
         sequences: How many scenes they come from.
@@ -82,19 +81,23 @@ def compared(outcomes: Outcomes, default: Outcomes, *, objective: Objective = AC
     scenes = objective.ratios(outcomes, default)
     sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, default)
     sample = objective.counted(sample)
-    found, middle = bounds(sample), centre(sample)
-    about: dict[str, Any] = {"n": len(outcomes), "sequences": len(scenes), "what": objective.what}
-    if found is None:
-        return Ratio(ratio=_ratio(middle), low=None, high=None, **about)
-    bound = _ratio(upper(sample, 1 - FALSE_CHOICES / candidates))
-    return Ratio(ratio=_ratio(middle), low=_ratio(found[0]), high=_ratio(found[1]), bound=bound, **about)
+    interval = bounds(sample)
+    return Ratio(
+        ratio=_ratio(centre(sample)),
+        low=None if interval is None else _ratio(interval[0]),
+        high=None if interval is None else _ratio(interval[1]),
+        bound=None if interval is None else _ratio(upper(sample, 1 - FALSE_CHOICES / candidates)),
+        n=len(outcomes),
+        sequences=len(scenes),
+        what=objective.what,
+    )
 
 
 def _ratio(logarithm: float) -> float:
     return math.exp(min(logarithm, _LARGEST_LOG))
 
 
-# What came out of a study, and what may be concluded from it.
+# The summary of a study and its conclusion.
 
 
 class Candidate(Record):
@@ -130,26 +133,14 @@ class Candidate(Record):
     feasible: bool = True
     failed: str = ""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _of_an_older_version(cls, values: Any) -> Any:
-        """What is ``confirm`` now were fresh repeats on the tune split."""
-        if isinstance(values, dict) and "tune" in values:
-            return {**{key: value for key, value in values.items() if key != "tune"}, "confirm": values["tune"]}
-        return values
-
     @property
     def bound(self) -> float:
         """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
-        known = self.feasible and self.confirm is not None and self.confirm.bound is not None
-        if not self.nothing_lost(self.on_confirm):
-            return math.inf
-        return self.confirm.bound if known and self.confirm is not None and self.confirm.bound is not None else math.inf
+        return _bound(self.confirm) if self.feasible and self.nothing_lost(self.on_confirm) else math.inf
 
     def nothing_lost(self, ratios: Mapping[str, Ratio]) -> bool:
         """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the default, if that is asked."""
-        bound = ratios["accuracy"].bound if "accuracy" in ratios else None
-        return self.ate_margin is None or (bound is not None and bound < 1 + self.ate_margin)
+        return self.ate_margin is None or _bound(ratios.get("accuracy")) < 1 + self.ate_margin
 
     @property
     def worse_on_recordings(self) -> bool:
@@ -176,15 +167,14 @@ class StudySummary(Record):
         improves: Whether the chosen settings beat the default on the held-out split (the whole interval below 1), are
             not worse on recordings, and the splits are apart.
         conclusion: One sentence, see `conclude`.
-        importances: Shares of the parameters that matter more than chance, see `importance`.
-        inert: Parameters that changed nothing, or never took part.
+        importances: Optuna's importances of the parameters, see `trials.importances`.
         tune: The instances that trials ran on.
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
         picks: Presets of the study by name, and the trial of each; None where the default is the pick.
         split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
-        seen: Splits with scenes that the network behind the masks was trained on, see `seen.seen_note`.
+        seen: Splits with scenes that the network behind the masks was trained on, see `splits.seen_note`.
     """
 
     name: str
@@ -196,7 +186,6 @@ class StudySummary(Record):
     improves: bool
     conclusion: str
     importances: dict[str, float] = Field(default_factory=dict)
-    inert: list[str] = Field(default_factory=list)
     tune: list[str] = Field(default_factory=list)
     confirm: list[str] = Field(default_factory=list)
     held_out: list[str] = Field(default_factory=list)
@@ -204,12 +193,6 @@ class StudySummary(Record):
     picks: dict[str, int | None] = Field(default_factory=dict)
     split_notes: list[str] = Field(default_factory=list)
     seen: list[str] = Field(default_factory=list)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_an_older_version(cls, values: Any) -> Any:
-        """The repeats are told by the instances now."""
-        return {key: value for key, value in values.items() if key != "repeats"} if isinstance(values, dict) else values
 
     @property
     def verdict(self) -> str:
@@ -225,80 +208,82 @@ def choose(candidates: Sequence[Candidate]) -> Candidate | None:
 
 def conclude(candidates: Sequence[Candidate], chosen: int | None, split_notes: Sequence[str]) -> str:
     """One sentence: better or not on the held-out split, by how much, how sure, and whether to keep the default."""
-    taken = next((candidate for candidate in candidates if candidate.trial == chosen), None)
-    text = _nothing_chosen(candidates) if taken is None else _conclude(taken, bool(split_notes))
-    return text + (f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else "")
+    candidate = next((candidate for candidate in candidates if candidate.trial == chosen), None)
+    text = _nothing_chosen(candidates) if candidate is None else _judged(candidate, bool(split_notes))
+    return text + _apart(split_notes)
 
 
 def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
     """Why the default was chosen."""
-    judged = [each for each in candidates if each.confirm is not None]
-    feasible = [each for each in judged if each.feasible]
+    judged = [candidate for candidate in candidates if candidate.confirm is not None]
+    feasible = [candidate for candidate in judged if candidate.feasible]
     if not candidates:
         return "Keep the default: no trial with other settings came to its end."
     if not judged:
         return f"Keep the default: trial {candidates[0].trial} failed when run again: {candidates[0].failed}."
     if not feasible:
         return f"Keep the default: trial {judged[0].trial} violates a constraint when run again, as do all that were."
-    unsure = [each for each in feasible if not each.nothing_lost(each.on_confirm)]
-    if len(unsure) == len(feasible):
-        return _not_as_accurate(unsure)
-    best = min(feasible, key=lambda each: each.bound)
+    if not any(candidate.nothing_lost(candidate.on_confirm) for candidate in feasible):
+        best = min(feasible, key=lambda candidate: _bound(candidate.on_confirm["accuracy"]))
+        ate = best.on_confirm["accuracy"]
+        return (
+            f"Keep the default: no trial is shown to be as accurate on {ate.n} runs that none had seen (trial "
+            f"{best.trial}: {best.confirm}, but {ate}, upper bound {_bound_text(ate)}, which has to lie below "
+            f"{1 + (best.ate_margin or 0.0):.2f})."
+        )
+    best = min(feasible, key=lambda candidate: candidate.bound)
     assert best.confirm is not None
-    many = f"none of the {len(judged)} best trials holds" if len(judged) > 1 else "the best trial does not hold"
-    bound = "none" if best.confirm.bound is None else f"{best.confirm.bound:.3f}"
+    many = f"none of the {len(judged)} best trials is" if len(judged) > 1 else "the best trial is not"
     return (
-        f"Keep the default: {many} up on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
-        f"{best.confirm}, upper bound {bound})."
+        f"Keep the default: {many} confirmed on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
+        f"{best.confirm}, upper bound {_bound_text(best.confirm)})."
     )
 
 
-def _not_as_accurate(candidates: Sequence[Candidate]) -> str:
-    """That no candidate could be shown to be as accurate as the default."""
-    best = min(candidates, key=lambda each: each.on_confirm["accuracy"].bound or math.inf)
-    ate, margin = best.on_confirm["accuracy"], best.ate_margin or 0.0
-    bound = "none" if ate.bound is None else f"{ate.bound:.3f}"
-    return (
-        f"Keep the default: no trial could be shown to be as accurate on {ate.n} runs that none had seen (trial "
-        f"{best.trial}: {best.confirm}, but {ate}, upper bound {bound}, asked for: below {1 + margin:.2f})."
-    )
+def _bound_text(ratio: Ratio) -> str:
+    return "none" if ratio.bound is None else f"{ratio.bound:.3f}"
 
 
-def _conclude(chosen: Candidate, overlapping: bool) -> str:
+def _judged(chosen: Candidate, overlapping: bool) -> str:
+    """What the held-out split and the recordings say of the choice."""
     if chosen.failed:
         return f"Keep the default: trial {chosen.trial} was chosen, but failed when it was judged: {chosen.failed}."
-    held, again = chosen.held_out, chosen.confirm
+    held, confirm = chosen.held_out, chosen.confirm
     if held is None:
         return (
             f"Not judged, keep the default: no held-out split was given, and what trial {chosen.trial} reaches on the "
-            f"instances that it was chosen on ({again}) says nothing about others."
+            f"instances that it was chosen on ({confirm}) says nothing about others."
         )
     on = f"on {held.sequences} held-out scene{'s' * (held.sequences != 1)}"
-    chosen_on = f"where it was chosen: {again}"
+    details = f"where it was chosen: {confirm}"
     if held.sequences < FEWEST_SCENES:
-        return f"Not judged, keep the default: {held} {on} only, from which nothing follows for others ({chosen_on})."
+        return f"Not judged, keep the default: {held} {on} only, from which nothing follows for others ({details})."
     sure = "95 % interval over scenes" + (", rough below five" if held.sequences < 5 else "")
-    checked = "" if chosen.recorded is None else f"; recorded: {chosen.recorded}"
     if chosen.worse_on_recordings:
         return f"Worse on recordings, keep the default: {chosen.recorded} there ({on}: {held}, {sure})."
-    if chosen.ate_margin is not None:
-        checked = f"; {chosen.on_held_out['accuracy']}{checked}" if "accuracy" in chosen.on_held_out else checked
+    if held.shows_loss and chosen.nothing_lost(chosen.on_held_out):
+        more = f"{100 * (held.ratio - 1):.1f} % more {held.what}"
+        return f"Worse, keep the default: {more} {on} ({held}, {sure}; {details})."
+    if chosen.ate_margin is not None and "accuracy" in chosen.on_held_out:
+        details += f"; {chosen.on_held_out['accuracy']}"
+    if chosen.recorded is not None:
+        details += f"; recorded: {chosen.recorded}"
     if not chosen.nothing_lost(chosen.on_held_out):
-        asked = f"not shown to be as accurate, which asks for an upper bound below {1 + (chosen.ate_margin or 0):.2f}"
-        return f"Not better, keep the default: {held} {on}, but {asked} ({chosen_on}{checked})."
+        limit = 1 + (chosen.ate_margin or 0)
+        return (
+            f"Not better, keep the default: {held} {on}, but not shown to be as accurate: the upper bound has to lie "
+            f"below {limit:.2f} ({details})."
+        )
     if held.shows_gain and not overlapping:
         return (
             f"Better: trial {chosen.trial} has {100 * (1 - held.ratio):.1f} % less {held.what} {on} ({held}, {sure}; "
-            f"{chosen_on}{checked}), so its settings may replace the default there."
+            f"{details}), so its settings may replace the default there."
         )
-    if held.shows_loss:
-        more = f"{100 * (held.ratio - 1):.1f} % more {held.what}"
-        return f"Worse, keep the default: {more} {on} ({held}, {sure}; {chosen_on})."
-    return f"Not better, keep the default: {held} {on} shows no gain ({sure}; {chosen_on}{checked})."
+    return f"Not better, keep the default: {held} {on} shows no gain ({sure}; {details})."
 
 
 def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) -> str:
-    """What a preset is worth, in one sentence.
+    """The value of a preset, in one sentence.
 
     Args:
         name: Of the preset.
@@ -307,18 +292,23 @@ def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) ->
     """
     if candidate is None:
         return f"The '{name}' pick is the default: no trial was surely better than it."
-    judged = [f"{split}: {ratios['accuracy']}, {ratios['speed']}" for split, ratios in (
-        ("where it was chosen", candidate.on_confirm), ("held out", candidate.on_held_out),
-    ) if ratios]  # fmt: skip
+    parts = [
+        f"{split}: {ratios['accuracy']}, {ratios['speed']}"
+        for split, ratios in (("where it was chosen", candidate.on_confirm), ("held out", candidate.on_held_out))
+        if ratios
+    ]
     if candidate.recorded is not None:
-        judged.append(f"recorded: {candidate.recorded}")
+        parts.append(f"recorded: {candidate.recorded}")
     if candidate.failed:
-        judged.append(f"failed when it was judged: {candidate.failed}")
-    apart = f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else ""
-    return f"The '{name}' pick is trial {candidate.trial} ({'; '.join(judged)}).{apart}"
+        parts.append(f"failed when it was judged: {candidate.failed}")
+    return f"The '{name}' pick is trial {candidate.trial} ({'; '.join(parts)}).{_apart(split_notes)}"
 
 
-# Which configuration for whom: the fast, the balanced and the accurate one of a study's best trials.
+def _apart(split_notes: Sequence[str]) -> str:
+    return f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else ""
+
+
+# Picks: the fast, the balanced and the accurate one of a study's best trials.
 
 PickName = Literal["fast", "balanced", "accurate"]
 PICKS: tuple[PickName, ...] = get_args(PickName)
@@ -334,8 +324,8 @@ def pick(name: PickName, candidates: Sequence[Candidate], margin: float) -> Cand
         margin: What may be lost of accuracy, as a share.
     """
     asked = 1 + margin if name != "accurate" else math.inf
-    equal = [each for each in candidates if _bound(each.on_confirm["accuracy"]) < asked]
-    best = min(equal, key=lambda each: _decides(name, each), default=None)
+    accurate = [candidate for candidate in candidates if _bound(candidate.on_confirm["accuracy"]) < asked]
+    best = min(accurate, key=lambda candidate: _decides(name, candidate), default=None)
     return best if best is not None and _decides(name, best) < 1 else None
 
 

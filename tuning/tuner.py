@@ -1,4 +1,4 @@
-"""Running a study: trial 0 is the default, trials race on growing sets of instances, everything resumes."""
+"""Running a study: trial 0 is the default, trials run on growing sets of instances, everything resumes."""
 
 from __future__ import annotations
 
@@ -20,28 +20,24 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.passwords import words_without_passwords
-from dynslam_bench.core.reading import read_json
 from dynslam_bench.core.records import digest, write_atomic
-from dynslam_bench.core.sanitise import storable
+from dynslam_bench.core.sanitise import storable, words_without_passwords
 from dynslam_bench.core.settings import apply_overrides, flatten
 from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.record import program_of
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning import pruning as race
 from dynslam_bench.tuning.evaluate import CancelledError, InstanceFailedError, Outcome, evaluate
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.objectives import Objective, Outcomes, coverage, find_objective, fps, violations
-from dynslam_bench.tuning.samplers import build_sampler, set_constraints
+from dynslam_bench.tuning.pruning import build_pruner, is_dominated, step_name, steps
+from dynslam_bench.tuning.samplers import build_sampler
 from dynslam_bench.tuning.space import default_configuration, search_space, suggest
 from dynslam_bench.tuning.splits import design_of
 from dynslam_bench.tuning.storage import open_storage, study_folder, without_password, worker_is_dead, worker_name
-from dynslam_bench.tuning.study_file import NEW, StudySpec, converted, is_old
-from dynslam_bench.tuning.trials import best_trials, errors_in, errors_of
+from dynslam_bench.tuning.study_file import StudySpec
 
 DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-MADE_OF = ("parameters", "data", "program", "version", "source")
-"""What of a study's identity tells the data and the program that made it: must be the same to go on, not to read."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
 
@@ -65,7 +61,7 @@ class StudyEvent:
 
 OnEvent = Callable[[StudyEvent], None]
 OnRun = Callable[[RunEvent], None]
-"""Told of every run that a study makes, also while it goes on; several threads may tell at a time."""
+"""Called with every event of every run of a study, possibly by several threads at a time."""
 
 
 class Tuner:
@@ -79,7 +75,7 @@ class Tuner:
         sampler: In place of the one that the study names.
 
     Attributes:
-        on_run: Told of every run that the study makes from now on; None for nobody.
+        on_run: Called with every event of every run from now on; None for no calls.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
@@ -95,7 +91,7 @@ class Tuner:
         objectives: Sequence[Objective] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
     ) -> None:
-        self.spec = spec = as_stored(spec, study_folder(Path(results), spec) / "study.json") if reading else spec
+        self.spec = spec
         self.results = Path(results)
         self.reading = reading
         self.tracker = TRACKERS.get(spec.tracker)
@@ -104,12 +100,11 @@ class Tuner:
             self.tracker.settings, spec.space, {instance.sequence for instance in spec.instances(*spec.tune)}
         )
         self.defaults, self.base = defaults, flatten(defaults)
-        if spec.race == "wilcoxon" and len(spec.objectives) > 1:
+        if spec.pruner == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(
-                f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
-                "use halving, rejection or none",
+                f"pruner 'wilcoxon' takes one objective, the study has {len(spec.objectives)}", "use halving or none"
             )
-        self.objectives = [find_objective(each) for each in spec.objectives] if objectives is None else list(objectives)
+        self.objectives = [find_objective(name) for name in spec.objectives] if objectives is None else list(objectives)
         sampler = build_sampler(spec) if sampler is None else sampler
         self.design = design_of(spec, accept=reading)
         self.steps = self._steps()
@@ -129,7 +124,7 @@ class Tuner:
 
         Args:
             jobs: Trials at a time in this process.
-            on_event: Told of everything that happens.
+            on_event: Called with every event.
 
         Raises:
             StudyError: The default settings themselves fail on a sequence; says where and why. Or the study was opened
@@ -161,7 +156,8 @@ class Tuner:
     def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[ProblemInstance, Outcome]:
         """The default settings' outcomes on the tune split, to which every trial is compared."""
         missing = [instance for instance in self.design.reference if instance not in self._reference]
-        _tell(on_event, "reference", 0, len(missing), "the default settings")
+        if on_event is not None:
+            on_event(StudyEvent("reference", 0, len(missing), "the default settings"))
         with self._ending_all():
             try:
                 self._reference.update(self.evaluate(self.spec.space.fixed, missing, jobs=jobs))
@@ -181,7 +177,7 @@ class Tuner:
         jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
-        """Run settings on instances as this study runs them; see `evaluate.evaluate`. `cache` is the study's if None."""
+        """Run settings on instances as this study does; see `evaluate.evaluate`. `cache` None is the study's own."""
         return evaluate(
             self.spec.tracker, settings, instances, results=self.store, jobs=jobs, protocol=self.spec.protocol,
             threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
@@ -191,12 +187,12 @@ class Tuner:
     def evaluate_beside(
         self, configurations: Sequence[Mapping[str, Any]], instances: Sequence[ProblemInstance], *, jobs: int = 1
     ) -> list[dict[ProblemInstance, Outcome] | InstanceFailedError]:
-        """Run several configurations instance by instance, without the stage cache, so that their times can be compared.
+        """Run configurations instance by instance, without the stage cache, so that their times can be compared.
 
-        Whatever else the machine does at a time then slows all of them alike.
+        Other load on the machine then slows all of them alike.
 
         Returns:
-            For each configuration its outcomes, or why its first failing run failed; it runs on no further instance then.
+            For each configuration its outcomes, or the error of its first failed run; it runs on no instance after it.
         """
         outcomes: list[dict[ProblemInstance, Outcome]] = [{} for _ in configurations]
         failed: dict[int, InstanceFailedError] = {}
@@ -213,48 +209,49 @@ class Tuner:
                 pool.submit(one, number, instance) for instance in instances for number in range(len(outcomes))
             ]:
                 future.result()
-        return [failed.get(number, found) for number, found in enumerate(outcomes)]
+        return [failed.get(number, outcome) for number, outcome in enumerate(outcomes)]
 
     def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
         """The overrides that a trial ran with."""
         return {**self.spec.space.fixed, **trial.params}
 
+    def values(self, outcomes: Outcomes) -> list[float]:
+        """The objectives' values: natural logarithms of ratios to the default settings, less is better."""
+        return [objective.value(outcomes, self._reference) for objective in self.objectives]
+
     def _steps(self) -> list[int]:
-        """The steps of the race at which every objective has a instance that counts."""
-        found = race.steps(self.spec.race, len(self.design.race))
-        return [
-            step
-            for step in found[:-1]
-            if all(any(map(each.counts, self.design.race[:step])) for each in self.objectives)
-        ] + found[-1:]
+        """The steps at which every objective has an instance that counts."""
+        *early, last = steps(self.spec.pruner, len(self.design.tune))
+        counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
+        return [*(step for step in early if all(any(flags[:step]) for flags in counted)), last]
 
     def _one(self, on_event: OnEvent | None) -> None:
         with self._lock:
             trial = self.study.ask()
             values = suggest(trial, self.space, self.base)
         trial.set_user_attr("worker", worker_name())
-        _tell(on_event, "started", trial.number, self.spec.trials, f"trial {trial.number}")
+        if on_event is not None:
+            on_event(StudyEvent("started", trial.number, self.spec.trials, f"trial {trial.number}"))
         state, result, text = self._evaluate(trial, values)
         with self._lock:
             self.study.tell(trial, result, state=state)
-        _tell(on_event, "finished", trial.number, self.spec.trials, f"trial {trial.number}: {text}")
+        if on_event is not None:
+            on_event(StudyEvent("finished", trial.number, self.spec.trials, f"trial {trial.number}: {text}"))
 
     def _evaluate(self, trial: optuna.Trial, values: dict[str, Any]) -> tuple[TrialState, list[float] | None, str]:
         settings = {**self.spec.space.fixed, **values}
         outcomes: dict[ProblemInstance, Outcome] = {}
         started = time.perf_counter()
         try:
-            for position, step in enumerate(self.steps):
-                outcomes |= self.evaluate(settings, self.design.race[len(outcomes) : step])
+            for step in self.steps:
+                first = len(outcomes)
+                outcomes |= self.evaluate(settings, self.design.tune[first:step])
                 result = self.values(outcomes)
-                final = step == self.steps[-1]
-                self._record(trial, outcomes, final=final)
-                if not final:
-                    race.note(trial, step, result)
-                    if trial.number > 0 and self._drops(trial.number, position, outcomes):
-                        text = f"dropped after {step} of {self.steps[-1]} instances"
-                        trial.set_user_attr("reason", text)
-                        return TrialState.PRUNED, None, text
+                self._record(trial, outcomes)
+                if self._pruned(trial, outcomes, result, first) and trial.number > 0:
+                    text = f"pruned after {step} of {self.steps[-1]} instances"
+                    trial.set_user_attr("reason", text)
+                    return TrialState.PRUNED, None, text
         except CancelledError:
             trial.set_user_attr("reason", CRASHED_WORKER)
             return TrialState.FAIL, None, "interrupted"
@@ -263,47 +260,54 @@ class Tuner:
             return TrialState.FAIL, None, f"failed: {error}"
         finally:
             trial.set_user_attr("wall_s", round(time.perf_counter() - started, 3))
-        return TrialState.COMPLETE, result, self._describe(result, outcomes)
-
-    def values(self, outcomes: Outcomes) -> list[float]:
-        """The objectives' values: natural logarithms of ratios to the default settings, less is better."""
-        return [each.value(outcomes, self._reference) for each in self.objectives]
-
-    def _describe(self, result: list[float], outcomes: Outcomes) -> str:
+        violated = violations(self.spec, outcomes, self._reference)
+        for name, value in violated.items():
+            trial.set_constraint(name, value)
         parts = [f"{each.what} x {math.exp(value):.3f}" for each, value in zip(self.objectives, result, strict=True)]
-        violated = [name for name, value in violations(self.spec, outcomes, self._reference).items() if value > 0]
-        return ", ".join(parts) + (f", violates {' and '.join(violated)}" if violated else "")
+        broken = [name for name, value in violated.items() if value > 0]
+        text = ", ".join(parts) + (f", violates {' and '.join(broken)}" if broken else "")
+        return TrialState.COMPLETE, result, text
 
-    def _drops(self, number: int, position: int, outcomes: Mapping[ProblemInstance, Outcome]) -> bool:
-        """Whether a trial leaves the race at a step."""
-        if self.spec.race == "wilcoxon":
-            best = best_trials(self.study, 1)
-            return bool(best) and race.is_worse(errors_in(outcomes), errors_of(best[0]))
-        trials = self.study.get_trials(deepcopy=False)
-        return race.leaves(trials, number, self.steps, position)
+    def _pruned(self, trial: optuna.Trial, outcomes: Outcomes, values: list[float], first: int) -> bool:
+        """Report a trial's values and ask the pruner; `first` instances were reported before.
 
-    def _record(self, trial: optuna.Trial, outcomes: Mapping[ProblemInstance, Outcome], *, final: bool) -> None:
-        set_constraints(trial, violations(self.spec, outcomes, self._reference), final=final)
+        Optuna's pruners know no constraints: a trial that violates one at a step takes no part in the comparison there.
+        """
+        step, final = len(outcomes), len(outcomes) == self.steps[-1]
+        if self.spec.pruner == "wilcoxon":
+            for index, value in enumerate(self.objectives[0].by_start(outcomes, self._reference)):
+                if index >= first:
+                    trial.report(value, index)
+            return not final and trial.should_prune()
+        if final or any(value > 0 for value in violations(self.spec, outcomes, self._reference).values()):
+            return False
+        if len(values) == 1:
+            trial.report(values[0], step)
+            return trial.should_prune()
+        trial.set_user_attr(step_name(step), values)
+        return is_dominated(self.study.get_trials(deepcopy=False), trial.number, step)
+
+    def _record(self, trial: optuna.Trial, outcomes: Outcomes) -> None:
         trial.set_user_attr("coverage", coverage(outcomes))
         trial.set_user_attr("fps", fps(outcomes))
-        rows = [[str(instance), o.run_id, o.ate_m, o.coverage, o.frame_s] for instance, o in outcomes.items()]
+        rows = [[str(instance), run.run_id, run.ate_m, run.coverage, run.frame_s] for instance, run in outcomes.items()]
         trial.set_user_attr("instances", rows)
 
     def _more(self) -> bool:
         """Whether another trial is wanted; running ones count, those of dead workers do not."""
         with self._lock:
-            self._bury_dead_workers()
+            self._fail_trials_of_dead_workers()
             trials = self.study.get_trials(deepcopy=False)
             counted = [t for t in trials if t.state in DONE and t.user_attrs.get("reason") != CRASHED_WORKER]
             running = [t for t in trials if t.state == TrialState.RUNNING]
             return len(counted) + len(running) < self.spec.trials
 
-    def _bury_dead_workers(self) -> None:
-        """Trials that a killed worker of this host left running are over."""
+    def _fail_trials_of_dead_workers(self) -> None:
+        """Mark as failed the trials that a killed worker of this host left running."""
         for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             worker = trial.user_attrs.get("worker", "")
             if worker and worker_is_dead(worker):
-                with suppress(RuntimeError):  # another worker has buried it meanwhile
+                with suppress(RuntimeError):  # another worker has done so meanwhile
                     self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
                     self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
@@ -315,7 +319,7 @@ class Tuner:
         storage = open_storage(self.results, self.spec)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         how: dict[str, Any] = {"storage": storage, "study_name": name, "sampler": sampler}
-        how["pruner"] = optuna.pruners.NopPruner()
+        how["pruner"] = build_pruner(self.spec.pruner)
         try:
             if self.reading:
                 study = optuna.load_study(**how)
@@ -327,24 +331,14 @@ class Tuner:
         except KeyError as error:
             raise StudyError(absent, "dynslam-bench tune run STUDY.toml") from error
         except Exception as error:  # storages raise their drivers' errors
-            said = without_password(f"cannot open study '{name}': {error}", self.spec.storage)
-            raise StudyError(said) from None
-        stored, identity = _identity_of(study), self._identity()
-        if stored is None:
-            raise StudyError(
-                f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name"
-            )
-        if not same(stored, identity, but=MADE_OF if self.reading else ()):
-            raise StudyError(
-                f"study '{name}' is stored with other {difference(stored, identity)}",
-                f"give the study another name, or delete {self.folder}",
-            )
+            raise StudyError(without_password(f"cannot open study '{name}': {error}", self.spec.storage)) from None
+        self._check_identity(study)
         if not self.spec.storage:
             write_atomic(self.folder / "study.json", json.dumps(self.spec.for_others(), indent=2) + "\n")
         return study
 
     def _begin(self, study: optuna.Study) -> None:
-        """What a new study begins with; the identity comes last, others wait for it."""
+        """What a new study begins with; the identity comes last, other workers wait for it."""
         study.set_user_attr("spec", self.spec.for_others())
         study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
         with warnings.catch_warnings():
@@ -353,13 +347,28 @@ class Tuner:
         study.enqueue_trial(default_configuration(self.space, self.base))
         study.set_user_attr("identity", self._identity())
 
+    def _check_identity(self, study: optuna.Study) -> None:
+        """Refuse a stored study that was made with something else; data and program count only to go on with it."""
+        deadline = time.monotonic() + 10.0
+        while (stored := study.user_attrs.get("identity")) is None and time.monotonic() < deadline:
+            time.sleep(0.05)  # another worker is beginning the study
+        if stored is None:
+            raise StudyError(
+                f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"
+            )
+        identity = self._identity()
+        if different := difference(stored, identity):
+            raise StudyError(
+                f"study '{self.spec.name}' is stored with other {different}",
+                f"give the study another name, or delete {self.folder}",
+            )
+
     def _identity(self) -> dict[str, Any]:
-        """What must be the same when a study is resumed."""
+        """What must be the same when a study is resumed; without data and program, which reading does not need."""
         spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
-        if not self.spec.allow_overlap:
-            del spec["allow_overlap"]  # as in studies of before it was there
-        identity = {**spec, "parameters": digest([repr(parameter) for parameter in self.space])}
-        return identity if self.reading else identity | self._made_of()
+        if self.reading:
+            return spec
+        return {**spec, **self._made_of(), "parameters": digest([repr(parameter) for parameter in self.space])}
 
     def _made_of(self) -> dict[str, Any]:
         """The content of the study's sequences, and the program that runs on them: code, weights, libraries, device."""
@@ -377,60 +386,18 @@ class Tuner:
         return {"data": data, "program": program}
 
 
-def _identity_of(study: optuna.Study, wait_s: float = 10.0) -> dict[str, Any] | None:
-    """What a stored study was made with, as soon as the worker that begins it has said so; None if nobody does."""
-    deadline = time.monotonic() + wait_s
-    while (found := study.user_attrs.get("identity")) is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return None if found is None else dict(found)
-
-
-def _tell(
-    on_event: OnEvent | None, kind: Literal["reference", "started", "finished"], number: int, total: int, text: str
-) -> None:
-    if on_event is not None:
-        on_event(StudyEvent(kind, number, total, text))
-
-
-# What a stored study was made with, beside what it would be made with now.
-
-
-def as_stored(spec: StudySpec, file: Path) -> StudySpec:
-    """A study that is only read, with the start offsets that it had: one of before there were any began at frame 0."""
-    if "offsets" in spec.model_fields_set or not file.is_file():
-        return spec
-    stored = read_json(file, kind=StudyError)
-    return spec if not isinstance(stored, dict) or "offsets" in stored else spec.model_copy(update={"offsets": (0,)})
-
-
-def same(stored: dict[str, Any], now: dict[str, Any], but: tuple[str, ...]) -> bool:
-    """Whether two identities agree, but for some keys."""
-    if is_old(stored):
-        stored, _ = converted(stored)
-        but = (*but, *NEW)
-    return all(_of(stored, key) == _of(now, key) for key in (stored.keys() | now.keys()) - set(but))
-
-
-def _of(identity: dict[str, Any], key: str) -> Any:
-    """A part of a study's identity; studies from before there were start offsets had none."""
-    return identity.get(key, [0] if key == "offsets" else None)
-
-
 def difference(stored: dict[str, Any], now: dict[str, Any]) -> str:
-    """The first thing in which two identities differ, in words."""
-    for key in ("data", "program"):
-        there, here = stored.get(key) or {}, now.get(key) or {}
-        names = [name for name in here if there.get(name) != here[name]]
-        if names and key == "data":
+    """The first thing of an identity that is stored otherwise, in words; empty where there is none."""
+    changed = [key for key in now if stored.get(key) != now[key]]
+    if not changed:
+        return ""
+    key = changed[0]
+    there, here = stored.get(key), now[key]
+    if key in ("data", "program"):
+        names = [name for name in here if (there or {}).get(name) != here[name]]
+        if key == "data":
             return f"data: the content of {', '.join(names[:3])} is not what it was"
-        if names:
-            return f"{names[0]}: {there.get(names[0])} there, {here[names[0]]} here"
-    changed = [key for key in now if _of(stored, key) != now[key]]
-    first = changed[0] if changed else next(iter(stored.keys() - now.keys()), "content")
+        key, there, here = names[0], (there or {}).get(names[0]), here[names[0]]
+        return f"{key}: {there} there, {here} here"
     more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"{first}{more}: {_short(stored.get(first))} there, {_short(now.get(first))} here"
-
-
-def _short(value: Any, limit: int = 80) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    return f"{key}{more}: {json.dumps(there)[:80]} there, {json.dumps(here)[:80]} here"

@@ -8,6 +8,7 @@ from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.trackers import TRACKERS
 
 ROOMS = {
+    "api": ("Public interface", ["api"]),
     "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.steering", "core.errors"]),
     "sequences": (
         "Sequences and geometry",

@@ -1,4 +1,4 @@
-"""``report``, ``report compare`` and ``demo``."""
+"""``report make|publish|compare|audit-paper`` and ``demo``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from dynslam_bench.cli.options import REPORT, START, AsJson, DataRoot, DefaultGroup, Jobs, ProtocolId, Results
+from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, Jobs, ProtocolId, Results
 from dynslam_bench.cli.output import (
     SOME_RUNS_FAILED,
+    present,
     progress,
     wrapped,
     write,
-    write_json,
     write_report_table,
     write_table,
 )
@@ -23,23 +23,13 @@ if TYPE_CHECKING:
     from dynslam_bench.reports.tables.table import Table
 
 
-report = typer.Typer(
+app = typer.Typer(
     cls=DefaultGroup,
     help="Reports of stored runs: `report [RESULTS...] [-o DIR]` is short for `report make ...`.",
 )
 
 
-def add_report(app: typer.Typer) -> None:
-    """Add ``report``."""
-    app.add_typer(report, name="report", rich_help_panel=REPORT)
-
-
-def add_demo(app: typer.Typer) -> None:
-    """Add ``demo``."""
-    app.command(rich_help_panel=START)(demo)
-
-
-@report.command()
+@app.command()
 def make(
     results: Annotated[Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")] = None,  # noqa: UP045
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")] = None,  # noqa: UP045
@@ -66,33 +56,33 @@ def make(
     as_json: AsJson = False,
 ) -> None:
     """Make an offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it."""
+    from dynslam_bench.api import report
     from dynslam_bench.core.errors import ReportError
-    from dynslam_bench.reports import build_report
     from dynslam_bench.reports.model.load import trial_words
 
     if on not in ("common", "all"):
         raise ReportError(f"--on is 'common' or 'all', got '{on}'")
-    folders = results or [Path("results")]
     with progress("report") as advance:
-        paths = build_report(
-            folders,
-            output or folders[0] / "report",
+        paths = report(
+            results or "results",
+            output,
             protocol=protocol,
             reference=reference,
             title=title,
-            on="all" if on == "all" else "common",
+            on=on,
             rank_seen=rank_seen,
             trials=trials,
             most_pages=most_pages,
             on_progress=advance,
         )
-    if as_json:
-        write_json({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")})
-    else:
+
+    def show() -> None:
         show_top(paths.leaderboard)
         if paths.trials:
             write(wrapped(f"Left out: {trial_words(paths.trials)}."))
         write(str(paths.html))
+
+    present({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")}, show)
 
 
 def show_top(leaderboard: Table, most: int = 5) -> None:
@@ -108,7 +98,7 @@ def show_top(leaderboard: Table, most: int = 5) -> None:
     write((f"... and {more} more; " if more > 0 else "") + leaderboard.brief)
 
 
-@report.command()
+@app.command()
 def publish(
     results: Annotated[list[Path], typer.Argument(help="Results folders.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")],
@@ -130,13 +120,11 @@ def publish(
             results, output, study=study, title=title, note=remark, picture_seconds=picture_seconds,
             protocol=protocol, on_progress=advance,
         )  # fmt: skip
-    if as_json:
-        write_json({"index": site.index, "files": site.files, "size_mb": site.size_mb})
-    else:
-        write(f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
+    facts = {"index": site.index, "files": site.files, "size_mb": site.size_mb}
+    present(facts, lambda: write(f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)"))
 
 
-@report.command()
+@app.command()
 def compare(
     a: Annotated[Path, typer.Argument(help="Results folder, or folder of a report.")],
     b: Annotated[Path, typer.Argument(help="The other one.")],
@@ -146,22 +134,22 @@ def compare(
     """Compare two results folders on the sequences that both have, with the same settings or with others."""
     from dynslam_bench.reports import compare as compare_results
 
-    found = compare_results(a, b, protocol=protocol)
-    if as_json:
-        overall = {
-            name: {end: None if math.isnan(number) else number for end, number in vars(interval).items()}
-            for name, interval in found.overall.items()
-        }
-        write_json(
-            {"overall": overall, "differences": found.differences, "only_a": found.only_a, "only_b": found.only_b}
-        )
-        return
-    write_report_table(found.table)
-    if found.only_a or found.only_b:
-        write(f"\nonly in {a}: {found.only_a} runs; only in {b}: {found.only_b} runs")
+    result = compare_results(a, b, protocol=protocol)
+    overall = {
+        name: {end: None if math.isnan(number) else number for end, number in vars(interval).items()}
+        for name, interval in result.overall.items()
+    }
+
+    def show() -> None:
+        write_report_table(result.table)
+        if result.only_a or result.only_b:
+            write(f"\nonly in {a}: {result.only_a} runs; only in {b}: {result.only_b} runs")
+
+    facts = {"differences": result.differences, "only_a": result.only_a, "only_b": result.only_b}
+    present({"overall": overall} | facts, show)
 
 
-@report.command("audit-paper")
+@app.command("audit-paper")
 def audit_paper(
     data_root: DataRoot = None,
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Markdown file.")] = None,  # noqa: UP045
@@ -178,22 +166,24 @@ def audit_paper(
     from dynslam_bench.sequences.catalogue import entry_of
 
     truth = {}
-    for name in sorted(set(claimed()["sequence"])):
+    for name in sorted({claim.sequence for claim in claimed()}):
         entry = entry_of(name)
         folder = None if entry is None else entry.find(find_data_root(data_root))
         if folder is not None and (folder / "groundtruth.txt").is_file():
             truth[name] = read_tum(folder / "groundtruth.txt")
-    found = audit(truth)
+    findings = audit(truth)
     if output is not None:
-        write_atomic(output, found.to_markdown())
-    if as_json:
-        write_json([asdict(finding) for finding in found.findings])
-    elif output is not None:
-        write(str(output))
-    else:
-        for table in (found.summary(), found.details()):
+        write_atomic(output, findings.to_markdown())
+
+    def show() -> None:
+        if output is not None:
+            write(str(output))
+            return
+        for table in (findings.summary(), findings.details()):
             write_report_table(table)
             write()
+
+    present([asdict(finding) for finding in findings.findings], show)
 
 
 def demo(

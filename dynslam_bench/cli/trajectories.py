@@ -1,4 +1,4 @@
-"""``eval`` and ``protocols list|compare``."""
+"""``eval``, ``protocols list|compare``, ``import`` and ``export``: trajectory files, scored and exchanged."""
 
 from __future__ import annotations
 
@@ -8,10 +8,20 @@ from typing import Annotated, Literal, Optional
 
 import typer
 
-from dynslam_bench.cli import options as completion
-from dynslam_bench.cli.options import MEASURE, AsJson, Camera, DataRoot, Frames, ProtocolId, Results, Stride, Timestamps
-from dynslam_bench.cli.options import TRAJECTORY_FORMATS as FORMATS
-from dynslam_bench.cli.output import SOME_RUNS_FAILED, complain, write, write_json, write_table
+from dynslam_bench.cli.options import (
+    MEASURE,
+    TRAJECTORY_FORMATS,
+    AsJson,
+    Camera,
+    DataRoot,
+    Frames,
+    ProtocolId,
+    Results,
+    Stride,
+    Timestamps,
+    complete_formats,
+)
+from dynslam_bench.cli.output import SOME_RUNS_FAILED, present, warn, write, write_table
 from dynslam_bench.cli.runs import show_runs
 
 protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
@@ -26,6 +36,8 @@ def add(app: typer.Typer) -> None:
     """Add the verbs."""
     app.command("eval", rich_help_panel=MEASURE)(evaluate)
     app.add_typer(protocols, name="protocols", rich_help_panel=MEASURE)
+    app.command("import", rich_help_panel=MEASURE)(import_)
+    app.command("export", rich_help_panel=MEASURE)(export)
 
 
 def evaluate(
@@ -41,20 +53,19 @@ def evaluate(
     from dynslam_bench.evaluation.prepare import truth_of_file
     from dynslam_bench.runs import read_trajectory
 
-    read, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
-    result = evaluate_loaded(read, truth, protocol)
-    known = truth_of_file(truth.trajectory, get_protocol(protocol))
-    found = hints(read.trajectory, known, protocol, notes=read.notes)
-    if as_json:
-        write_json(result.model_dump(mode="json") | {"hints": [asdict(hint) for hint in found]})
-        return
-    write(result.summary())
-    write(result.protocol)
-    write_table(("metric", "value"), list(result.metrics.items()))
-    for line in result.diagnostics:
-        write(line)
-    for hint in found:
-        write(f"hint: {hint}")
+    loaded, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
+    result = evaluate_loaded(loaded, truth, protocol)
+    prepared = truth_of_file(truth.trajectory, get_protocol(protocol))
+    likely = hints(loaded.trajectory, prepared, protocol, notes=loaded.notes)
+
+    def show() -> None:
+        write(result.summary())
+        write(result.protocol)
+        write_table(("metric", "value"), list(result.metrics.items()))
+        for line in (*result.diagnostics, *(f"hint: {hint}" for hint in likely)):
+            write(line)
+
+    present(result.model_dump(mode="json") | {"hints": [asdict(hint) for hint in likely]}, show)
 
 
 @protocols.command("list")
@@ -62,10 +73,9 @@ def list_(as_json: AsJson = False) -> None:
     """List the protocols."""
     from dynslam_bench.evaluation import PROTOCOLS
 
-    if as_json:
-        write_json([{"digest": each.digest(), **each.model_dump(mode="json")} for each in PROTOCOLS.values()])
-        return
-    write_table(("id", "digest", "meaning"), [(each.id, each.digest(), each.describe()) for each in PROTOCOLS.values()])
+    entries = [{"digest": protocol.digest(), **protocol.model_dump(mode="json")} for protocol in PROTOCOLS.values()]
+    rows = [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()]
+    present(entries, lambda: write_table(("id", "digest", "meaning"), rows))
 
 
 @protocols.command()
@@ -77,27 +87,14 @@ def compare(
     from dynslam_bench.runs import read_trajectory
 
     loaded = [read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth)]
-    rows = compare_protocols(loaded[0], loaded[1], of_file=True)
-    if as_json:
-        write_json([asdict(row) for row in rows])
-        return
-    write_table(
-        ("metric", "protocol", "rmse (m)", "pairs", "note"),
-        [(row.metric, row.label, row.rmse_m, row.pairs, row.note) for row in rows],
-    )
-
-
-# ``import`` and ``export``: trajectories from elsewhere beside our runs, and our runs in the formats of others.
-
-
-def add_exchange(app: typer.Typer) -> None:
-    """Add the verbs."""
-    app.command("import", rich_help_panel=MEASURE)(import_)
-    app.command("export", rich_help_panel=MEASURE)(export)
+    scores = compare_protocols(loaded[0], loaded[1], of_file=True)
+    rows = [(score.metric, score.label, score.rmse_m, score.pairs, score.note) for score in scores]
+    columns = ("metric", "protocol", "rmse (m)", "pairs", "note")
+    present([asdict(score) for score in scores], lambda: write_table(columns, rows))
 
 
 def import_(
-    trajectory: Annotated[Path, typer.Argument(help=f"A trajectory: {FORMATS}.")],
+    trajectory: Annotated[Path, typer.Argument(help=f"A trajectory: {TRAJECTORY_FORMATS}.")],
     tracker: Annotated[str, typer.Option(help="Name of the system that made it.")],
     sequence: Annotated[str, typer.Option(help="Id or folder of the sequence that it was made on.")],
     label: Annotated[str, typer.Option(help="Name for tables.")] = "",
@@ -136,7 +133,7 @@ def import_(
         timestamps=timestamps,
         topic=topic,
     )
-    show_runs([record], store, protocol, as_json=as_json)
+    show_runs([record], store, protocol)
     if record.status == "lost":
         raise typer.Exit(SOME_RUNS_FAILED)
 
@@ -147,7 +144,7 @@ def export(
         typer.Argument(
             metavar="FORMAT",
             help="tum, kitti, euroc, vslam-lab, colmap, mcap or rrd (rerun).",
-            autocompletion=completion.export_formats,
+            autocompletion=complete_formats,
         ),
     ],
     run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",
@@ -169,10 +166,11 @@ def export(
 
     which: Literal["online", "final"] | None = None if online is None else ("online" if online else "final")
     done = export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
-    if as_json:
-        write_json({"folder": done.folder, "files": done.files, "which": done.which, "notes": done.notes})
-        return
-    for name in done.files:
-        write(str(done.folder / name))
-    for line in done.notes:
-        complain(line)
+
+    def show() -> None:
+        for name in done.files:
+            write(str(done.folder / name))
+        for line in done.notes:
+            warn(line)
+
+    present({"folder": done.folder, "files": done.files, "which": done.which, "notes": done.notes}, show)

@@ -1,6 +1,6 @@
 """What may be plugged in, and what the plug-ins exchange; a plug-in imports from here, from settings and errors only.
 
-Importing this room loads neither torch nor OpenCV, numba, scipy, Gymnasium or Optuna.
+Importing this package loads neither torch nor OpenCV, numba, scipy, Gymnasium or Optuna.
 
 | plug-in | its spec | its heavy part | what it is given and gives |
 | --- | --- | --- | --- |
@@ -11,7 +11,7 @@ Importing this room loads neither torch nor OpenCV, numba, scipy, Gymnasium or O
 | features | `FeatureSpec` | `FeatureExtractor` | a grey image; `Keypoints` |
 | filter | none: a tracker is composed of filters | `DynamicFilter` | `FrameBundle`, `FilterState`; `FilterResult` |
 
-`docs/plugins.md` shows one of each. The registries, which find plug-ins by id, lie in the rooms of their kind.
+`docs/plugins.md` shows one of each. The registries, which find plug-ins by id, are in the packages of their kind.
 
 Example:
     >>> from dynslam_bench.contracts import TrackerSpec

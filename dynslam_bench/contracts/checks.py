@@ -176,8 +176,8 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
 
 def _pose_faults(pose: object) -> Iterator[Fault]:
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
-        found = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
-        yield Fault(f"{found} as pose, expected a 4x4 matrix")
+        kind = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
+        yield Fault(f"{kind} as pose, expected a 4x4 matrix")
     elif pose.dtype.kind not in "fiu":
         yield Fault(f"a pose of the type {pose.dtype}, expected real numbers", "return float64")
     elif not np.isfinite(pose).all():

@@ -63,7 +63,6 @@ class FeatureExtractor(Protocol):
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image; none is an empty result."""
-        ...
 
 
 @runtime_checkable
@@ -82,4 +81,3 @@ class MaskedExtractor(FeatureExtractor, Protocol):
             The keypoints of `extract` on the mask, and outside it those of `extract` or as many as it would find if
             nothing else were in the image; in the order of `extract`.
         """
-        ...

@@ -166,8 +166,6 @@ class DynamicFilter(Protocol):
 
     def reset(self, camera: Camera) -> None:
         """Forget everything: a new sequence begins."""
-        ...
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Judge the frame's keypoints; never raises on degenerate input, says so in `stats` instead."""
-        ...

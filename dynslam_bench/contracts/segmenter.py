@@ -1,4 +1,4 @@
-"""The contract of segmenters: what announces them, what they are told and what they return."""
+"""The contract of segmenters: their spec, their context and their result."""
 
 from __future__ import annotations
 
@@ -98,4 +98,3 @@ class Segmenter(Protocol):
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame; no objects is an empty result, never an error."""
-        ...

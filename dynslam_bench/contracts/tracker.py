@@ -27,11 +27,9 @@ class Tracker(Protocol):
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; all randomness must come from `rng`."""
-        ...
 
     def track(self, frame: Frame) -> TrackResult:
         """Process one frame and return its camera-to-world pose, causally: later frames change nothing."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -165,8 +163,8 @@ class TrackResult:
 Provenance = Literal["own", "faithful-code", "faithful-paper", "inspired", "assumed", "external", "control"]
 """``faithful-code``: as the authors' code does; ``faithful-paper``: as the paper says; ``inspired``: its idea in
 another form; ``assumed``: the source is silent on what matters; ``own``: put together here, no one paper or
-program describes the whole; ``external``: somebody else's program;
-``control``: a yardstick, no system."""
+program describes the whole; ``external``: another project's program;
+``control``: a reference, no system."""
 
 
 # What a tracker's map looks like from outside.

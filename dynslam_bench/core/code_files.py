@@ -20,7 +20,7 @@ _WORD = re.compile(rb"[\w./~+\-]+")
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([A-Za-z_]\w*)|import[ \t]+([A-Za-z_][\w., \t]*))", re.MULTILINE)
 _SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
-_STORE = ("index", "metrics", "sequences", "latest")
+_STORE = ("index.sqlite", "sequences", "latest")
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
 
 

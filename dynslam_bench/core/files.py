@@ -56,7 +56,7 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     Raises:
         DynslamError: The folder cannot be written (full disk, permissions); nothing is left behind.
     """
-    with _told(path), replacing(path) as temporary:
+    with _clear_errors(path), replacing(path) as temporary:
         temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
@@ -66,13 +66,13 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
     Raises:
         DynslamError: As `write_atomic`.
     """
-    with _told(path), replacing(path) as temporary, temporary.open("wb") as file:
+    with _clear_errors(path), replacing(path) as temporary, temporary.open("wb") as file:
         file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in lines)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """What goes wrong in writing a file, as one line."""
+def _clear_errors(path: Path) -> Iterator[None]:
+    """Turn what goes wrong in writing a file into one line."""
     try:
         yield
     except OSError as error:
@@ -190,7 +190,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
             raise DynslamError(f"cannot write {target}: {error.strerror}", "check the permissions") from error
 
 
-# Locks that the system releases when their holder dies, in whatever way.
+# -- locks, which the system releases when their holder dies -----------------------------------------------------------
 
 
 @contextmanager
@@ -211,7 +211,7 @@ def claimed(path: Path) -> Iterator[bool]:
     except OSError as error:
         raise DynslamError(f"cannot write {path}: {error.strerror}", "check the permissions and the disk") from error
     try:
-        mine = _lock(handle) is not False and _is(handle, path)  # else its last holder has just removed it
+        mine = _lock(handle) is not False and _is_at(handle, path)  # else its last holder has just removed it
         try:
             yield mine
         finally:
@@ -245,6 +245,14 @@ def is_abandoned(path: Path) -> bool:
         os.close(handle)
 
 
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether an open file still has that name."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except OSError:
+        return False
+
+
 def _lock(handle: int) -> bool | None:
     """Whether the lock was free and is ours now; None where the file system knows none."""
     try:
@@ -256,14 +264,7 @@ def _lock(handle: int) -> bool | None:
     return True
 
 
-def _is(handle: int, path: Path) -> bool:
-    try:
-        return os.fstat(handle).st_ino == path.stat().st_ino
-    except OSError:
-        return False
-
-
-# Private temporary folders that go with the process that made them, also when that is killed.
+# -- private temporary folders, which are removed with the process that made them, also when that is killed ------------
 
 _PREFIX = "dynslam-held-"
 SHARED_MEMORY = Path("/dev/shm")

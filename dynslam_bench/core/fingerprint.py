@@ -72,13 +72,13 @@ def named_digests(settings: Settings) -> dict[str, str]:
     Raises:
         PluginError: One cannot be read.
     """
-    found = {}
+    digests = {}
     for name, path in named_files(settings).items():
         try:
-            found[name] = path_digest(path)[:16]
+            digests[name] = path_digest(path)[:16]
         except OSError as error:
             raise PluginError(f"cannot read {path}, which the setting '{name}' names: {error.strerror}") from error
-    return found
+    return digests
 
 
 def _texts(name: str, value: object) -> Iterator[tuple[str, str]]:
@@ -96,20 +96,20 @@ def _texts(name: str, value: object) -> Iterator[tuple[str, str]]:
 # -- code --------------------------------------------------------------------------------------------------------------
 
 
-def code_digest(entry_point: str, rooms: Sequence[str]) -> str:
-    """Digest of the code behind an entry point as it lies on the disk now: this package's rooms and a plug-in's files.
+def code_digest(entry_point: str, packages: Sequence[str]) -> str:
+    """Digest of the code behind an entry point as it is on the disk now: packages of ours and a plug-in's files.
 
     A plug-in in a file counts with the code of its folder and the data files that this names, one in a package with all
     files of its top-level package. Python sources count by their syntax: comments and docstrings change nothing.
 
     Args:
         entry_point: ``module:Attr`` or ``file.py:Attr``.
-        rooms: The rooms of this package that it may use, e.g. ``features``.
+        packages: The subpackages of this package that it may use, e.g. ``features``.
 
     Raises:
         PluginError: The plug-in's files cannot be found or read.
     """
-    return digest([package_digest(tuple(rooms)), plugin_digest(entry_point)])
+    return digest([package_digest(tuple(packages)), plugin_digest(entry_point)])
 
 
 def plugin_digest(entry_point: str) -> str:
@@ -129,7 +129,7 @@ def plugin_digest(entry_point: str) -> str:
         if module.endswith(".py"):
             file = Path(module).expanduser().resolve()
             files = program_files(file.parent)
-            return digest([code_files_digest(files, file.parent), _dependencies(foreign_modules(file))])
+            return digest([contents_digest(files, file.parent), _dependencies(foreign_modules(file))])
         places = _folders_of(top)
         names = imported_modules(file for place in places for file in _files_of(place)) - {top}
         return digest([[_whole(place) for place in places], _dependencies(names)])
@@ -175,11 +175,11 @@ def _distributions() -> Mapping[str, Sequence[str]]:
 
 
 @cache
-def package_digest(rooms: tuple[str, ...]) -> str:
-    """Digest of the code of rooms of this package; read once a process, as its modules are."""
-    folders = [Path(folder) / room for folder in dynslam_bench.__path__ for room in rooms]
+def package_digest(packages: tuple[str, ...]) -> str:
+    """Digest of the code of packages of this package; read once a process, as its modules are."""
+    folders = [Path(folder) / package for folder in dynslam_bench.__path__ for package in packages]
     codes = {folder: [file for file in files_below(folder) if is_code(file)] for folder in folders if folder.is_dir()}
-    return digest([[folder.name, code_files_digest(files, folder)] for folder, files in codes.items()])
+    return digest([[folder.name, contents_digest(files, folder)] for folder, files in codes.items()])
 
 
 def _files_of(place: Path) -> list[Path]:
@@ -187,7 +187,7 @@ def _files_of(place: Path) -> list[Path]:
 
 
 def _whole(place: Path) -> str:
-    return code_files_digest(_files_of(place), place.parent if place.is_file() else place)
+    return contents_digest(_files_of(place), place.parent if place.is_file() else place)
 
 
 def _folders_of(top: str) -> list[Path]:
@@ -229,7 +229,7 @@ def machine_digest() -> str:
     """Short digest of the machine and the versions that change a stage's result or its cost."""
     versions = {name: distribution_version(name) for name in _STAGES_NEED}
     found = {"dynslam-bench": release(), "opencv": opencv_version(), **versions}
-    return digest({"node": platform.node(), "cpu": _cpu_name(), "versions": found})
+    return digest({"node": platform.node(), "cpu": _cpu_model(), "versions": found})
 
 
 def content_digest(*arrays: NDArray[Any]) -> str:
@@ -241,58 +241,36 @@ def content_digest(*arrays: NDArray[Any]) -> str:
     return state.hexdigest()
 
 
-def _cpu_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
-
-
-# Digests of file contents, remembered while the files are unchanged.
+# -- file contents, whose digests are remembered while the files are unchanged ----------------------------------------
 
 _BLOCK = 1 << 20
 _SETTLED_NS = 2_000_000_000
 _MEMORY: dict[str, str] = {}
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content.
+def contents_digest(files: Iterable[Path], root: Path | None = None, *, syntax: bool = True) -> str:
+    """SHA-256 of the contents of files.
 
-    Raises:
-        OSError: It cannot be read.
-    """
-    return _remembered("file", [path], lambda: _sha256(path))
-
-
-def files_digest(files: Iterable[Path], root: Path) -> str:
-    """SHA-256 of the contents of files and of their names below a root; their order does not matter.
+    Args:
+        files: The files; without a root their order counts and their names do not.
+        root: A folder; with one their names below it count and their order does not.
+        syntax: Whether Python sources count by `syntax_digest`, and not by their bytes.
 
     Raises:
         OSError: One cannot be read.
     """
-    ordered = sorted(files)
-    return _remembered("files", ordered, lambda: _of_all(ordered, root, _sha256))
+    ordered = list(files) if root is None else sorted(files)
 
+    def compute() -> str:
+        whole = hashlib.sha256()
+        for file in ordered:
+            name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
+            is_source = syntax and file.suffix == ".py"
+            content = syntax_digest(file.read_bytes()) if is_source else _sha256(file)
+            whole.update(f"{name}{content}\n".encode(errors="surrogateescape"))
+        return whole.hexdigest()
 
-def contents_digest(files: Iterable[Path]) -> str:
-    """SHA-256 of the contents of files in the given order, whatever they are called; Python sources by their syntax.
-
-    Raises:
-        OSError: One cannot be read.
-    """
-    ordered = list(files)
-    return _remembered("contents", ordered, lambda: _joined(_code_digest(file) for file in ordered))
-
-
-def code_files_digest(files: Iterable[Path], root: Path) -> str:
-    """As `files_digest`, but Python sources count by `syntax_digest`.
-
-    Raises:
-        OSError: One cannot be read.
-    """
-    ordered = sorted(files)
-    return _remembered("code", ordered, lambda: _of_all(ordered, root, _code_digest))
+    return _remembered(f"contents {root} {syntax}", ordered, compute)
 
 
 def path_digest(path: Path) -> str:
@@ -302,8 +280,8 @@ def path_digest(path: Path) -> str:
         OSError: Something cannot be read.
     """
     if path.is_file():
-        return file_digest(path)
-    return files_digest((file for file in path.rglob("*") if file.is_file()), path)
+        return _remembered("file", [path], lambda: _sha256(path))
+    return contents_digest((file for file in path.rglob("*") if file.is_file()), path, syntax=False)
 
 
 def syntax_digest(source: bytes) -> str:
@@ -328,9 +306,9 @@ def _tokens_of(node: Any) -> Iterator[str]:
                 yield from _tokens_of(value)
         yield ")"
     elif isinstance(node, list):
-        for each in node:
-            if not _is_docstring(each):
-                yield from _tokens_of(each)
+        for inner in node:
+            if not _is_docstring(inner):
+                yield from _tokens_of(inner)
     else:
         yield repr(node)
 
@@ -338,21 +316,6 @@ def _tokens_of(node: Any) -> Iterator[str]:
 def _is_docstring(node: Any) -> bool:
     """Whether a statement is a string alone, which does nothing."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-
-
-def _code_digest(file: Path) -> str:
-    return syntax_digest(file.read_bytes()) if file.suffix == ".py" else _sha256(file)
-
-
-def _of_all(files: Iterable[Path], root: Path, hashed: Callable[[Path], str]) -> str:
-    return _joined(f"{file.relative_to(root).as_posix()}\0{hashed(file)}" for file in files)
-
-
-def _joined(lines: Iterable[str]) -> str:
-    whole = hashlib.sha256()
-    for line in lines:
-        whole.update(f"{line}\n".encode(errors="surrogateescape"))
-    return whole.hexdigest()
 
 
 def _sha256(path: Path) -> str:
@@ -409,7 +372,7 @@ def _files_state(files: Iterable[Path]) -> tuple[str, int]:
     return whole.hexdigest(), newest
 
 
-# Where and with what a run was made.
+# -- where and with what a run was made --------------------------------------------------------------------------------
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "gtsam", "gymnasium", "optuna")
 

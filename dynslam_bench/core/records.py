@@ -11,9 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import atomic_folder, write_atomic
-from dynslam_bench.core.passwords import json_without_passwords
 from dynslam_bench.core.reading import RECORD_BYTES, read_text
-from dynslam_bench.core.sanitise import storable
+from dynslam_bench.core.sanitise import json_without_passwords, storable
 
 __all__ = ["Digest", "Record", "atomic_folder", "digest", "schema", "write_atomic"]
 

@@ -1,4 +1,4 @@
-"""NGD-SLAM's masks: cut the person out of the box by the depth of its middle."""
+"""NGD-SLAM's masks: the person is the region of the box at the depth of its middle."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes
 from dynslam_bench.culling.settings import BoxDepthSettings
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry.camera import inside
 from dynslam_bench.segmentation.postprocess import dilate
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
-class BoxDepthFilter(DynamicFilter):
+class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
     """Drops the features on the largest connected region at the depth of a box's middle.
 
     A box with too little depth, or whose region would cover most of the image, is ignored.
@@ -26,30 +26,18 @@ class BoxDepthFilter(DynamicFilter):
     provenance: Provenance = "inspired"
     stats_names = ("dropped", "objects", "ignored", "mask_fraction")
 
-    def __init__(self, settings: BoxDepthSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
-
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Cut every box out and drop what lies on it."""
-        mask = np.zeros(frame.depth.shape, bool)
+        """Segment the person in every box and drop the features on them."""
         depth = np.nan_to_num(frame.depth)
-        ignored = 0
         boxes = dynamic_boxes(frame, self.segmentation)
-        for box in boxes:
-            person = self._cut(box, depth)
-            if person is None:
-                ignored += 1
-            else:
-                mask |= person
-        mask = dilate(mask, self.settings.dilation_px)
-        stats = {"objects": float(len(boxes)), "ignored": float(ignored), "mask_fraction": float(mask.mean())}
+        people = [mask for mask in (self._segment(box, depth) for box in boxes) if mask is not None]
+        mask = dilate(np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px)
+        ignored = float(len(boxes) - len(people))
+        stats = {"objects": float(len(boxes)), "ignored": ignored, "mask_fraction": float(mask.mean())}
         return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
 
-    def _cut(self, box: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+    def _segment(self, box: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+        """The mask ``[H, W]`` of the person in a box; None where the box is ignored."""
         height, width = depth.shape
         x0, y0, x1, y1 = box.astype(np.float64)
         shrink_x, shrink_y = (1 - self.settings.core) / 2 * (x1 - x0), (1 - self.settings.core) / 2 * (y1 - y0)

@@ -5,22 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling.matches import Estimator, Matches, f_stats, judged_by_flow
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling.matches import Estimator, Matches, f_stats, tested_by_flow
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxEpipolarSettings
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 MIN_OUTSIDE = 20
 """SG-SLAM takes all matches where fewer than this lie outside the boxes."""
 
 
-class BoxEpipolarFilter(DynamicFilter):
+class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
     """Drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
 
-    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is
-    meaningless. Features whose flow failed go by the setting ``unmatched``. Stats: ``dropped``, ``matches``, ``boxes``,
+    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is degenerate.
+    The setting ``unmatched`` decides about features whose flow failed. Stats: ``dropped``, ``matches``, ``boxes``,
     ``lost`` (features whose flow failed), ``failed`` (1 where F could not be estimated).
     """
 
@@ -28,13 +27,6 @@ class BoxEpipolarFilter(DynamicFilter):
     needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
     provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "matches", "lost", "failed", "f_asked", "f_judged", "boxes")
-
-    def __init__(self, settings: BoxEpipolarSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
@@ -48,22 +40,21 @@ class BoxEpipolarFilter(DynamicFilter):
         stats["lost"] = float(np.count_nonzero(lost))
         if self.settings.unmatched == "drop":
             keep &= ~lost
-        judged = judged_by_flow(flow, state.keep, self.settings.unmatched)
+        tested = tested_by_flow(flow, state.keep, self.settings.unmatched)
         inside = np.asarray(in_boxes(frame.keypoints.xy, boxes).any(axis=0))
-        fit = judged & ~self._left_out(inside, state)
+        fit = tested & ~self._excluded_from_fit(inside, state)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
-            fit = judged
+            fit = tested
         stats["matches"] = float(np.count_nonzero(fit))
-        options = Estimator(inlier_px=self.settings.inlier_px, confidence=self.settings.confidence)
-        distance = matches.distances(fit, judged, options)
+        distance = matches.distances(fit, tested, Estimator(inlier_px=self.settings.inlier_px))
         if distance is None:
             return FilterResult.of(keep, stats | {"failed": 1.0} | f_stats(asked=True))
         outside_px = self.settings.outside_px if self.settings.test_outside else np.inf
         limit = np.where(inside, self.settings.inside_px, outside_px)
-        keep[judged] = (distance <= limit)[judged]
+        keep[tested] = (distance <= limit)[tested]
         return FilterResult.of(keep, stats | f_stats(asked=True, judged=True))
 
-    def _left_out(self, inside: NDArray[np.bool_], state: FilterState) -> NDArray[np.bool_]:
+    def _excluded_from_fit(self, inside: NDArray[np.bool_], state: FilterState) -> NDArray[np.bool_]:
         """Matches that F is not fitted to, bool ``[N]``."""
         if self.settings.fit == "kept":
             return np.zeros(len(inside), dtype=bool)

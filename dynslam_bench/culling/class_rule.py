@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling.matches import Estimator, Flags, Matches, f_stats, judged_by_flow
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling.matches import Estimator, Flags, Matches, f_stats, tested_by_flow
 from dynslam_bench.culling.settings import ClassRuleSettings
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry.camera import inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
-class ClassRuleFilter(DynamicFilter):
-    """Drops all points on people; on movable things those off their line, or at the depth of a thing that moves.
+class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
+    """Drops all points on people, and those points on movable objects that fail the epipolar or the depth rule.
 
-    A feature on a movable thing whose flow failed goes by the setting ``unmatched``.
+    The setting ``unmatched`` decides about a feature on a movable object whose flow failed.
     Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``, ``lost`` (features whose flow failed).
     """
 
@@ -24,15 +24,8 @@ class ClassRuleFilter(DynamicFilter):
     provenance: Provenance = "inspired"
     stats_names = ("dropped", "on_people", "on_movable", "moving_objects", "lost", "f_asked", "f_judged")
 
-    def __init__(self, settings: ClassRuleSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
-
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Judge by class first, then movable things by geometry."""
+        """Drop by class first, then test movable objects by geometry."""
         keep = np.ones(len(frame), dtype=bool)
         stats = dict.fromkeys(("on_people", "on_movable", "moving_objects", "lost"), 0.0)
         matches = Matches.by_flow(frame, state)
@@ -50,16 +43,16 @@ class ClassRuleFilter(DynamicFilter):
         off_line, tested = self._off_line(matches, state, static)
         stats |= f_stats(asked=matches is not None, judged=bool(tested.any()))
         for mask in movable.masks:
-            on = inside(mask, frame.keypoints.xy) & keep
-            stats["on_movable"] += float(np.count_nonzero(on))
-            voters = on & tested
-            drop = on & (off_line | lost) if self.settings.unmatched == "drop" else on & off_line
+            on_object = inside(mask, frame.keypoints.xy) & keep
+            stats["on_movable"] += float(np.count_nonzero(on_object))
+            voters = on_object & tested
+            drop = on_object & (off_line | lost) if self.settings.unmatched == "drop" else on_object & off_line
             if voters.any() and off_line[voters].mean() >= self.settings.vote_share:
                 stats["moving_objects"] += 1.0
                 depth = frame.depth[mask]
                 depth = depth[np.isfinite(depth) & (depth > 0)]
                 if len(depth):
-                    drop |= on & (np.abs(frame.z - np.median(depth)) < self.settings.depth_m)
+                    drop |= on_object & (np.abs(frame.z - np.median(depth)) < self.settings.depth_m)
             keep &= ~drop
         return FilterResult.of(keep, stats, people)
 
@@ -68,6 +61,6 @@ class ClassRuleFilter(DynamicFilter):
         none = np.zeros(len(static), dtype=bool)
         if matches is None or state.flow is None:
             return none, none
-        judged = judged_by_flow(state.flow, state.keep, self.settings.unmatched)
-        distance = matches.distances(judged & static, judged, Estimator())
-        return (none, none) if distance is None else (distance > self.settings.threshold_px, judged)
+        tested = tested_by_flow(state.flow, state.keep, self.settings.unmatched)
+        distance = matches.distances(tested & static, tested, Estimator())
+        return (none, none) if distance is None else (distance > self.settings.threshold_px, tested)

@@ -1,4 +1,4 @@
-"""B7: Dai et al. 2020: points that keep their mutual vectors over time belong together; the largest body is static."""
+"""B7: Dai et al. 2020: a Delaunay graph of point correlations, of which the largest rigid component is static."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.matches import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
@@ -23,17 +24,17 @@ _NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 _WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 
 
-class CorrelationFilter(DynamicFilter):
+class CorrelationFilter(Rule[CorrelationSettings]):
     """Drops the points outside the largest rigid component of a Delaunay graph.
 
     An edge compares the vector between its two points now with that in the oldest frame, at most `window` frames ago,
     in which both were observed; it is cut where the Mahalanobis distance of the difference exceeds the chi-square
     quantile. Vectors are compared in the world frame: only the rotations of the poses matter.
 
-    The graph's components are those of its settled points, observed over at least `settled` frames: one edge that is
-    too young to show a motion would join two bodies. A younger point joins the static body if it agrees with at least
-    as many of the settled points around it as it contradicts. A point that was a keypoint in the last frame inherits
-    that one's observations; any other point has been where its flow ends, at the depth that the last frame has there.
+    Components are formed by settled points only, those observed over at least `settled` frames: a younger edge shows
+    too little motion and could connect two bodies. A younger point is static if it agrees with at least as many of its
+    settled neighbours as it contradicts. A point that continues a keypoint of the last frame takes over its
+    observations; any other point was at the end of its flow, at the depth that the last frame has there.
 
     Stats: ``dropped``, ``tracked`` (points judged), ``settled``, ``edges``, ``cut``, ``components`` (of the settled).
     """
@@ -44,10 +45,10 @@ class CorrelationFilter(DynamicFilter):
     stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
 
     def __init__(self, settings: CorrelationSettings) -> None:
-        self.settings = settings
-        self.reset(None)
+        super().__init__(settings)
+        self.reset()
 
-    def reset(self, camera: Camera | None) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """Forget all tracks."""
         self._past = np.zeros((0, 0, 12))  # [frames ago - 1, point of the previous frame, position and covariance]
         self._last: NDArray[np.float64] | None = None  # the previous frame's points in its camera
@@ -57,40 +58,40 @@ class CorrelationFilter(DynamicFilter):
         keep = np.ones(len(frame), dtype=bool)
         stats = dict.fromkeys(("tracked", "settled", "edges", "cut", "components"), 0.0)
         local = self._observe(frame.xy, frame.keypoints.xy, frame.z, frame.depth, state.camera)
-        past = self._recall(frame, state)
+        past = self._past_observations(frame, state)
         self._past, self._last = past, local
         if state.T_world_pred is None or not len(past):
             return FilterResult.of(keep, stats)
         now = _in_world(local, state.T_world_pred)
-        known = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
-        rows = np.flatnonzero(known.any(axis=0))
+        observed = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
+        rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
             return FilterResult.of(keep, stats)
-        age = len(past) - known[::-1, rows].argmax(axis=0)
+        age = len(past) - observed[::-1, rows].argmax(axis=0)
         settled = age >= min(self.settings.settled, len(past))
-        now, past, known, xy = now[rows], past[:, rows], known[:, rows], frame.xy[rows]
+        now, past, observed, xy = now[rows], past[:, rows], observed[:, rows], frame.xy[rows]
         static, cut, total = np.ones(len(rows), dtype=bool), 0, 0
         old = np.flatnonzero(settled)
         stats |= {"tracked": float(len(rows)), "settled": float(len(old))}
         if len(old) < MIN_POINTS:
             return FilterResult.of(keep, stats)
         edges = _delaunay_edges(xy[old])
-        whole = self._agree(now[old], past[:, old], known[:, old], edges)
-        static[old], stats["components"] = self._static_component(edges[whole], now[old, :3])
-        total, cut = len(edges), int(np.count_nonzero(~whole))
+        uncut = self._agree(now[old], past[:, old], observed[:, old], edges)
+        static[old], stats["components"] = self._static_component(edges[uncut], now[old, :3])
+        total, cut = len(edges), int(np.count_nonzero(~uncut))
         if len(old) < len(rows):
             edges = _delaunay_edges(xy)
             edges = edges[settled[edges].sum(axis=1) == 1]
             edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)  # the younger point first
-            whole = self._agree(now, past, known, edges)
-            total, cut = total + len(edges), cut + int(np.count_nonzero(~whole))
-            vote = np.where(static[edges[:, 1]], np.where(whole, 1, -1), np.where(whole, -1, 0))
+            uncut = self._agree(now, past, observed, edges)
+            total, cut = total + len(edges), cut + int(np.count_nonzero(~uncut))
+            vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         stats |= {"edges": float(total), "cut": float(cut)}
         keep[rows[~static]] = False
         return FilterResult.of(keep, stats)
 
-    def _recall(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
+    def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
         previous, pose, flow = state.previous, state.T_world_prev, state.flow
         if previous is None or pose is None or flow is None or self._last is None or len(self._last) != len(previous):
@@ -106,30 +107,30 @@ class CorrelationFilter(DynamicFilter):
             column, row = np.rint(raw).astype(np.intp).T
             inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
             z = np.where(inside, previous.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
-            seen = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
-            past[0, loose] = _in_world(seen, pose)
+            observations = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
+            past[0, loose] = _in_world(observations, pose)
         return past
 
     def _observe(
         self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
     ) -> NDArray[np.float64]:
         """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
-        seen = np.full((len(xy), 12), np.nan)
+        points = np.full((len(xy), 12), np.nan)
         valid = np.isfinite(z) & (z > 0)
         if valid.any():
-            seen[valid, :3] = camera.unproject(xy[valid], z[valid])
+            points[valid, :3] = camera.unproject(xy[valid], z[valid])
             variance = depth_variance(depth, raw[valid])
-            local = point_covariance(
+            covariance = point_covariance(
                 np.asarray(xy[valid], np.float64), z[valid], variance, camera, self.settings.pixel_sigma
             )
-            seen[valid, 3:] = local.reshape(-1, 9)
-        return seen
+            points[valid, 3:] = covariance.reshape(-1, 9)
+        return points
 
     def _agree(
-        self, now: NDArray[np.float64], past: NDArray[np.float64], known: NDArray[np.bool_], edges: NDArray[np.intp]
+        self, now: NDArray[np.float64], past: NDArray[np.float64], observed: NDArray[np.bool_], edges: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
         """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed."""
-        both = known[:, edges[:, 0]] & known[:, edges[:, 1]]
+        both = observed[:, edges[:, 0]] & observed[:, edges[:, 1]]
         oldest = len(past) - 1 - both[::-1].argmax(axis=0)
         first, second = edges.T
         then = past[oldest, first], past[oldest, second]
@@ -152,15 +153,15 @@ class CorrelationFilter(DynamicFilter):
             measure = size.astype(np.float64)
         else:
             measure = np.array([_volume(points[label == body]) for body in range(len(size))])
-        static = int(np.lexsort((size, measure))[-1])  # the one with more points where neither has a volume
+        static = int(np.lexsort((size, measure))[-1])  # with equal volumes the one with more points
         return np.asarray(label == static), float(len(size))
 
 
-def _in_world(seen: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+def _in_world(local: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points and covariances ``[N, 3 + 9]`` of a camera's frame in the world's."""
     R = T_world_cam[:3, :3]
-    covariance = R @ seen[:, 3:].reshape(-1, 3, 3) @ R.T
-    return np.column_stack([se3.transform(T_world_cam, seen[:, :3]), covariance.reshape(-1, 9)])
+    covariance = R @ local[:, 3:].reshape(-1, 3, 3) @ R.T
+    return np.column_stack([se3.transform(T_world_cam, local[:, :3]), covariance.reshape(-1, 9)])
 
 
 def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -177,7 +178,7 @@ def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDAr
     """Variance of the depth at raw pixels ``[N, 2]``, m^2: a Gaussian mixture over the 3x3 neighbourhood.
 
     The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its components' variances
-    those of the sensor; depth edges get a large variance by it.
+    those of the sensor. Depth edges thus get a large variance.
     """
     height, width = depth.shape
     column, row = np.rint(xy).astype(np.intp).T

@@ -6,20 +6,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import DepthBlockSettings
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry.camera import inside
 from dynslam_bench.segmentation.postprocess import dilate, select
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
-class DepthBlockFilter(DynamicFilter):
-    """Drops the features on the masks of people, completed by depth, and on movable things that they touch.
+class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
+    """Drops the features on the masks of people, completed by depth, and on movable objects that they touch.
 
-    The depth image is cut into blocks along its edges; a block that lies to a good part on the mask belongs to it as
-    a whole. A person who stands on a floor is one block with it and gains nothing, one before a wall does.
-    Stats: ``dropped``, ``objects``, ``touched`` (movable things that a person touches), ``blocks`` (taken as a
+    The depth image is divided into blocks along its edges. A block of which enough lies on the mask is added to the
+    mask as a whole. A person in front of a wall is a block; a person on a floor forms one block with the floor.
+    Stats: ``dropped``, ``objects``, ``touched`` (movable objects that a person touches), ``blocks`` (added as a
     whole), ``mask_fraction``.
     """
 
@@ -27,13 +27,6 @@ class DepthBlockFilter(DynamicFilter):
     needs: frozenset[Need] = frozenset({"masks", "depth"})
     provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "objects", "touched", "blocks", "mask_fraction")
-
-    def __init__(self, settings: DepthBlockSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Complete the masks and drop what lies on them."""
@@ -48,19 +41,19 @@ class DepthBlockFilter(DynamicFilter):
         return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
 
     def _semantic_mask(self, instances: Instances) -> tuple[NDArray[np.bool_], float, float]:
-        """People and the movable things whose masks touch theirs, bool ``[H, W]``, and how many of each."""
+        """People and the movable objects whose masks touch theirs, bool ``[H, W]``, and how many of each."""
         people = select(instances, self.segmentation)
         mask = people.union()
         movable = select(instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
-        reach = dilate(mask, 1) if len(movable) else mask
-        touched = [each for each in movable.masks if (each & reach).any() and (each & ~mask).any()]
+        neighbourhood = dilate(mask, 1) if len(movable) else mask
+        touched = [other for other in movable.masks if (other & neighbourhood).any() and (other & ~mask).any()]
         return np.logical_or.reduce([mask, *touched]), float(len(people)), float(len(touched))
 
 
 def covered_blocks(
     mask: NDArray[np.bool_], depth: NDArray[np.float32], settings: DepthBlockSettings
 ) -> tuple[NDArray[np.bool_], float]:
-    """The blocks of continuous depth that a mask covers to a good part.
+    """The blocks of continuous depth of which a mask covers enough.
 
     Args:
         mask: Bool ``[H, W]``.
@@ -79,5 +72,5 @@ def covered_blocks(
     size = np.bincount(label.ravel(), minlength=count)
     covered = np.bincount(label[mask], minlength=count)
     whole = covered >= np.maximum(settings.min_share * size, 1)
-    whole[0] = False  # the edges themselves, and what has no depth
+    whole[0] = False  # label 0: edges and pixels without depth
     return np.asarray(whole[label]), float(np.count_nonzero(whole))

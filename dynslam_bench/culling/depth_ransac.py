@@ -1,16 +1,15 @@
-"""B6: YOLO-SLAM's depth RANSAC: of the features in a person's box, the largest set of like depth is the person."""
+"""B6: YOLO-SLAM's depth RANSAC: the person is the largest set of features of similar depth in a box."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import DepthRansacSettings
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 MIN_POINTS = 3
 
@@ -18,8 +17,8 @@ MIN_POINTS = 3
 def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.random.Generator) -> NDArray[np.bool_]:
     """The largest set of features whose depth variance stays below the limit.
 
-    From each drawn pair the set grows by the nearest depths for as long as its variance stays below the limit
-    (the paper adds features in no stated order; nearest first gives the largest set from that pair).
+    From each drawn pair, the set grows by the nearest depths while its variance stays below the limit. The paper
+    does not state the order; nearest first gives the largest set from that pair.
 
     Args:
         z: Depths ``[N]`` of the features in one box, metres, all valid.
@@ -34,9 +33,9 @@ def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.r
     if count < MIN_POINTS:
         return best
     draws = settings.max_draws
-    tried = 0
-    while tried < draws:
-        tried += 1
+    drawn = 0
+    while drawn < draws:
+        drawn += 1
         pair = rng.choice(count, 2, replace=False)
         order = np.argsort(np.abs(z - z[pair].mean()), kind="stable")
         order = np.concatenate([pair, order[~np.isin(order, pair)]])
@@ -49,12 +48,12 @@ def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.r
             best[order[:size]] = True
             share = size / count
             needed = np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12)) if share < 1 else 0
-            draws = min(draws, max(tried, int(np.ceil(needed))))
+            draws = min(draws, max(drawn, int(np.ceil(needed))))
     return best
 
 
-class DepthRansacFilter(DynamicFilter):
-    """Drops, in each dynamic box, the largest set of features of like depth; keeps the rest of the box.
+class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
+    """Drops, in each dynamic box, the largest set of features of similar depth; keeps the rest of the box.
 
     Stats: ``dropped``, ``objects``, ``in_boxes``.
     """
@@ -64,15 +63,8 @@ class DepthRansacFilter(DynamicFilter):
     provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "objects", "in_boxes")
 
-    def __init__(self, settings: DepthRansacSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
-
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Find the person among the features of every box; features without depth go with it."""
+        """Find the person among the features of every box; features without depth are dropped too."""
         keep = np.ones(len(frame), dtype=bool)
         boxes = dynamic_boxes(frame, self.segmentation)
         member = in_boxes(frame.keypoints.xy, boxes)

@@ -1,4 +1,4 @@
-"""The camera's motion since the previous frame, from the flow of points with depth, robustly."""
+"""The camera's motion since the previous frame from optical flow and depth, and what motion tests share."""
 
 from __future__ import annotations
 
@@ -12,15 +12,21 @@ from dynslam_bench.geometry.camera import Camera
 
 MIN_POINTS = 12
 TURN_PX = (12.0, 6.0, 4.0)
-"""Scale of the redescending kernel in the first Gauss-Newton steps, in which the camera may only turn."""
+"""Scale of the redescending kernel in the first Gauss-Newton steps, which change the rotation only."""
 KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
-"""The same in the steps after them; narrow as the flow is exact: fitting walkers at the walls' cost must not pay."""
-BENT_SHARE = 0.05
-"""Added to the scale, as a share of a point's flow: a rolling shutter bends fast motion."""
+"""The same in the later steps; narrow, since the flow is exact and moving points must not influence the fit."""
+ROLLING_SHUTTER_SHARE = 0.05
+"""Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
 CELL = 32
+"""Side of the cells of `static_share`, pixels."""
+COHERENCE_CELL = 16
+COHERENCE_CELLS = 5
+"""Side of the neighbourhood of `coherent` in cells: 5 x 16 px."""
+MIN_FAILING = 3
+"""Fewest failing points of a moving region."""
 CORRELATION = 100.0
-"""By how much the flow counts for less than its points' number says, against the motion model: the points of one thing
-err together, most of all where it moves (the back end inflates the covariance of its poses likewise)."""
+"""Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
+(the back end inflates the covariance of its poses for the same reason)."""
 
 
 def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -28,12 +34,12 @@ def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(0.0012 + 0.0019 * np.square(np.maximum(z, 0.4) - 0.4), dtype=np.float64)
 
 
-def trust(frame: FrameBundle, state: FilterState, before: NDArray[np.floating]) -> NDArray[np.float64]:
-    """How far the previous frame held the surroundings of each point's origin for static.
+def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Share of static keypoints around each point's origin in the previous frame.
 
     Args:
         frame: The current frame.
-        state: With the previous frame and its verdict.
+        state: With the previous frame and which of its keypoints were kept.
         before: Raw pixels of the points in the previous image, ``[N, 2]``; not finite gives 1.
 
     Returns:
@@ -42,28 +48,30 @@ def trust(frame: FrameBundle, state: FilterState, before: NDArray[np.floating]) 
     ones = np.ones(len(before))
     if state.previous is None or state.previous_keep is None or not len(state.previous):
         return ones
-    rows, columns = -(-frame.gray.shape[0] // CELL), -(-frame.gray.shape[1] // CELL)
-
-    def cell(xy: NDArray[np.floating]) -> NDArray[np.intp]:
-        index = np.floor(np.nan_to_num(xy) / CELL).astype(np.intp)
-        return np.asarray(index[:, 1].clip(0, rows - 1) * columns + index[:, 0].clip(0, columns - 1))
-
-    home = cell(state.previous.keypoints.xy)
-    count = np.bincount(home, minlength=rows * columns)
-    kept = np.bincount(home, weights=state.previous_keep, minlength=rows * columns)
+    previous_cell, grid = cell_index(state.previous.keypoints.xy, CELL, frame.gray.shape)
+    count = np.bincount(previous_cell, minlength=grid[0] * grid[1])
+    kept = np.bincount(previous_cell, weights=state.previous_keep, minlength=grid[0] * grid[1])
     share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
-    return np.where(np.isfinite(before).all(axis=1), share[cell(before)], ones)
+    cell, _ = cell_index(np.nan_to_num(before), CELL, frame.gray.shape)
+    return np.where(np.isfinite(before).all(axis=1), share[cell], ones)
+
+
+def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
+    """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
+    rows, columns = -(-shape[0] // size), -(-shape[1] // size)
+    cell = np.floor(xy / size).astype(np.intp)
+    return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
 
 
 def rigid_flow(
     frame: FrameBundle, state: FilterState, rows: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where points would have been in the previous frame if the world stood still and only the camera moved.
+    """Where points would have been in the previous frame if only the camera moved.
 
     Args:
         frame: The current frame.
         state: With the previous and the predicted pose.
-        rows: bool ``[N]``, the points asked for, K of them; all with depth.
+        rows: bool ``[N]``, K points, all with depth.
 
     Returns:
         Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels ``[K, 2]``.
@@ -77,19 +85,18 @@ def rigid_flow(
 def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.float64] | None:
     """The pose predicted for this frame, refined by the flow to the previous image.
 
-    Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the previous image, begun
-    at the motion model's prediction and held to it as far as the model is sure (maximum a posteriori), with a
-    redescending (Geman-McClure) kernel. Otherwise a person nearby drags the estimate along even where most points are
-    static: a far background of one depth tells turning from moving sideways hardly apart, so that the camera's
-    translation is left to what is near, and that may walk. For the same reason the camera may only turn at first:
-    while the kernel is wide, walls that fit to three pixels and walkers that fit look better than walls alone.
+    Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the previous image, with a
+    redescending (Geman-McClure) kernel. It starts at the motion model's prediction, which is also the prior (maximum a
+    posteriori). Without the prior a person nearby would bias the estimate even where most points are static: a far
+    background of one depth hardly separates rotation from sideways translation, so that near points determine the
+    translation. For the same reason the first steps, with a wide kernel, change the rotation only.
 
     Args:
         frame: The current frame.
         state: With flow, the previous pose and, if known, the predicted one.
 
     Returns:
-        Camera-to-world pose ``[4, 4]``; the unrefined prediction (or None) where there is too little to refine on.
+        Camera-to-world pose ``[4, 4]``; the unrefined prediction (or None) with too few points.
     """
     flow = state.flow
     if flow is None or state.previous is None or state.T_world_prev is None:
@@ -101,12 +108,12 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     points = state.camera.unproject(frame.xy[use], frame.z[use])
     before = state.camera.undistort_points(flow.xy[use])
     prior = None if state.T_world_pred is None else prior_information(state, start)
-    T_prev_cur = _align(points, before, state.camera, start, trust(frame, state, flow.xy[use]), prior)
+    T_prev_cur = _align(points, before, state.camera, start, static_share(frame, state, flow.xy[use]), prior)
     return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
 
 
 def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """What the motion model knows of the motion since the previous frame, in the flow's units.
+    """Information of the motion model on the motion since the previous frame.
 
     Args:
         state: With the covariance of the predicted motion.
@@ -114,14 +121,14 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
 
     Returns:
         Information ``[6, 6]`` of (translation, rotation), both in the previous camera's frame, times `CORRELATION`;
-        None where the motion model knows nothing.
+        None without a covariance of the motion model.
     """
     if state.motion_covariance is None or state.T_world_prev is None:
         return None
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = state.T_world_prev[:3, :3].T
-    turn[3:, 3:] = T_prev_cur[:3, :3]
-    covariance = turn @ state.motion_covariance @ turn.T + 1e-12 * np.eye(6)
+    rotation = np.zeros((6, 6))
+    rotation[:3, :3] = state.T_world_prev[:3, :3].T
+    rotation[3:, 3:] = T_prev_cur[:3, :3]
+    covariance = rotation @ state.motion_covariance @ rotation.T + 1e-12 * np.eye(6)
     return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
 
@@ -130,23 +137,23 @@ def _align(
     pixels: NDArray[np.float64],
     camera: Camera,
     start: NDArray[np.float64],
-    trusted: NDArray[np.float64],
+    prior_weight: NDArray[np.float64],
     information: NDArray[np.float64] | None,
 ) -> NDArray[np.float64] | None:
-    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if it does not hold.
+    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if too few points agree.
 
-    `information` ``[6, 6]`` holds it to the start pose.
+    `information` ``[6, 6]`` is that of the prior, the start pose.
     """
     pose = start
     inverse_start = se3.inverse(start)
-    weight = trusted
-    bent = np.square(BENT_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
+    weight = prior_weight
+    rolling_shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
     for number, scale in enumerate(TURN_PX + KERNEL_PX):
         moved = se3.transform(pose, points)
         z = np.maximum(moved[:, 2], 0.05)
         error = camera.project(moved) - pixels
         error = np.where(moved[:, 2:3] > 0.05, np.nan_to_num(error, posinf=1e4, neginf=-1e4), 1e4)
-        weight = trusted / np.square(1 + (error**2).sum(axis=1) / (scale**2 + bent))
+        weight = prior_weight / np.square(1 + (error**2).sum(axis=1) / (scale**2 + rolling_shutter))
         x, y = moved[:, 0] / z, moved[:, 1] / z
         zero = np.zeros_like(x)
         # derivative of the pixel by a left perturbation exp(rho, phi) of the pose
@@ -170,18 +177,14 @@ def _align(
     return pose if weight.sum() >= 0.5 * MIN_POINTS else None
 
 
-# Moving things are regions: a lone point that fails a test is noise.
-
-Flags = NDArray[np.bool_]
-
-COHERENCE_CELL = 16
-COHERENCE_CELLS = 5
-"""Cells on a side of the neighbourhood: 5 x 16 px."""
-MIN_FAILING = 3
-
-
-def coherent(failing: Flags, tested: Flags, xy: NDArray[np.floating], share: float, size: tuple[int, int]) -> Flags:
-    """The failing points among whose tested neighbours enough fail too.
+def coherent(
+    failing: NDArray[np.bool_],
+    tested: NDArray[np.bool_],
+    xy: NDArray[np.floating],
+    share: float,
+    size: tuple[int, ...],
+) -> NDArray[np.bool_]:
+    """The failing points of whose tested neighbours enough fail too: a lone failure is noise.
 
     Args:
         failing: bool ``[N]``, points that failed a test.
@@ -195,18 +198,13 @@ def coherent(failing: Flags, tested: Flags, xy: NDArray[np.floating], share: flo
     """
     if share <= 0 or not failing.any():
         return failing
-    rows, columns = -(-size[0] // COHERENCE_CELL), -(-size[1] // COHERENCE_CELL)
-    cell = np.floor(xy / COHERENCE_CELL).astype(np.intp)
-    index = cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1)
+    index, grid = cell_index(xy, COHERENCE_CELL, size)
+    neighbourhood = (COHERENCE_CELLS, COHERENCE_CELLS)
 
-    def around(flags: Flags) -> NDArray[np.float64]:
-        counts = np.bincount(index, weights=flags, minlength=rows * columns).reshape(rows, columns)
-        return np.asarray(
-            cv2.boxFilter(
-                counts, -1, (COHERENCE_CELLS, COHERENCE_CELLS), normalize=False, borderType=cv2.BORDER_CONSTANT
-            ),
-            np.float64,
-        ).ravel()
+    def around(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
+        counts = np.bincount(index, weights=flags, minlength=grid[0] * grid[1]).reshape(grid)
+        total = cv2.boxFilter(counts, -1, neighbourhood, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(total, np.float64).ravel()
 
-    bad, all_ = around(failing & tested), around(tested)
-    return np.asarray(failing & (bad[index] >= MIN_FAILING) & (bad[index] >= share * all_[index]))
+    failures, tests = around(failing & tested), around(tested)
+    return np.asarray(failing & (failures[index] >= MIN_FAILING) & (failures[index] >= share * tests[index]))

@@ -1,4 +1,4 @@
-"""A point in space that an earlier keyframe saw through lies on something that has moved there since."""
+"""Free-space violation: a point where earlier keyframes measured free space lies on a moving object."""
 
 from __future__ import annotations
 
@@ -6,28 +6,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import (
-    DynamicFilter,
-    FilterResult,
-    FilterState,
-    FrameBundle,
-    KeyframeView,
-    Need,
-    Provenance,
-)
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import coherent, depth_sigma
 from dynslam_bench.culling.settings import FreeSpaceSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
+KEYFRAMES = 8
+"""Number of the latest keyframes that are compared."""
+MAX_AGE_S = 10.0
+"""Older keyframes are not compared: objects may have been moved for good since."""
 PATCH = np.ones((7, 7), np.uint8)
-"""Neighbourhood whose smallest depth must lie behind the point: depth edges and pose errors prove nothing."""
+"""Neighbourhood whose smallest depth must lie behind the point: depth edges and pose errors are no evidence."""
 
 
-class FreeSpaceFilter(DynamicFilter):
+class FreeSpaceFilter(Rule[FreeSpaceSettings]):
     """Drops points that violate the free space of several keyframes.
 
-    Stats: ``dropped``, ``asked`` (keyframes), ``tested`` (points seen by at least one of them).
+    Stats: ``dropped``, ``asked`` (keyframes compared), ``tested`` (points in the view of at least one of them).
     """
 
     name = "free_space"
@@ -36,7 +33,7 @@ class FreeSpaceFilter(DynamicFilter):
     stats_names = ("dropped", "asked", "tested")
 
     def __init__(self, settings: FreeSpaceSettings) -> None:
-        self.settings = settings
+        super().__init__(settings)
         self._nearest: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
 
     def reset(self, camera: Camera) -> None:
@@ -44,32 +41,29 @@ class FreeSpaceFilter(DynamicFilter):
         self._nearest.clear()
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Ask the latest keyframes whether they saw past each point."""
-        keep = np.ones(len(frame), dtype=bool)
-        oldest = self.settings.max_age_s
-        fresh = [view for view in state.keyframes if frame.timestamp - view.timestamp <= oldest]
-        keyframes = [view for view in fresh if view.depth is not None][: self.settings.keyframes]
-        known = np.flatnonzero(frame.z > 0)
-        if state.T_world_pred is None or not keyframes or not len(known):
-            return FilterResult.of(keep, {"asked": 0.0, "tested": 0.0})
-        points = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[known], frame.z[known]))
-        votes = np.zeros(len(known), dtype=int)
-        seen = np.zeros(len(known), dtype=bool)
+        """Count for each point the keyframes that measured beyond it."""
+        recent = [view for view in state.keyframes if frame.timestamp - view.timestamp <= MAX_AGE_S]
+        keyframes = [view for view in recent if view.depth is not None][:KEYFRAMES]
+        rows = np.flatnonzero(frame.z > 0)
+        if state.T_world_pred is None or not keyframes or not len(rows):
+            return FilterResult.of(np.ones(len(frame), dtype=bool), {"asked": 0.0, "tested": 0.0})
+        points = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+        votes = np.zeros(len(frame), dtype=int)
+        tested = np.zeros(len(frame), dtype=bool)
         for view in keyframes:
-            violated, observed = self._saw_past(view, points, state.camera)
-            votes += violated
-            seen |= observed
-        self._forget({id(view.depth) for view in keyframes})
-        violating, tested = np.zeros(len(frame), dtype=bool), np.zeros(len(frame), dtype=bool)
-        violating[known] = votes >= min(self.settings.min_votes, len(keyframes))
-        tested[known] = seen
-        keep = ~coherent(violating, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
-        return FilterResult.of(keep, {"asked": float(len(keyframes)), "tested": float(np.count_nonzero(seen))})
+            violated, observed = self._violations(view, points, state.camera)
+            votes[rows] += violated
+            tested[rows] |= observed
+        compared = {id(view.depth) for view in keyframes}
+        self._nearest = {image: depths for image, depths in self._nearest.items() if image in compared}
+        violating = votes >= min(self.settings.min_votes, len(keyframes))
+        moving = coherent(violating, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
+        return FilterResult.of(~moving, {"asked": float(len(keyframes)), "tested": float(np.count_nonzero(tested))})
 
-    def _saw_past(
+    def _violations(
         self, view: KeyframeView, points: NDArray[np.float64], camera: Camera
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which world points the keyframe saw past, and which lie in its view at all."""
+        """Which world points lie in front of the surface that the keyframe measured, and which lie in its view."""
         local = se3.transform(se3.inverse(view.T_world_cam), points)
         ahead = local[:, 2] > 0.1
         pixels = np.full((len(points), 2), -1.0)
@@ -84,10 +78,6 @@ class FreeSpaceFilter(DynamicFilter):
     def _nearest_depth(self, view: KeyframeView) -> NDArray[np.float32]:
         """Smallest depth around each pixel of the keyframe, 0 where any depth of the patch is missing."""
         assert view.depth is not None
-        if id(view.depth) not in self._nearest:  # the image is kept, so that its id stays its own
+        if id(view.depth) not in self._nearest:  # the image is stored too, so that its id cannot be reused
             self._nearest[id(view.depth)] = view.depth, np.asarray(cv2.erode(view.depth, PATCH), dtype=np.float32)
         return self._nearest[id(view.depth)][1]
-
-    def _forget(self, asked: set[int]) -> None:
-        for image in self._nearest.keys() - asked:
-            del self._nearest[image]

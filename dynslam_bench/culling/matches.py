@@ -1,4 +1,4 @@
-"""The fundamental matrix of chosen matches, what it says of others, and when it means nothing (paper, Eq. 24-25)."""
+"""Matches with the previous frame by optical flow, and the fundamental matrix of matches (paper, Eq. 24-25)."""
 
 from __future__ import annotations
 
@@ -18,25 +18,23 @@ from dynslam_bench.geometry.camera import Camera
 Points = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-MIN_MATCHES = 16  # twice the eight-point algorithm's minimum
-METHODS = {"ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS, "magsac": cv2.USAC_MAGSAC}
+MIN_MATCHES = 16
+"""Twice the minimum of the eight-point algorithm."""
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """How F is estimated.
+    """Options of RANSAC for F.
 
     Attributes:
-        method: ``ransac``, ``lmeds`` or ``magsac``.
         inlier_px: Distance in pixels up to which a match agrees with F.
-        confidence: Of the robust estimator.
+        confidence: Of RANSAC.
         max_draws: Most samples that it draws.
         min_matches: Fewer matches give no F.
-        refits: How often F is fitted anew to all matches that agree: the minimal sample's F is noisy at the image's
-            fringe.
+        refits: How often F is fitted again to all matches that agree: the F of the minimal sample is noisy at the
+            image's border.
     """
 
-    method: str = "ransac"
     inlier_px: float = 1.0
     confidence: float = 0.99
     max_draws: int = 2000
@@ -58,53 +56,51 @@ class Matches:
 
     @classmethod
     def by_flow(cls, frame: FrameBundle, state: FilterState) -> Matches | None:
-        """All keypoints and where their flow ends; None where there is no flow or no previous image to test against."""
+        """All keypoints and where their flow ends; None without flow or without a previous frame."""
         if state.flow is None or state.previous is None:
             return None
         return cls(state.camera.undistort_points(state.flow.xy), frame.xy)
 
-    def distances(self, fit: Flags, judged: Flags, estimator: Estimator) -> Points | None:
-        """How far points are from the epipolar line that an F of some of them gives.
+    def distances(self, fit: Flags, tested: Flags, estimator: Estimator) -> Points | None:
+        """Distances from the epipolar lines of an F that is fitted to some of the matches.
 
         Args:
             fit: bool ``[N]``, the matches that F is fitted to.
-            judged: bool ``[N]``, the matches that are measured.
-            estimator: How F is estimated.
+            tested: bool ``[N]``, the matches that are measured.
+            estimator: Options of RANSAC.
 
         Returns:
-            Distances ``[N]`` in pixels, 0 where a match is not judged; None where F cannot be estimated.
+            Distances ``[N]`` in pixels, 0 where a match is not tested; None where F cannot be estimated.
         """
         matrix = fundamental_matrix(self.before[fit], self.now[fit], estimator)
         if matrix is None:
             return None
-        distance = np.zeros(len(judged))
-        distance[judged] = epipolar_distance(matrix, self.before[judged], self.now[judged])
+        distance = np.zeros(len(tested))
+        distance[tested] = epipolar_distance(matrix, self.before[tested], self.now[tested])
         return distance
 
 
 def f_stats(*, asked: bool, judged: bool = False) -> dict[str, float]:
-    """A filter's account of its fundamental matrix, see `FilterResult`: was there anything to test, and did F judge?"""
+    """Stats of a filter that uses F, see `FilterResult`: whether there were matches, and whether F was used."""
     return {"f_asked": float(asked), "f_judged": float(judged)}
 
 
 def fundamental_matrix(first: Points, second: Points, estimator: Estimator) -> NDArray[np.float64] | None:
-    """The matrix F with ``x2^T F x1 = 0`` (Eq. 24) for matched pixels, robustly.
+    """The matrix F with ``x2^T F x1 = 0`` (Eq. 24) for matched pixels, by RANSAC.
 
     Args:
         first: Undistorted pixels x1, float64 ``[N, 2]``.
         second: Undistorted pixels x2, float64 ``[N, 2]``.
-        estimator: Method and thresholds.
+        estimator: Thresholds and limits.
 
     Returns:
-        F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate, the estimator gave up).
+        F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate).
     """
     if len(first) < estimator.min_matches:
         return None
-    method, draws = METHODS[estimator.method], estimator.max_draws
-    try:
-        matrix, _ = cv2.findFundamentalMat(first, second, method, estimator.inlier_px, estimator.confidence, draws)
-    except cv2.error:  # OpenCV 5.0's MAGSAC raises "!model.empty()" where no model was found
-        return None
+    matrix, _ = cv2.findFundamentalMat(
+        first, second, cv2.FM_RANSAC, estimator.inlier_px, estimator.confidence, estimator.max_draws
+    )
     for _ in range(estimator.refits):
         if not _usable(matrix):
             return None
@@ -127,17 +123,11 @@ def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points
 
 
 def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
-    """How much of the flow a pure rotation of the camera leaves unexplained: median residual in pixels.
-
-    Args:
-        first: Undistorted pixels ``[N, 2]``.
-        second: Undistorted pixels ``[N, 2]``.
-        camera: Intrinsics.
-    """
+    """Median distance in pixels between matches ``[N, 2]`` and the best pure rotation: the parallax."""
     rays = [_rays(first, camera), _rays(second, camera)]
     weight = np.ones(len(first))
     residual = np.zeros(len(first))
-    for _ in range(3):  # iteratively reweighted, so that moving things do not turn the rotation
+    for _ in range(3):  # iteratively reweighted, so that moving objects do not influence the rotation
         u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
@@ -152,12 +142,9 @@ def _rays(xy: Points, camera: Camera) -> Points:
 
 
 def homography_share(first: Points, second: Points) -> float:
-    """Share of the matches ``[N, 2]`` that one homography explains within 1 px: 1 for a plane or a pure rotation."""
+    """Share of the matches ``[N, 2]`` within 1 px of one homography: 1 for a plane or a pure rotation."""
     matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=300, confidence=0.99)
     return 0.0 if matrix is None else float(np.mean(mask))
-
-
-# Which feature of the previous frame is this one, and which are judged by their flow at all?
 
 
 def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 2.5) -> NDArray[np.intp]:
@@ -166,7 +153,7 @@ def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 
     Args:
         frame: The current frame.
         state: With the flow to the previous image.
-        radius_px: How near the flow's end must be to an earlier keypoint.
+        radius_px: Largest distance between the end of the flow and an earlier keypoint.
     """
     link = np.full(len(frame), -1, dtype=np.intp)
     if state.flow is None or state.previous is None or not len(state.previous):
@@ -180,21 +167,14 @@ def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 
     return link
 
 
-def judged_by_flow(flow: FlowResult, asked: NDArray[np.bool_], unmatched: Unmatched) -> NDArray[np.bool_]:
-    """Which features a test on flow judges, bool ``[N]``.
+def tested_by_flow(flow: FlowResult, kept: NDArray[np.bool_], unmatched: Unmatched) -> NDArray[np.bool_]:
+    """Features that a test on flow applies to, bool ``[N]``.
 
     Args:
-        flow: Flow of the features; where it failed, ``xy`` is the place where the tracker gave up.
-        asked: bool ``[N]``, features whose flow was asked for: those that earlier filters kept.
-        unmatched: ``judge`` takes those along whose flow failed.
+        flow: Flow of the features; where it failed, ``xy`` is the place where the tracker lost the feature.
+        kept: bool ``[N]``, features that earlier filters kept and whose flow was computed.
+        unmatched: ``judge`` includes features whose flow failed.
     """
     if unmatched != "judge":
-        return np.asarray(asked & flow.valid)
-    return np.asarray(asked & np.isfinite(flow.xy).all(axis=1))
-
-
-def inherit(values: NDArray[np.float64], link: NDArray[np.intp], default: float) -> NDArray[np.float64]:
-    """Values ``[M, ...]`` of the previous keypoints, carried to the current ones ``[N, ...]`` along their links."""
-    carried = np.full((len(link), *values.shape[1:]), default, dtype=np.float64)
-    carried[link >= 0] = values[link[link >= 0]]
-    return carried
+        return np.asarray(kept & flow.valid)
+    return np.asarray(kept & np.isfinite(flow.xy).all(axis=1))

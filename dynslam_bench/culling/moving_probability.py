@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling.matches import inherit, link_to_previous
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling.matches import link_to_previous
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.geometry.camera import Camera, inside
@@ -17,12 +18,16 @@ from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 UNKNOWN = 0.5
-SURE = (0.25, 0.75)
-"""Below and above, a feature is held for static and dynamic with certainty (Detect-SLAM)."""
+CERTAIN = (0.25, 0.75)
+"""Below the first a feature is certainly static, above the second certainly dynamic (Detect-SLAM)."""
+HIT = 0.9
+"""Probability that a moving point lies on a mask, and a static one off it (Bayes rule; our assumption)."""
+RATE = 0.3
+"""Weight of the new observation (moving average; our assumption)."""
 
 
-class ProbabilityFilter(DynamicFilter):
-    """Drops features whose moving probability exceeds the threshold; it is inherited along the flow.
+class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
+    """Drops features whose moving probability exceeds the threshold; the probability follows the flow.
 
     Args:
         settings: Accumulation rule and threshold.
@@ -40,8 +45,7 @@ class ProbabilityFilter(DynamicFilter):
     def __init__(
         self, settings: ProbabilitySettings, segmentation: SegmentationSettings, evidence: str = "masks"
     ) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
+        super().__init__(settings, segmentation)
         self._boxes = evidence == "boxes"
         self._probability = np.zeros(0)
 
@@ -54,7 +58,8 @@ class ProbabilityFilter(DynamicFilter):
         link = link_to_previous(frame, state, self.settings.link_px)
         if state.previous is None or len(self._probability) != len(state.previous):
             link[:] = -1
-        prior = inherit(self._probability, link, UNKNOWN)
+        prior = np.full(len(link), UNKNOWN)
+        prior[link >= 0] = self._probability[link[link >= 0]]
         if self.settings.expand_px > 0:
             prior = expand(frame.keypoints.xy, prior, link >= 0, self.settings.expand_px)
         if frame.instances is not None:
@@ -77,33 +82,33 @@ class ProbabilityFilter(DynamicFilter):
 
     def _update(self, prior: NDArray[np.float64], on_mask: NDArray[np.bool_]) -> NDArray[np.float64]:
         if self.settings.rule == "average":
-            return (1 - self.settings.rate) * prior + self.settings.rate * on_mask
-        moving = np.where(on_mask, self.settings.hit, 1 - self.settings.hit)
+            return (1 - RATE) * prior + RATE * on_mask
+        moving = np.where(on_mask, HIT, 1 - HIT)
         posterior = moving * prior / (moving * prior + (1 - moving) * (1 - prior))
         return np.asarray(posterior.clip(0.01, 0.99))
 
 
 def expand(
-    xy: NDArray[np.floating], probability: NDArray[np.float64], linked: NDArray[np.bool_], reach_px: float
+    xy: NDArray[np.floating], probability: NDArray[np.float64], linked: NDArray[np.bool_], radius_px: float
 ) -> NDArray[np.float64]:
-    """Matching point expansion: what has no history takes after the nearest feature that is sure of its own.
+    """Matching point expansion: a new feature takes a share of the nearest certain feature's probability.
 
     Args:
         xy: Pixels of all features ``[N, 2]``.
         probability: Their moving probabilities ``[N]``.
         linked: bool ``[N]``, which of them have a history.
-        reach_px: How far that feature may be; its say fades as a Gaussian of half this width.
+        radius_px: Largest distance to that feature; its influence is a Gaussian of half this width.
 
     Returns:
         Probabilities ``[N]``; those with a history unchanged.
     """
     expanded = probability.copy()
-    sure = np.flatnonzero(linked & ((probability < SURE[0]) | (probability > SURE[1])))
+    certain = np.flatnonzero(linked & ((probability < CERTAIN[0]) | (probability > CERTAIN[1])))
     new = np.flatnonzero(~linked)
-    if not len(sure) or not len(new):
+    if not len(certain) or not len(new):
         return expanded
-    distance, nearest = cKDTree(xy[sure]).query(xy[new], distance_upper_bound=reach_px)
+    distance, nearest = cKDTree(xy[certain]).query(xy[new], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
-    say = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * reach_px)))
-    expanded[new[near]] = UNKNOWN + say * (probability[sure[np.asarray(nearest)[near]]] - UNKNOWN)
+    influence = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * radius_px)))
+    expanded[new[near]] = UNKNOWN + influence * (probability[certain[np.asarray(nearest)[near]]] - UNKNOWN)
     return expanded

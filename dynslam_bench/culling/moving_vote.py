@@ -1,4 +1,4 @@
-"""B3 and B11 as in DS-SLAM's code: if any moving corner lies near a person, all people go; otherwise all stay."""
+"""B3 and B11 as in DS-SLAM's code: one moving corner near a person drops the features of all people."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.matches import Estimator, Matches, f_stats
 from dynslam_bench.culling.settings import MovingVoteSettings
 from dynslam_bench.geometry.camera import Camera, inside
 from dynslam_bench.segmentation.postprocess import select
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 BORDER_PX = 5
 HARRIS_K = 0.04
@@ -24,10 +24,10 @@ ESTIMATOR = Estimator(max_draws=1000, min_matches=8, refits=0)
 WINDOW = (22, 22)
 
 
-class MovingVoteFilter(DynamicFilter):
+class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
     """DS-SLAM's moving consistency check: corners of its own, pyramidal Lucas-Kanade, F by RANSAC, one global vote.
 
-    It has no degeneracy guard (the published system fails on `walking_rpy` for want of one).
+    It has no degeneracy guard; the published system fails on `walking_rpy` without one.
     Stats: ``dropped``, ``corners`` (tracked), ``moving`` (off their line), ``votes`` (of those, near a person).
     """
 
@@ -36,26 +36,19 @@ class MovingVoteFilter(DynamicFilter):
     provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "corners", "moving", "votes", "f_judged", "f_asked")
 
-    def __init__(self, settings: MovingVoteSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
-
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Vote, and drop the points on people if the vote says that they move."""
+        """Vote, and drop the points on people if enough moving corners lie near them."""
         keep = np.ones(len(frame), dtype=bool)
         stats = dict.fromkeys(("corners", "moving", "votes"), 0.0) | f_stats(asked=state.previous is not None)
         if state.previous is None or frame.instances is None:
             return FilterResult.of(keep, stats)
         people = select(frame.instances, self.segmentation).union()
-        moving, stats["corners"], judged = self._moving_corners(state.previous.gray, frame.gray, state.camera)
-        stats |= f_stats(asked=True, judged=judged)
+        moving, stats["corners"], estimated = self._moving_corners(state.previous.gray, frame.gray, state.camera)
+        stats |= f_stats(asked=True, judged=estimated)
         stats["moving"] = float(len(moving))
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
-        around = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
-        votes = np.count_nonzero(inside(around, moving))
+        near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+        votes = np.count_nonzero(inside(near_people, moving))
         stats["votes"] = float(votes)
         if votes < self.settings.min_votes:
             return FilterResult.of(keep, stats)
@@ -64,34 +57,39 @@ class MovingVoteFilter(DynamicFilter):
     def _moving_corners(
         self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
     ) -> tuple[NDArray[np.float32], float, bool]:
-        """Raw pixels ``[M, 2]`` of the corners off their line in the current image; how many tracked; whether F was."""
-        nothing = np.zeros((0, 2), np.float32)
+        """Pixels ``[M, 2]`` of the corners off their line, the number of tracked corners, whether F was estimated."""
+        no_corners = np.zeros((0, 2), np.float32)
         corners = cv2.goodFeaturesToTrack(
             previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
         )
         if corners is None or len(corners) < ESTIMATOR.min_matches:
-            return nothing, 0.0, False
+            return no_corners, 0.0, False
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
         corners = cv2.cornerSubPix(previous, corners, (10, 10), (-1, -1), criteria)
-        guess = corners.copy()
-        tracked, found, _ = cv2.calcOpticalFlowPyrLK(
-            previous, current, corners, guess, winSize=WINDOW, maxLevel=LEVELS, criteria=(criteria[0], 20, 0.01)
+        tracked, status, _ = cv2.calcOpticalFlowPyrLK(
+            previous,
+            current,
+            corners,
+            corners.copy(),
+            winSize=WINDOW,
+            maxLevel=LEVELS,
+            criteria=(criteria[0], 20, 0.01),
         )
         before, after = corners.reshape(-1, 2), tracked.reshape(-1, 2)
         height, width = current.shape
         low, high = np.array([BORDER_PX, BORDER_PX]), np.array([width - BORDER_PX - 1, height - BORDER_PX - 1])
-        good = found.ravel().astype(bool)
+        good = status.ravel().astype(bool)
         for xy in (before, after):
             good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
         good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
         before, after = before[good], after[good]
         if len(before) < ESTIMATOR.min_matches:
-            return nothing, float(len(before)), False
-        every = np.ones(len(before), dtype=bool)
+            return no_corners, float(len(before)), False
+        all_corners = np.ones(len(before), dtype=bool)
         matches = Matches(camera.undistort_points(before), camera.undistort_points(after))
-        distance = matches.distances(every, every, replace(ESTIMATOR, inlier_px=self.settings.inlier_px))
+        distance = matches.distances(all_corners, all_corners, replace(ESTIMATOR, inlier_px=self.settings.inlier_px))
         if distance is None:
-            return nothing, float(len(before)), False
+            return no_corners, float(len(before)), False
         return after[distance > self.settings.threshold_px], float(len(before)), True
 
 

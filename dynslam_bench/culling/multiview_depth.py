@@ -1,4 +1,4 @@
-"""B4 and B5: DynaSLAM's multi-view geometry: what keyframes saw and something nearer hides now, moves."""
+"""B4 and B5: DynaSLAM's multi-view geometry: an object that hides points of earlier keyframes is dynamic."""
 
 from __future__ import annotations
 
@@ -8,17 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import (
-    DynamicFilter,
-    FilterResult,
-    FilterState,
-    FrameBundle,
-    KeyframeView,
-    Need,
-    Provenance,
-)
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.features.matching import CellGrid, as_words, search_in_radius
@@ -30,14 +23,16 @@ MAX_REFERENCE_DEPTH_M = 6.0
 MAX_PROJECTED_DEPTH_M = 7.0
 MAX_DEPTH_M = 40.0
 """Measured depth beyond this counts as missing, as in the back end."""
+GROW_M = 0.2
+"""Largest depth difference to the mean of a region (our assumption)."""
 MARGIN_PX = 20
-"""Half side of the window around a projected point; points nearer to the image's border are not judged."""
+"""Half side of the window around a projected point; points nearer to the image's border are not tested."""
 
 
-class MultiViewFilter(DynamicFilter):
-    """Drops what lies on something that hides points which earlier keyframes saw there.
+class MultiViewFilter(Rule[MultiViewSettings]):
+    """Drops the features on objects that hide points which earlier keyframes observed.
 
-    A region of like depth grows around every hidden point; features go on the region and within `border_px` of it.
+    A region of similar depth grows around every hidden point; features on it and within `border_px` of it are dropped.
     Difference from the authors' code: the parallax angle is taken between the camera centres (the code uses a
     translation in the wrong frame). Stats: ``dropped``, ``references``, ``seeds`` (hidden points), ``mask_fraction``.
     """
@@ -47,14 +42,8 @@ class MultiViewFilter(DynamicFilter):
     provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "references", "seeds", "mask_fraction")
 
-    def __init__(self, settings: MultiViewSettings) -> None:
-        self.settings = settings
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
-
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Project the references' points into the frame and look for what hides them."""
+        """Project the references' points into the frame and find the objects that hide them."""
         keep = np.ones(len(frame), dtype=bool)
         stats = {"references": 0.0, "seeds": 0.0, "mask_fraction": 0.0}
         if state.T_world_pred is None or len(state.keyframes) < self.settings.min_keyframes:
@@ -64,7 +53,7 @@ class MultiViewFilter(DynamicFilter):
         references = self._choose(state.keyframes, pose)
         depth = np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0)
         depth = np.ascontiguousarray(np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0), dtype=np.float32)
-        seeds = self._hiding(references, depth, pose, state.camera)
+        seeds = self._seeds(references, depth, pose, state.camera)
         stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
         if not len(seeds):
             return FilterResult.of(keep, stats)
@@ -82,35 +71,35 @@ class MultiViewFilter(DynamicFilter):
         ranked = np.argsort(score if self.settings.order == "nearest" else -score, kind="stable")
         return [views[i] for i in ranked[: self.settings.references]]
 
-    def _hiding(
+    def _seeds(
         self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
     ) -> NDArray[np.int64]:
-        """Pixels ``[M, 2]`` at which something hides the references' points now, reference by reference."""
-        world, then = [], []
+        """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
+        world, from_reference = [], []
         for view in views:
             usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
             world.append(se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable])))
-            then.append(world[-1] - view.T_world_cam[:3, 3])
+            from_reference.append(world[-1] - view.T_world_cam[:3, 3])
         points = np.concatenate(world)
-        now = points - pose[:3, 3]
-        cosine = _cosine(np.concatenate(then), now)
-        local = now @ pose[:3, :3]
+        from_frame = points - pose[:3, 3]
+        cosine = _cosine(np.concatenate(from_reference), from_frame)
+        local = from_frame @ pose[:3, :3]
         pixels = np.full((len(local), 2), -1.0)
         ahead = local[:, 2] > 0.1
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
-        shown = ahead & (cosine > np.cos(np.deg2rad(self.settings.max_parallax_deg)))
-        shown &= local[:, 2] < MAX_PROJECTED_DEPTH_M
+        visible = ahead & (cosine > np.cos(np.deg2rad(self.settings.max_parallax_deg)))
+        visible &= local[:, 2] < MAX_PROJECTED_DEPTH_M
         size = (camera.width - MARGIN_PX - 2, camera.height - MARGIN_PX - 2)
-        shown &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
-        if not shown.any():
+        visible &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
+        if not visible.any():
             return np.zeros((0, 2), np.int64)
-        centre = np.ceil(pixels[shown]).astype(np.int64)
-        seeds = centre[hidden(depth, centre, local[shown, 2], self.settings.tau_m, MARGIN_PX)]
+        centre = np.ceil(pixels[visible]).astype(np.int64)
+        seeds = centre[hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)]
         return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
 
     def _region(self, seeds: NDArray[np.int64], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         if self.settings.grow:
-            mask = grow(depth, np.ascontiguousarray(seeds), self.settings.grow_m, BIN_M)
+            mask = grow(depth, np.ascontiguousarray(seeds), GROW_M, BIN_M)
         else:
             mask = np.zeros(depth.shape, np.uint8)
         mask[seeds[:, 1], seeds[:, 0]] = 1
@@ -126,7 +115,7 @@ def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
 def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArray[np.float64]:
     """Variance ``[N]`` of the depth in the 41x41 neighbourhoods of pixels ``[N, 2]``, m^2.
 
-    Missing depth counts as the 0 that it is stored as, as in the authors' code: beside it nothing is a seed.
+    Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
     """
     if not len(xy):
         return np.zeros(0)
@@ -151,22 +140,22 @@ BIN_M = 0.005
 def hidden(
     depth: NDArray[np.float32], centre: NDArray[np.int64], expected: NDArray[np.float64], tau: float, radius: int
 ) -> NDArray[np.bool_]:
-    """Which points are hidden by something nearer, whatever small error their projection has.
+    """Which points are hidden by a nearer object, robustly against small projection errors.
 
-    The depth that a point is compared with is the one in the window that is nearest to what is expected, among those
-    in front of it: a point beside an object is not hidden, only one well inside its outline is.
+    A point is compared with the depth in the window that is nearest to the expected depth, among those in front of it:
+    a point beside an object is not hidden, only one well inside its outline is.
 
     Args:
         depth: float32 ``[H, W]`` metres, 0 missing.
         centre: int64 ``[N, 2]`` pixels (column, row) of the projected points, at least `radius` from the border.
         expected: float64 ``[N]`` depth at which the points should be seen, metres.
-        tau: How far in front of it everything must be, metres.
+        tau: Least distance of all nearer depths in front of the point, metres.
         radius: Half side of the window, pixels.
 
     Returns:
         Bool ``[N]``; False also where the point's own pixel has no depth, or nothing in the window is nearer.
     """
-    found = np.zeros(len(centre), np.bool_)
+    is_hidden = np.zeros(len(centre), np.bool_)
     for i in range(len(centre)):
         column, row = centre[i]
         if not depth[row, column] > 0:
@@ -182,16 +171,16 @@ def hidden(
                         break
             if not all_far:
                 break
-        found[i] = nearer and all_far
-    return found
+        is_hidden[i] = nearer and all_far
+    return is_hidden
 
 
 @kernel
 def grow(depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_m: float) -> NDArray[np.uint8]:
-    """Regions of like depth around seeds: neighbours join while they are within `step` of the region's mean.
+    """Regions of similar depth around seeds: neighbours join while they are within `step` of the region's mean.
 
-    Of all neighbours of a region the one nearest to its mean joins next (to `bin_m`), and the mean moves along. Pixels
-    without depth never join. A seed within an earlier region founds none of its own.
+    Of all neighbours of a region the one nearest to its mean joins next (to `bin_m`), and the mean is updated. Pixels
+    without depth never join. A seed within an earlier region starts no new region.
 
     Args:
         depth: float32 ``[H, W]`` metres, 0 missing, at most a few ten metres.
@@ -248,21 +237,21 @@ def grow(depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_
 # DynaSLAM's low-cost tracking: a pose for the geometric test before the frame is really tracked.
 
 MIN_MATCHES = 20
-"""Fewer matches are sought again in twice the radius, then given up."""
+"""With fewer matches the search is repeated with twice the radius; after that the prediction is not refined."""
 MAX_DISTANCE = 100
 """Largest Hamming distance of a match."""
 
 
 def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float = 15.0) -> NDArray[np.float64] | None:
-    """The pose predicted for this frame, refined on the matches of the features that earlier filters kept.
+    """DynaSLAM's low-cost tracking: the predicted pose, refined on matches of features that earlier filters kept.
 
-    The previous frame's features are projected under constant velocity and matched by descriptor within `radius_px`;
-    the pose is the one that explains most of the matches. The authors match the local map instead of the last frame.
+    The previous frame's features are projected under constant velocity and matched by descriptor within `radius_px`.
+    The authors match the local map instead of the last frame.
 
     Args:
         frame: The current frame.
         state: With the previous frame, its pose and the predicted one.
-        radius_px: Half side of the search windows (DynaSLAM: 15, doubled where too little matches).
+        radius_px: Half side of the search windows (DynaSLAM: 15, doubled with too few matches).
 
     Returns:
         Camera-to-world pose ``[4, 4]``; the prediction itself (or None) where there are fewer than 20 matches, or
@@ -287,8 +276,8 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
             valid = np.zeros(len(frame), dtype=bool)
             xy[match[matched]] = previous.keypoints.xy[rows[matched]]
             valid[match[matched]] = True
-            found = FlowResult(xy, valid, np.zeros(len(frame), np.float32))
-            return refine_prediction(frame, replace(state, flow=found))
+            matches = FlowResult(xy, valid, np.zeros(len(frame), np.float32))
+            return refine_prediction(frame, replace(state, flow=matches))
     return state.T_world_pred
 
 

@@ -1,30 +1,30 @@
-"""B12: more features are sought than are used, so that culling leaves the static budget full (NGD-SLAM, Crowd-SLAM)."""
+"""B12: extract more features than are used, so that culling leaves enough static ones (NGD-SLAM, Crowd-SLAM)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.orb import EDGE, level_quotas, spread
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry.camera import Camera
 
 ORIGIN = EDGE - 3
-"""Where the extractor's cells begin, pixels of a level."""
+"""Where the extractor's cells begin, in pixels of a level."""
 
 
-class ReseedingFilter(DynamicFilter):
-    """Of the features that earlier filters kept, uses the best `budget`: what fell to a mask is replaced elsewhere.
+class ReseedingFilter(Rule[ReseedingSettings]):
+    """Uses the best `budget` of the features that earlier filters kept.
 
-    The extractor seeks more features than the budget (x1.5 in NGD-SLAM). The budget is shared among the pyramid's
-    levels and the cells of the image as the extractor shares its own, so that a frame without anything dynamic gives
-    exactly the features that the extractor finds when asked for `budget` of them: other systems' features.
+    The extractor finds more features than the budget (x1.5 in NGD-SLAM). The budget is divided among pyramid levels and
+    image cells as in the extractor. A frame without dynamic objects thus gives exactly the features of an extractor
+    with ``n_features = budget``, those of the other systems.
 
-    It must be the last filter. What it leaves out is surplus, not dynamic: it has no part in a mask.
-    Stats: ``dropped`` (the surplus), ``static`` (what earlier filters left), ``reseeded`` (used features that are
-    there only because others fell), ``missing`` (by how much the budget is not filled).
+    It must be the last filter. The features that it drops are surplus, not dynamic.
+    Stats: ``dropped`` (the surplus), ``static`` (kept by earlier filters), ``reseeded`` (used features that replace
+    dynamic ones), ``missing`` (unused part of the budget).
 
     Args:
         settings: The budget.
@@ -37,11 +37,8 @@ class ReseedingFilter(DynamicFilter):
     stats_names = ("dropped", "static", "reseeded", "missing")
 
     def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:
-        self.settings = settings
+        super().__init__(settings)
         self._features = features
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Choose the features that are used."""
@@ -54,7 +51,7 @@ class ReseedingFilter(DynamicFilter):
             "missing": float(max(self.settings.budget - int(np.count_nonzero(used)), 0)),
             "dropped": float(np.count_nonzero(static & ~used)),
         }
-        keep = used | ~static  # only what was still in use is judged here
+        keep = used | ~static  # features that earlier filters dropped are not judged again
         return FilterResult(keep, keep.astype(np.float32), stats)
 
     def _choose(self, frame: FrameBundle, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -70,7 +67,7 @@ class ReseedingFilter(DynamicFilter):
             rows = np.flatnonzero((octave == level) & allowed)
             quota = quotas[level] + missing
             picked = rows[self._spread(frame, rows, level, quota)]
-            missing = quota - len(picked)  # what a coarse level cannot give is sought in the next finer one
+            missing = quota - len(picked)  # a coarse level's missing features are added to the next finer level
             chosen[picked] = True
         return chosen
 
@@ -80,5 +77,5 @@ class ReseedingFilter(DynamicFilter):
         cell = (xy / self._features.cell_px).astype(np.int64)
         # ranks of the responses, so that equal ones stay equal and keep their order
         strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
-        home = cell[:, 1] * (1 << 20) + cell[:, 0]
-        return spread(home, strength, np.ones(len(rows), dtype=bool), quota)
+        cell_index = cell[:, 1] * (1 << 20) + cell[:, 0]
+        return spread(cell_index, strength, np.ones(len(rows), dtype=bool), quota)

@@ -1,21 +1,27 @@
-"""Motion in 3-D against the camera's own: sees what moves along epipolar lines, and under pure rotation."""
+"""Rigid-motion test in 3-D: detects motion along epipolar lines, and motion under pure rotation of the camera."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling.ego_motion import CELL, coherent, depth_sigma, rigid_flow
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
+from dynslam_bench.culling.ego_motion import CELL, cell_index, coherent, depth_sigma, rigid_flow
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry.camera import Camera
 
+THRESHOLD_SHARE = 0.05
+"""Added to the pixel threshold, as a share of the flow that the camera's motion explains (rolling shutter)."""
+MEMORY = 0.6
+"""Share of a point's evidence that is carried over from the previous frame."""
 
-class RigidMotionFilter(DynamicFilter):
+
+class RigidMotionFilter(Rule[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
-    A point's evidence is 1 where it fails in the image or in depth; it fades over the following frames
-    (`RigidMotionSettings.memory`), carried along by the flow, so that people who pause for a moment stay culled.
+    A point's evidence is 1 where it fails in the image or in depth. The evidence follows the flow and decays over the
+    next frames (`MEMORY`), so that people who pause for a moment stay culled.
     Stats: ``dropped``, ``tested``, ``failed`` (in this frame alone).
     """
 
@@ -25,7 +31,7 @@ class RigidMotionFilter(DynamicFilter):
     stats_names = ("dropped", "tested", "failed")
 
     def __init__(self, settings: RigidMotionSettings) -> None:
-        self.settings = settings
+        super().__init__(settings)
         self._evidence: NDArray[np.float64] | None = None
 
     def reset(self, camera: Camera) -> None:
@@ -44,7 +50,7 @@ class RigidMotionFilter(DynamicFilter):
         failed[tested] = self._fails(frame, state, tested)
         failed = coherent(failed, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
         evidence = failed.astype(np.float64)
-        evidence[flow.valid] += self.settings.memory * self._recall(frame, flow.xy[flow.valid])
+        evidence[flow.valid] += MEMORY * self._past_evidence(frame, flow.xy[flow.valid])
         evidence = evidence.clip(0, 1)
         self._evidence = _pool(evidence, frame)
         return FilterResult.of(
@@ -57,26 +63,24 @@ class RigidMotionFilter(DynamicFilter):
         before = state.camera.undistort_points(state.flow.xy[tested])
         distance = np.linalg.norm(expected - before, axis=1)
         explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
-        limit_px = self.settings.threshold_px + self.settings.threshold_share * explained
-        seen = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
+        limit_px = self.settings.threshold_px + THRESHOLD_SHARE * explained
+        measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
         limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
-        off_depth = (seen > 0) & (np.abs(seen - moved[:, 2]) > limit)
+        off_depth = (measured > 0) & (np.abs(measured - moved[:, 2]) > limit)
         return np.asarray(~(distance <= limit_px) | off_depth)
 
-    def _recall(self, frame: FrameBundle, before: NDArray[np.floating]) -> NDArray[np.float64]:
+    def _past_evidence(self, frame: FrameBundle, before: NDArray[np.floating]) -> NDArray[np.float64]:
         if self._evidence is None:
             return np.zeros(len(before))
-        rows, columns = self._evidence.shape
-        cell = np.floor(before / (CELL // 2)).astype(np.intp)
-        return np.asarray(self._evidence[cell[:, 1].clip(0, rows - 1), cell[:, 0].clip(0, columns - 1)])
+        return self._evidence[cell_index(before, CELL // 2, frame.gray.shape)[0]]
 
 
 def nearest_depth(
     depth: NDArray[np.float32], xy: NDArray[np.floating], expected: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """The depth in the 3x3 patch around each raw pixel that is nearest to what is expected.
+    """The depth in the 3x3 patch around each raw pixel that is nearest to the expected depth.
 
-    Depth edges and sub-pixel flow errors so never count as motion.
+    Thus depth edges and sub-pixel flow errors do not count as motion.
 
     Args:
         depth: float32 ``[H, W]`` metres, 0 or not finite where missing.
@@ -98,11 +102,8 @@ def nearest_depth(
 
 
 def _pool(evidence: NDArray[np.float64], frame: FrameBundle) -> NDArray[np.float64]:
-    """Mean evidence of the keypoints in cells of half `CELL`, ``[rows, columns]``; 0 where there are none."""
-    size = CELL // 2
-    rows, columns = -(-frame.gray.shape[0] // size), -(-frame.gray.shape[1] // size)
-    cell = np.floor(frame.keypoints.xy / size).astype(np.intp)
-    index = cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1)
+    """Mean evidence of the keypoints in cells of half `CELL`, row by row; 0 where there are none."""
+    index, (rows, columns) = cell_index(frame.keypoints.xy, CELL // 2, frame.gray.shape)
     total = np.bincount(index, weights=evidence, minlength=rows * columns)
     count = np.bincount(index, minlength=rows * columns)
-    return np.asarray((total / np.maximum(count, 1)).reshape(rows, columns))
+    return np.asarray(total / np.maximum(count, 1))

@@ -1,19 +1,18 @@
-"""B1: drop the features on objects of a-priori dynamic classes (Mask R-CNN as a filter, DynaSLAM's variant N)."""
+"""B1: drop the features on objects of a-priori dynamic classes (DynaSLAM's variant N); boxes of such objects."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.culling.settings import BoxSettings
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
+from dynslam_bench.geometry.camera import inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
-class SemanticFilter(DynamicFilter):
+class SemanticFilter(Rule[SegmentationSettings]):
     """Drops every keypoint on the dilated masks of the dynamic classes.
 
     Stats: ``dropped``, ``objects`` (of dynamic classes), ``mask_fraction`` (share of the image).
@@ -24,12 +23,6 @@ class SemanticFilter(DynamicFilter):
     provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "objects", "mask_fraction")
     group = "segmentation"
-
-    def __init__(self, settings: SegmentationSettings) -> None:
-        self.settings = settings
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop what lies on the masks; without a segmenter, keep all."""
@@ -48,34 +41,13 @@ class SemanticFilter(DynamicFilter):
 
 def dynamic_boxes(frame: FrameBundle, settings: SegmentationSettings) -> NDArray[np.float32]:
     """Boxes ``[K, 4]`` of the frame's objects of dynamic classes; none without a segmenter."""
-    found: Instances | None = frame.instances
-    return np.zeros((0, 4), np.float32) if found is None else select(found, settings).boxes
+    if frame.instances is None:
+        return np.zeros((0, 4), np.float32)
+    return select(frame.instances, settings).boxes
 
 
-def in_boxes(xy: NDArray[np.floating], boxes: NDArray[np.floating], margin: float = 0.0) -> NDArray[np.bool_]:
-    """Bool ``[K, N]``: which raw pixels ``[N, 2]`` lie in which box ``[K, 4]`` (x0, y0, x1, y1) grown by a margin."""
+def in_boxes(xy: NDArray[np.floating], boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Bool ``[K, N]``: which raw pixels ``[N, 2]`` lie in which box ``[K, 4]`` (x0, y0, x1, y1)."""
     x, y = np.asarray(xy)[:, 0], np.asarray(xy)[:, 1]
     x0, y0, x1, y1 = (column[:, None] for column in np.asarray(boxes).reshape(-1, 4).T)
-    return np.asarray((x >= x0 - margin) & (x < x1 + margin) & (y >= y0 - margin) & (y < y1 + margin))
-
-
-class BoxFilter(DynamicFilter):
-    """Drops every keypoint inside a dynamic box. Stats: ``dropped``, ``objects``."""
-
-    name = "boxes"
-    needs: frozenset[Need] = frozenset({"boxes"})
-    provenance: Provenance = "faithful-code"
-    stats_names = ("dropped", "objects")
-
-    def __init__(self, settings: BoxSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
-
-    def reset(self, camera: Camera) -> None:
-        """Nothing to forget."""
-
-    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Drop what lies in the boxes."""
-        boxes = dynamic_boxes(frame, self.segmentation)
-        inside = in_boxes(frame.keypoints.xy, boxes, self.settings.margin_px).any(axis=0)
-        return FilterResult.of(~inside, {"objects": float(len(boxes))})
+    return np.asarray((x >= x0) & (x < x1) & (y >= y0) & (y < y1))

@@ -1,4 +1,4 @@
-"""B13: inside boxes, keep what is found again where the camera's motion predicts it (DynaTM-SLAM)."""
+"""B13: inside boxes, keep the patches that match where the camera's motion predicts them (DynaTM-SLAM)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.geometry import se3
@@ -15,8 +16,8 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
-class TemplateFilter(DynamicFilter):
-    """Drops features in dynamic boxes whose patch is not found at its predicted place in the latest frames.
+class TemplateFilter(ObjectRule[TemplateSettings]):
+    """Drops features in dynamic boxes whose patch does not match at its predicted place in the latest frames.
 
     Stats: ``dropped``, ``in_boxes``, ``tested``, ``median_zncc``.
     """
@@ -27,8 +28,7 @@ class TemplateFilter(DynamicFilter):
     stats_names = ("dropped", "in_boxes", "tested", "median_zncc")
 
     def __init__(self, settings: TemplateSettings, segmentation: SegmentationSettings) -> None:
-        self.settings = settings
-        self.segmentation = segmentation
+        super().__init__(settings, segmentation)
         self._window: deque[tuple[NDArray[np.uint8], NDArray[np.float64]]] = deque()
 
     def reset(self, camera: Camera) -> None:
@@ -36,7 +36,7 @@ class TemplateFilter(DynamicFilter):
         self._window.clear()
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Compare patches; features without depth or history go with their box."""
+        """Compare patches; features in boxes without depth or history are dropped."""
         if state.previous is not None and state.T_world_prev is not None:
             self._window.appendleft((state.previous.gray, state.T_world_prev))
         while len(self._window) > self.settings.window:
@@ -48,14 +48,14 @@ class TemplateFilter(DynamicFilter):
         if state.T_world_pred is None or not self._window or not len(rows):
             return FilterResult.of(keep, stats)
         world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
-        own = patches(frame.gray, frame.keypoints.xy[rows].astype(np.float64), self.settings.patch_px)
+        current = patches(frame.gray, frame.keypoints.xy[rows].astype(np.float64), self.settings.patch_px)
         scores = np.full((len(self._window), len(rows)), np.nan)
         for number, (gray, pose) in enumerate(self._window):
             local = se3.transform(se3.inverse(pose), world)
             ahead = local[:, 2] > 0.1
             pixels = np.full((len(rows), 2), -1e3)
             pixels[ahead] = state.camera.distort_points(state.camera.project(local[ahead]))
-            scores[number] = zncc(own, patches(gray, pixels, self.settings.patch_px))
+            scores[number] = zncc(current, patches(gray, pixels, self.settings.patch_px))
         tested = np.isfinite(scores).any(axis=0)
         median = np.full(len(rows), -1.0)
         median[tested] = np.nanmedian(scores[:, tested], axis=0)
@@ -81,7 +81,7 @@ def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDAr
 
 def zncc(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zero-mean normalised cross-correlation ``[N]`` of patches ``[N, M]``; NaN where a patch is flat or missing."""
-    a, b = (each - each.mean(axis=1, keepdims=True) for each in (first, second))
+    a, b = (patch - patch.mean(axis=1, keepdims=True) for patch in (first, second))
     norm = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(norm > 1e-6, (a * b).sum(axis=1) / norm, np.nan))

@@ -65,7 +65,7 @@ def named(prefix: str, error: NDArray[np.float64], unit: str) -> dict[str, float
     return {f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}": value for name, value in statistics(error).items()}
 
 
-# The ATE alone: what a report takes thousands of times beside the whole evaluation of each run.
+# The ATE alone, which reports compute thousands of times.
 
 
 def ate_rmse_m(
@@ -94,7 +94,7 @@ def ate_rmse_m(
     return math.sqrt(float((left * left).sum()) / len(left))
 
 
-# The error of a camera that never moves: the reference below which an error says nothing.
+# The static-camera baseline: an error above it says nothing.
 
 
 def static_camera(ground_truth: Trajectory, stamps: ArrayLike | None = None, max_dt: float = 0.02) -> dict[str, float]:

@@ -70,27 +70,27 @@ def hints(
         One hint a fault, by `Hint.id`; none where the estimate is healthy, or where nothing explains why it is bad.
     """
     sim3 = get_protocol(protocol).alignment == "sim3"
-    found = _several_recordings(estimate, ground_truth, notes)
+    faults = _several_recordings(estimate, ground_truth, notes)
     truth = Track(ground_truth.timestamps, ground_truth.T_world_cam)
     inside = truth.covers(estimate.timestamps)
     if inside.sum() < MIN_POSES or np.abs(estimate.positions).max() > FARTHEST_M:
-        return tuple(found)
+        return tuple(faults)
     stamps, poses = estimate.timestamps[inside], estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
     motions = Motions(stamps, poses, truth)
     if (wrong := motions.wrong_convention(shift)) is not None:
         hint, poses = wrong
-        found.append(hint)
+        faults.append(hint)
         shift, left = _time_shift(stamps, poses, truth)
     if shift:
         late = _shift_hint(stamps, poses, truth, shift, left)
-        found += [late] if late else []
+        faults += [late] if late else []
         shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
     stamps, poses = stamps[covered] + shift, poses[covered]
     if not sim3 and left < MOSTLY:
-        found += _scale(stamps, poses, truth)
-    return (*found, *_below_noise(stamps, poses, truth))
+        faults += _scale(stamps, poses, truth)
+    return (*faults, *_below_noise(stamps, poses, truth))
 
 
 # -- several recordings --------------------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
     grid = stamps[0] + step * np.arange(-most, int(span / step) + most + 1)
     track = Track(stamps, poses)
-    own, known = (_displacements(each, grid, window) for each in (track, truth))
+    own, expected = (_displacements(one, grid, window) for one in (track, truth))
     at = most + np.flatnonzero(np.isfinite(own[most : len(own) - most, 0]))
     at = at[:: 1 + len(at) // 128]
     length = np.linalg.norm(own[at], axis=1)
@@ -143,7 +143,7 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     if len(at) < MIN_POSES:
         return 0.0, 1.0
     lags = np.arange(-most, most + 1)
-    lag = int(lags[np.argmin(_unexplained(own[at], known[at + lags[:, None]]))])
+    lag = int(lags[np.argmin(_unexplained(own[at], expected[at + lags[:, None]]))])
     coarse = lag * step
     fine = coarse + np.linspace(-1, 1, 9) * step
     begin, moved = grid[at], own[at]
@@ -153,8 +153,8 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     shift, left = float(fine[best]), float(near[best])
     if 0 < best < len(fine) - 1 and (bend := near[best - 1] - 2 * left + near[best + 1]) > 0:
         shift += float(0.5 * (near[best - 1] - near[best + 1]) / bend * (fine[1] - fine[0]))
-    itself = _displacements(track, begin[None] + shift, window)
-    visible = float(_unexplained(moved, itself)[0])  # what such a shift does to a path of this shape
+    shifted_self = _displacements(track, begin[None] + shift, window)
+    visible = float(_unexplained(moved, shifted_self)[0])  # what such a shift does to a path of this shape
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
 
@@ -215,7 +215,7 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
     moved, true = (_displacements(track, stamps, window) for track in (Track(stamps, poses), truth))
     both = np.isfinite(moved[:, 0]) & np.isfinite(true[:, 0])
-    varying, varied = (each[both] - each[both].mean(axis=0) for each in (moved, true))
+    varying, varied = (steps[both] - steps[both].mean(axis=0) for steps in (moved, true))
     steady = both.sum() < MIN_POSES or (varying**2).sum() < STEADY * (moved[both] ** 2).sum()
     if steady or _unexplained(varying, varied[None])[0] > MOSTLY:  # a steady motion fits many paths at some scale
         return []
@@ -240,7 +240,7 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     between = truth.at(stamps)
     nearest = truth.poses[truth.nearest(stamps)]
     fits = [fit(poses, true) for true in (between, nearest)]
-    error = min(each.sim3_m for each in fits)
+    error = min(one.sim3_m for one in fits)
     inside = (truth.stamps >= stamps[0]) & (truth.stamps <= stamps[-1])
     noise = _jitter(truth.positions[inside], 5) if truth.step < MEASURED_S else 0.0
     least = min(COPY_M if noise > NOISE_M else EXACT_M, COPY_SHARE * fits[0].extent_m)
@@ -362,7 +362,7 @@ class Fit:
 
 def fit(poses: Array, truth: Array) -> Fit:
     """How well the positions of poses ``[N, 4, 4]`` can be aligned with those of the true ones."""
-    own, true = (each[:, :3, 3] - each[:, :3, 3].mean(axis=0) for each in (poses, truth))
+    own, true = (matrices[:, :3, 3] - matrices[:, :3, 3].mean(axis=0) for matrices in (poses, truth))
     u, singular, vt = np.linalg.svd(true.T @ own / len(own))
     explained = singular[0] + singular[1] + np.sign(np.linalg.det(u) * np.linalg.det(vt)) * singular[2]
     size, extent = float((own**2).sum() / len(own)), float((true**2).sum() / len(own))
@@ -421,17 +421,17 @@ class Motions:
         if as_read < UNEXPLAINED or not np.isfinite(as_read):
             return None
         limit = min(EXPLAINED, as_read / CLEARLY, self._shifted(shift) if shift else np.inf)
-        found: list[tuple[float, HintId, Array, str]] = []
+        candidates: list[tuple[float, HintId, Array, str]] = []
         for name, axes, undo in _CONVENTIONS:
             poses = undo(self.poses)
             error, varies = self.compare(poses)
             if error < limit and varies > VARIES:
-                found.append((error, name, poses, axes))
-        if not found:
+                candidates.append((error, name, poses, axes))
+        if not candidates:
             return self._other_axes(as_read)
         true = self.truth.at(self.stamps)
-        misfit = [one[0] + fit(one[2], true).misfit for one in found]
-        best = [one for one, score in zip(found, misfit, strict=True) if score < min(misfit) + TIE]
+        misfit = [one[0] + fit(one[2], true).misfit for one in candidates]
+        best = [one for one, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
         error, name, poses, axes = best[0]
         others = [_CURES[one[1]][0].format(axes=one[3]) for one in best[1:]]
         return self._hint(name, as_read, error, axes, others), poses
@@ -494,20 +494,22 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
     if len(true) < MIN_POSES:
         return np.inf, 0.0
-    found = []
+    scores = []
     angle = np.rad2deg(se3.rotation_angle(true))
     moving = angle >= np.median(angle)
     if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
         off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
-        found.append((float(np.median(off)) / turned, _correlation(_axis(motions), _axis(true))))
+        scores.append((float(np.median(off)) / turned, _correlation(_axis(motions), _axis(true))))
     length = np.linalg.norm(true[:, :3, 3], axis=1)
     moving = length >= np.median(length)
     moved, estimated = true[moving, :3, 3], motions[moving, :3, 3]
-    way = float(np.median(np.linalg.norm(estimated, axis=1)))
-    if (true_way := float(np.median(length[moving]))) > MOVES_M:
-        off = np.linalg.norm(estimated * (true_way / way) - moved, axis=1) if way > 0 else length[moving]
-        found.append((float(np.median(off)) / true_way, _correlation(motions[:, :3, 3], true[:, :3, 3])))
-    return max((error for error, _ in found), default=np.inf), max((good for _, good in found), default=0.0)
+    own_length = float(np.median(np.linalg.norm(estimated, axis=1)))
+    if (true_length := float(np.median(length[moving]))) > MOVES_M:
+        off = (
+            np.linalg.norm(estimated * (true_length / own_length) - moved, axis=1) if own_length > 0 else length[moving]
+        )
+        scores.append((float(np.median(off)) / true_length, _correlation(motions[:, :3, 3], true[:, :3, 3])))
+    return max((error for error, _ in scores), default=np.inf), max((good for _, good in scores), default=0.0)
 
 
 def _reordered(poses: Array) -> Array:
@@ -566,7 +568,7 @@ def _correlation(first: Array, second: Array) -> float:
     """Correlation of vectors ``[N, 3]`` about their means, jumps left out; 0 where one does not vary."""
     length = np.linalg.norm(first, axis=1)
     usual = length <= 6 * np.median(length)
-    first, second = (each[usual] - each[usual].mean(axis=0) for each in (first, second))
+    first, second = (vectors[usual] - vectors[usual].mean(axis=0) for vectors in (first, second))
     sizes = np.linalg.norm(first), np.linalg.norm(second)
     if sizes[0] <= 0.1 * np.linalg.norm(length[usual]) or not sizes[1] > 0:
         return 0.0

@@ -107,7 +107,7 @@ STAMP_TOLERANCE = 1e-3
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
-    """Which input frames ``[N]`` have a pose in the estimate; nobody may write into it.
+    """Which input frames ``[N]`` have a pose in the estimate; read-only.
 
     A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some systems write the depth
     image's stamp, and files round.
@@ -152,7 +152,7 @@ def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:
     Frames before the first tracked one take its pose.
 
     Raises:
-        EvaluationError: Nothing was tracked, or the estimate does not belong to the frames.
+        EvaluationError: Nothing was tracked, or the estimate does not belong to the input frames.
     """
     if not len(estimate):
         raise EvaluationError("no frame was tracked, so there is no pose to hold")

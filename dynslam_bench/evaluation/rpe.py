@@ -67,7 +67,7 @@ def tum_relative_errors(
 
 @lru_cache(maxsize=8)
 def _true_steps_back(ground_truth: bytes, pairs: bytes) -> Array:
-    """Inverse steps ``[P, 4, 4]`` between true poses, once for all runs on one sequence; nobody may write into it."""
+    """Inverse steps ``[P, 4, 4]`` between true poses, once for all runs on one sequence; read-only."""
     steps = _relative(np.frombuffer(ground_truth).reshape(-1, 4, 4), np.frombuffer(pairs, np.intp).reshape(-1, 2))
     back = se3.inverse(steps)
     back.flags.writeable = False
@@ -76,7 +76,7 @@ def _true_steps_back(ground_truth: bytes, pairs: bytes) -> Array:
 
 @lru_cache(maxsize=256)
 def _covered(estimate: bytes, ground_truth: bytes) -> NDArray[np.bool_]:
-    """Which stamps have a true pose near enough; once for equal stamps, so nobody may write into it."""
+    """Which stamps have a true pose near enough; once for equal stamps; read-only."""
     truth = np.frombuffer(ground_truth)
     intervals = np.diff(truth)
     tolerance = 2 * float(np.median(intervals)) if len(intervals) else 0.0
@@ -134,7 +134,7 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
 
 
 def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
-    """The way travelled up to every pose ``[N]``, in the unit of the delta."""
+    """Path length up to every pose ``[N]``, in the unit of the delta."""
     if spec.unit == "f":
         return np.arange(len(poses), dtype=np.float64)
     if spec.unit == "s":
@@ -165,7 +165,7 @@ def closest(values: Array, targets: Array) -> Index:
         targets: ``[M]``.
 
     Returns:
-        ``[M]``; nobody may write into it: all runs on one sequence share what is found for their stamps.
+        ``[M]``; read-only, as equal stamps share one result.
     """
     return _closest(np.asarray(values, np.float64).tobytes(), np.asarray(targets, np.float64).tobytes())
 
@@ -219,7 +219,7 @@ def _thin(pairs: Index, most: int) -> Index:
 
 
 def _consecutive(stamps: Array, poses: Array, spec: RPESpec) -> Index:
-    """Non-overlapping pairs: a new one begins where the way since the last reaches delta."""
+    """Non-overlapping pairs: a new one begins where the path since the last reaches delta."""
     if spec.unit == "f":
         starts = np.arange(0, len(poses), max(1, round(spec.delta)))
         return np.stack([starts[:-1], starts[1:]], axis=1).astype(np.intp)
@@ -241,14 +241,14 @@ def _all_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
         start = np.arange(max(0, n - delta))
         return np.stack([start, start + delta], axis=1).astype(np.intp)
     tolerance = spec.delta * spec.tolerance
-    if spec.unit in ("deg", "rad"):  # the angle between the two poses, not the way between them
+    if spec.unit in ("deg", "rad"):  # the angle between the two poses, not the path between them
         factor = 180 / np.pi if spec.unit == "deg" else 1.0
-        found = []
+        blocks = []
         for i in range(n - 1):
             angle = se3.rotation_angle(se3.inverse(poses[i]) @ poses[i + 1 :]) * factor
             j = np.flatnonzero((angle >= spec.delta - tolerance) & (angle <= spec.delta + tolerance)) + i + 1
-            found.append(np.stack([np.full(len(j), i), j], axis=1))
-        return np.concatenate(found).astype(np.intp) if found else np.zeros((0, 2), dtype=np.intp)
+            blocks.append(np.stack([np.full(len(j), i), j], axis=1))
+        return np.concatenate(blocks).astype(np.intp) if blocks else np.zeros((0, 2), dtype=np.intp)
     index = path_index(stamps, poses, spec)
     pairs = []
     for i in range(n - 1):
@@ -321,18 +321,12 @@ def relative_metrics(
     metrics: dict[str, float] = {}
     counts: dict[str, int] = {}
     for spec in protocol.rpe:
-        errors: RelativeErrors
         stamps = estimate.timestamps
         if spec.pairs in ("tum-fixed", "tum-random"):
             errors = tum_relative_errors(estimate, ground_truth, spec, scale=similarity.scale)
         else:
             stamps = stamps[association.estimate]
-            errors = evo_relative_errors(
-                stamps,
-                aligned,
-                ground_truth.T_world_cam[association.ground_truth],
-                spec,
-            )
+            errors = evo_relative_errors(stamps, aligned, ground_truth.T_world_cam[association.ground_truth], spec)
         counts[spec.key] = len(errors.pairs)
         metrics.update(_statistics(spec, errors, stamps))
     return metrics, counts
@@ -363,6 +357,6 @@ def segment_metrics(
 def _statistics(spec: RPESpec, errors: RelativeErrors, stamps: np.ndarray) -> dict[str, float]:
     """The statistics of a relative error; a sum of squared rates means nothing and is left out."""
     times = np.diff(stamps[errors.pairs], axis=1)[:, 0] if spec.rate else np.ones(len(errors.pairs))
-    found = named(f"rpe_{spec.key}_trans", errors.translation_m / times, spec.unit_of("trans"))
-    found |= named(f"rpe_{spec.key}_rot", errors.rotation_deg / times, spec.unit_of("rot"))
-    return {name: value for name, value in found.items() if not (spec.rate and "_sse_" in name)}
+    metrics = named(f"rpe_{spec.key}_trans", errors.translation_m / times, spec.unit_of("trans"))
+    metrics |= named(f"rpe_{spec.key}_rot", errors.rotation_deg / times, spec.unit_of("rot"))
+    return {name: value for name, value in metrics.items() if not (spec.rate and "_sse_" in name)}

@@ -1,13 +1,12 @@
-"""Dense DAISY Filter Flow: superpixel labels, guided-filter aggregation, winner takes all, and the way back.
+"""Dense DAISY Filter Flow: superpixel labels, guided-filter aggregation, winner takes all, forward-backward check.
 
 1. Superpixels; one label search per superpixel at its centre, with propagation between adjacent ones (as in `sparse`).
-2. Labels are refined photometrically (`refinement`): they are similarities, so that a label is sub-pixel exact over its
-   region.
+2. Labels are refined photometrically (`refinement`). A label is a similarity and thus sub-pixel exact over its region.
 3. For each superpixel, its own label and its neighbours' are tried on every pixel of its bounding box extended by twice
-   the filter's radius; the raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel keeps the winner
-   (Eq. 3). This works at half resolution: the orientation maps are no finer.
-4. A pixel is valid if the flow of the other direction leads back; the others get an affine motion fitted to consistent
-   regions around them, but stay marked as not valid.
+   the filter's radius. The raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel takes the label of
+   the lowest cost (Eq. 3). This works at half resolution: the orientation maps are no finer.
+4. A pixel is valid if the flow of the other direction leads back. The others take an affine motion that is fitted to
+   the consistent regions around them, but stay marked as not valid.
 """
 
 from __future__ import annotations
@@ -19,14 +18,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts.flow import FlowResult
-from dynslam_bench.flow.degenerate import STATS_NAMES, flow_stats, is_degenerate, request, usable_points
+from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, is_degenerate, usable_points
 from dynslam_bench.flow.dense_kernels import Superpixels, aggregate_and_choose, spread_labels, superpixels
-from dynslam_bench.flow.matching_cost import side, tables_for
+from dynslam_bench.flow.label_search import PROPAGATING
+from dynslam_bench.flow.matching_cost import MAX_COST, side, tables_for
 from dynslam_bench.flow.orientation_maps import OrientationMaps
 from dynslam_bench.flow.propagation import label_turns, transported_labels
 from dynslam_bench.flow.refinement import BORDER
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
 from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
+
+NEIGHBOURS = 9
+"""Reliable regions that a regional motion is fitted to."""
+SHARE = 0.5
+"""A region is reliable if this share of its pixels is consistent."""
+SMOOTH_PX = 3.0
+"""Consistent pixels this close to the fitted motion take it: a similarity a region cannot follow a slanted plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +42,10 @@ class DenseFlow:
 
     Attributes:
         flow: float32 ``[H, W, 2]``, displacement (x, y) in pixels.
-        valid: bool ``[H, W]``, consistent with the flow of the other direction (all True where that is not checked).
+        valid: bool ``[H, W]``, consistent with the flow of the other direction (all True without that check).
         cost: float32 ``[H, W]``, aggregated matching cost as a share of the largest possible.
         stats: Diagnostics.
-        back: float32 ``[H, W, 2]``, flow of every target pixel to the reference; None where it was not computed.
+        back: float32 ``[H, W, 2]``, flow of every target pixel to the reference; None without the check.
     """
 
     flow: NDArray[np.float32]
@@ -49,111 +56,145 @@ class DenseFlow:
 
 
 class DenseDaisyFlow:
-    """Dense DAISY Filter Flow on the processor.
+    """The paper's flow (Eq. 1-3 over every pixel), read at points; see `contracts.flow.FlowEstimator`.
+
+    The field is read at the pixel that contains a point and not interpolated: at the border of a moving object the mean
+    of two motions is wrong. A point is valid if its pixel is consistent (`consistency_px`), if its forward-backward
+    error is at most `forward_backward_px`, and if its aggregated cost is low. On the processor, whatever the device.
 
     Args:
-        settings: How; `FlowSettings.dense_*` are its own.
+        settings: Search, aggregation and checks.
         threads: Over which regions are divided; the result does not depend on it.
     """
 
-    def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
-        self._sparse = SparseDaisyFlow(threads=threads)
-        self.configure(settings or FlowSettings())
+    stats_names = STATS_NAMES
 
-    def configure(self, settings: FlowSettings) -> None:
-        """Work by these settings from the next pair on."""
+    def __init__(self, settings: DenseFlowSettings | None = None, *, threads: int = 1) -> None:
+        self._sparse = SparseDaisyFlow(threads=threads)
+        self.configure(settings or DenseFlowSettings())
+
+    def configure(self, settings: DenseFlowSettings) -> None:
+        """Use other settings from the next pair on."""
         self.settings = settings
-        self._sparse.settings = settings.model_copy(
-            update={
-                "support": 9,
-                "support_spacing_px": max(1, settings.dense_superpixel_px // 2),
-                "range_px": settings.dense_range_px,
-                "budget": settings.dense_budget,
-                "sweeps": settings.dense_sweeps,
-            }
-        )
+        common = {name: getattr(settings, name) for name in DaisySettings.model_fields}
+        spacing = max(1, settings.superpixel_px // 2)
+        self._sparse.configure(FlowSettings(**common, support=9, support_spacing_px=spacing))
 
     def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
         """The orientation maps of a uint8 ``[H, W]`` image."""
         return self._sparse.prepare(gray)
 
-    def flow(self, reference: OrientationMaps, target: OrientationMaps, *, seed: int = 0) -> DenseFlow:
-        """Flow from the reference to the target; see `DenseFlow`.
+    def track(
+        self,
+        reference: OrientationMaps,
+        target: OrientationMaps,
+        points: NDArray[np.float32],
+        *,
+        guess: NDArray[np.float32] | None = None,
+        seed: int = 0,
+    ) -> FlowResult:
+        """Find points of the reference in the target; see `FlowEstimator.track`. The guess is not used."""
+        cleaned = clean_points(reference.gray, target.gray, points)
+        if isinstance(cleaned, FlowResult):
+            return cleaned
+        clean, usable = cleaned
+        dense = self.flow(reference, target, seed=seed)
+        column, row = _pixels(clean)
+        xy = (clean + dense.flow[row, column]).astype(np.float32)
+        cost = dense.cost[row, column]
+        valid = usable & dense.valid[row, column] & usable_points(xy, target.gray.shape)
+        valid &= cost < MAX_COST
+        if self.settings.forward_backward_px > 0 and dense.back is not None:
+            ends = np.where(valid[:, None], xy, clean)
+            column, row = _pixels(ends)
+            error = np.linalg.norm(ends + dense.back[row, column] - clean, axis=1)
+            valid &= error <= self.settings.forward_backward_px
+        stats = flow_stats(len(clean), int(valid.sum()), int(dense.stats["evaluations"]))
+        return FlowResult(xy, valid, cost, stats)
 
-        Identical images and images without texture give zero flow that is not valid, as in the sparse mode; the stat
-        ``degenerate`` is 1 then.
+    def flow(self, reference: OrientationMaps, target: OrientationMaps, *, seed: int = 0) -> DenseFlow:
+        """Flow of every pixel from the reference to the target.
+
+        Degenerate images give zero flow that is not valid, as in the sparse flow; the stat ``degenerate`` is 1 then.
         """
-        height, width = reference.gray.shape
+        shape = reference.gray.shape
         if is_degenerate(reference.gray, target.gray):
-            shape = (height, width)
-            return DenseFlow(
-                np.zeros((*shape, 2), np.float32),
-                np.zeros(shape, np.bool_),
-                np.zeros(shape, np.float32),
-                {"evaluations": 0.0, "valid": 0.0, "degenerate": 1.0},
-            )
-        forward = self._one_way(reference, target, seed)
-        valid = np.ones((height, width), dtype=np.bool_)
-        rounds, back = [forward], None
-        if self.settings.dense_forward_backward_px > 0:
-            backward = self._one_way(target, reference, seed + 1)
-            rounds = [forward, backward]
-            tolerance = self.settings.dense_forward_backward_px
-            flows = forward.flow(), backward.flow()
-            if self.settings.dense_second_round:
-                forward.again(consistent(*flows, tolerance))
-                backward.again(consistent(*flows[::-1], tolerance))
-                flows = forward.flow(), backward.flow()
-            valid, back = consistent(*flows, tolerance), flows[1]
-            fitted = fit_regional_motion(flows[0], valid, forward.regions, forward.half)
-            flow = flows[0] if fitted is None else fill_and_smooth(flows[0], valid, fitted)
-        else:
-            flow = forward.flow()
-        evaluations = float(sum(r.evaluations for r in rounds))
-        stats = {"evaluations": evaluations, "valid": float(valid.sum()), "degenerate": 0.0}
+            stats = {"evaluations": 0.0, "valid": 0.0, "degenerate": 1.0}
+            no_cost = np.zeros(shape, np.float32)
+            return DenseFlow(np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_), no_cost, stats)
+        forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
+        flow, valid, back = forward.flow(), np.ones(shape, dtype=np.bool_), None
+        evaluations, tolerance = forward.evaluations, self.settings.consistency_px
+        if tolerance > 0:
+            backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
+            back = backward.flow()
+            if self.settings.second_round:
+                forward.try_regional_motion(consistent(flow, back, tolerance))
+                backward.try_regional_motion(consistent(back, flow, tolerance))
+                flow, back = forward.flow(), backward.flow()
+            valid = consistent(flow, back, tolerance)
+            fitted = fit_regional_motion(flow, valid, forward.regions, forward.half)
+            if fitted is not None:
+                flow = fill_and_smooth(flow, valid, fitted)
+            evaluations = forward.evaluations + backward.evaluations
+        stats = {"evaluations": float(evaluations), "valid": float(valid.sum()), "degenerate": 0.0}
         return DenseFlow(flow, valid, forward.cost(), stats, back)
 
-    def _one_way(self, reference: OrientationMaps, target: OrientationMaps, seed: int) -> _OneWay:
-        one_way = _OneWay(self.settings, self._sparse, reference, target)
-        one_way.found(seed)
-        return one_way
+
+def _pixels(points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Column and row of the pixels that contain points inside an image."""
+    column, row = np.rint(points).astype(np.intp).T
+    return column, row
 
 
-class _OneWay:
-    """The labels of one direction while they are improved; the sizes are those of the half-resolution image."""
+class _RegionLabels:
+    """The labels of one direction; sizes are those of the half-resolution image.
+
+    A label is searched for each region; the region's pixels take the best of it and its neighbours'.
+    """
 
     def __init__(
-        self, settings: FlowSettings, sparse: SparseDaisyFlow, reference: OrientationMaps, target: OrientationMaps
+        self,
+        settings: DenseFlowSettings,
+        sparse: SparseDaisyFlow,
+        reference: OrientationMaps,
+        target: OrientationMaps,
+        seed: int,
     ) -> None:
         self.settings, self._sparse = settings, sparse
-        self._pair = Pair(reference, target, tables_for(reference.gray.shape, sparse.settings))
+        shape = reference.gray.shape
+        self._pair = Pair(reference, target, tables_for(shape, sparse.settings))
         self.half = np.ascontiguousarray(reference.framed_half[BORDER:-BORDER, BORDER:-BORDER])
-        self.regions = superpixels(self.half, max(2, settings.dense_superpixel_px // 2))
+        self.regions = superpixels(self.half, max(2, settings.superpixel_px // 2))
         self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
         self.evaluations = 0
-        self._tables = tables_for(reference.gray.shape, settings.model_copy(update={"support": 1}))
+        self._tables = tables_for(shape, sparse.settings.model_copy(update={"support": 1}))
         self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
+        self._search(seed)
 
-    def found(self, seed: int) -> None:
-        """Search a label for each region and let its pixels choose among it and the neighbours'."""
-        sparse, pair = self._sparse, self._pair
-        near = sparse.nearest(self.centres)
-        neighbours = sparse.neighbours(self.centres)
-        described = sparse.describe(pair.reference, self.centres, pair.tables)
+    def _search(self, seed: int) -> None:
+        sparse, pair, centres = self._sparse, self._pair, self.centres
+        neighbours = sparse.nearest(centres)
+        described = sparse.describe(pair.reference, centres, pair.tables)
         state = sparse.search(described, pair, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
         if self.settings.refinement == "lucas-kanade":
-            correlation = sparse.refine(self.centres, labels, pair)
-            if neighbours.shape[1] > 1:
-                sparse.second_opinion(self.centres, labels, correlation, neighbours, pair)
+            correlation = sparse.refine(centres, labels, pair)
+            if self.settings.search in PROPAGATING and neighbours.shape[1] > 1:
+                sparse.neighbour_consensus(centres, labels, correlation, neighbours, pair)
         elif self.settings.refinement == "parabola":
             sparse.parabola(described, labels, pair, state.used)
         self.evaluations += int(state.used.sum())
-        self._choose(self._candidates(labels, near))
+        near = np.ascontiguousarray(neighbours[:, : self.settings.candidates - 1])
+        transported = np.empty((*near.shape, 4), dtype=np.float32)
+        extent, no_motion = np.full((len(labels), 4), 8.0, dtype=np.float32), np.empty((0, 4), dtype=np.float32)
+        sources = (centres, labels, label_turns(labels), near, no_motion)
+        transported_labels(0, len(labels), *sources, -extent, extent, transported)
+        self._choose(np.concatenate([labels[:, None], transported], axis=1))
 
-    def again(self, valid: NDArray[np.bool_]) -> None:
-        """Try, on every region, the motion that consistent regions around it suggest, as it is and refined."""
+    def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
+        """Try, on every region, the motion of the consistent regions around it, as fitted and refined."""
         fitted = fit_regional_motion(self.flow(), valid, self.regions, self.half)
         if fitted is None:
             return
@@ -166,39 +207,32 @@ class _OneWay:
         self._choose(np.stack([suggested, refined], axis=1))
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
+        """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""
         evaluations = np.zeros(len(self.centres), dtype=np.int64)
-        shape = (self.regions.members, self.regions.starts, self.centres, candidates)
+        regions = (self.regions.members, self.regions.starts, self.centres, candidates)
         sides = (side(self._pair.reference), side(self._pair.target), self._tables)
-        guide, radius = self.half.astype(np.float32) / np.float32(255), self.settings.dense_filter_radius_px
-        smoothing = (guide, max(1, radius // 2), np.float32(self.settings.dense_filter_epsilon))
+        guide, radius = self.half.astype(np.float32) / np.float32(255), max(1, self.settings.filter_radius_px // 2)
+        smoothing = (guide, radius, np.float32(self.settings.filter_epsilon))
         chosen = (self._best, self._winner, evaluations)
-        self._sparse.stripes(aggregate_and_choose, len(self.centres), *shape, *sides, *smoothing, *chosen)
+        self._sparse.workers.run(aggregate_and_choose, len(self.centres), *regions, *sides, *smoothing, *chosen)
         self.evaluations += int(evaluations.sum())
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
         height, width = self._pair.reference.gray.shape
         flow = np.empty((height, width, 2), dtype=np.float32)
-        self._sparse.stripes(spread_labels, height, self._winner, self.regions.labels, self.centres, flow)
+        self._sparse.workers.run(spread_labels, height, self._winner, self.regions.labels, self.centres, flow)
         return flow
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        height, width = self._pair.reference.gray.shape
-        y = np.minimum(np.arange(height) // 2, self.half.shape[0] - 1)
-        x = np.minimum(np.arange(width) // 2, self.half.shape[1] - 1)
-        share = self._best[np.ix_(y, x)] / np.float32(self._tables.ceiling)
-        return np.asarray(np.clip(share, 0, 1), dtype=np.float32)  # the filter may overshoot
+        share = self._best[_half_pixels(self._pair.reference.gray.shape, self.half.shape)]
+        return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)  # may overshoot
 
-    def _candidates(self, labels: NDArray[np.float32], neighbours: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Each region's own label first, then its neighbours' as seen from its centre: float32 ``[K, C, 4]``."""
-        n, most = len(labels), min(self.settings.dense_candidates - 1, neighbours.shape[1])
-        seen = np.empty((n, most, 4), dtype=np.float32)
-        extent = np.full((n, 4), 8.0, dtype=np.float32)
-        near = np.ascontiguousarray(neighbours[:, :most])
-        no_motion = np.empty((0, 4), dtype=np.float32)
-        transported_labels(0, n, self.centres, labels, label_turns(labels), near, no_motion, -extent, extent, seen)
-        return np.concatenate([labels[:, None], seen], axis=1)
+
+def _half_pixels(shape: tuple[int, ...], half: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
+    """Index of the half-resolution pixel of every full-image pixel."""
+    return np.ix_(*(np.minimum(np.arange(full) // 2, size - 1) for full, size in zip(shape, half, strict=True)))
 
 
 def consistent(forward: NDArray[np.float32], backward: NDArray[np.float32], tolerance: float) -> NDArray[np.bool_]:
@@ -209,87 +243,6 @@ def consistent(forward: NDArray[np.float32], backward: NDArray[np.float32], tole
     inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
     back = backward[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
     return np.asarray(inside & (np.hypot(*np.moveaxis(forward + back, -1, 0)) <= tolerance), dtype=np.bool_)
-
-
-# Dense DAISY Filter Flow behind the interface of all flows: the field of every pixel, read at the points.
-
-
-class DensePointFlow:
-    """The paper's flow (Eq. 1-3 over every pixel), read at the points; see `contracts.flow.FlowEstimator`.
-
-    The field is read at the pixel that a point lies in, never between two: across the border of a moving thing a mean
-    of two motions is nobody's. A point is valid if its pixel is (`dense_forward_backward_px`), if its way back ends
-    within `forward_backward_px`, and if its aggregated cost is below `max_cost`. On the processor, whatever the device.
-
-    Args:
-        settings: How.
-        threads: Over which regions are divided; the result does not depend on it.
-    """
-
-    stats_names = STATS_NAMES
-
-    def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
-        self._dense = DenseDaisyFlow(settings or FlowSettings(mode="dense"), threads=threads)
-
-    @property
-    def settings(self) -> FlowSettings:
-        """The settings in force."""
-        return self._dense.settings
-
-    @settings.setter
-    def settings(self, settings: FlowSettings) -> None:
-        self.configure(settings)
-
-    def configure(self, settings: FlowSettings) -> None:
-        """Work by these settings from the next pair on."""
-        self._dense.configure(settings)
-
-    def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
-        """The orientation maps of a uint8 ``[H, W]`` image."""
-        return self._dense.prepare(gray)
-
-    def track(
-        self,
-        reference: OrientationMaps,
-        target: OrientationMaps,
-        points: NDArray[np.float32],
-        *,
-        guess: NDArray[np.float32] | None = None,
-        seed: int = 0,
-    ) -> FlowResult:
-        """Find points of the reference in the target; see `FlowEstimator.track`. The guess is not used."""
-        asked = request(reference.gray, target.gray, points)
-        if isinstance(asked, FlowResult):
-            return asked
-        clean, usable = asked
-        dense = self._dense.flow(reference, target, seed=seed)
-        column, row = _pixels(clean)
-        xy = (clean + dense.flow[row, column]).astype(np.float32)
-        cost = dense.cost[row, column]
-        valid = usable & dense.valid[row, column] & usable_points(xy, target.gray.shape)
-        valid &= cost < self.settings.max_cost
-        if self.settings.forward_backward_px > 0 and dense.back is not None:
-            ends = np.where(valid[:, None], xy, clean)
-            column, row = _pixels(ends)
-            distance = np.linalg.norm(ends + dense.back[row, column] - clean, axis=1)
-            valid &= distance <= self.settings.forward_backward_px
-        stats = flow_stats(len(clean), int(valid.sum()), int(dense.stats["evaluations"]))
-        return FlowResult(xy, valid, cost, stats)
-
-
-def _pixels(points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Column and row of the pixels that points inside an image lie in."""
-    column, row = np.rint(points).astype(np.intp).T
-    return column, row
-
-
-# What consistent regions say about the regions around them: affine motions, fitted and read at every pixel.
-
-NEIGHBOURS = 9
-SHARE = 0.5
-"""A region is reliable if this share of its pixels is consistent."""
-SMOOTH_PX = 3.0
-"""Consistent pixels this close to the fitted motion take it: a similarity a region cannot follow a slanted plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,9 +284,8 @@ def fit_regional_motion(
     Returns:
         The motions; None where fewer than three regions are reliable.
     """
-    height, width = valid.shape
-    y, x = np.minimum(np.arange(height) // 2, guide.shape[0] - 1), np.minimum(np.arange(width) // 2, guide.shape[1] - 1)
-    region = regions.labels[np.ix_(y, x)].ravel().astype(np.int64)
+    width = valid.shape[1]
+    region = regions.labels[_half_pixels(valid.shape, guide.shape)].ravel().astype(np.int64)
     count = len(regions.centres)
     good = valid.ravel()
     pixels = np.maximum(np.bincount(region, minlength=count), 1)
@@ -341,11 +293,11 @@ def fit_regional_motion(
     reliable = np.flatnonzero((consistent >= SHARE * pixels) & (consistent > 0))
     if len(reliable) < 3:
         return None
-    kept = np.flatnonzero(good)
+    rows = np.flatnonzero(good)
     mean = np.empty((count, 4))  # position and flow of each region's consistent pixels
-    columns = (kept % width, kept // width, *flow.reshape(-1, 2)[kept].T)
+    columns = (rows % width, rows // width, *flow.reshape(-1, 2)[rows].T)
     for column, values in enumerate(columns):
-        mean[:, column] = np.bincount(region[kept], weights=values, minlength=count) / np.maximum(consistent, 1)
+        mean[:, column] = np.bincount(region[rows], weights=values, minlength=count) / np.maximum(consistent, 1)
     centres = regions.centres.astype(np.float64) * 2 + 0.5
     total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
     grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)

@@ -1,4 +1,4 @@
-"""Superpixels by k-means in position and grey level from a regular grid on (SLIC, Achanta et al. 2012, simplified)."""
+"""Kernels of the dense flow: superpixels, guided filter (Eq. 2), raw costs (Eq. 1) and winner takes all (Eq. 3)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs
 
 @dataclass(frozen=True, eq=False)
 class Superpixels:
-    """A division of an image into K regions.
+    """A division of an image into K regions, by simplified SLIC (Achanta et al. 2012).
 
     Attributes:
         labels: int32 ``[H, W]``, region of every pixel.
@@ -92,14 +92,11 @@ def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, itera
                     centres[k, j] = sums[k, j] / sums[k, 3]
 
 
-# The guided filter (He, Sun, Tang 2010) that aggregates matching costs: Eq. 2.
-
-
 @kernel
 def filter_patch(
     guide: Floats, values: Floats, height: int, width: int, radius: int, epsilon: Scalar, work: Floats, out: Floats
 ) -> None:
-    """Edge-preserving average of `values` that follows the edges of `guide`.
+    """The guided filter (He, Sun, Tang 2010): an average of `values` that preserves the edges of `guide`.
 
     Within each ``(2 radius + 1)**2`` window (clipped at the image's edge) the output is a linear function of the guide;
     overlapping windows are averaged.
@@ -163,8 +160,6 @@ def box_mean(values: Floats, height: int, width: int, radius: int, line: Floats,
             out[y * width + x] = total / (count * columns)
 
 
-# Aggregation and choice of labels: raw cost (Eq. 1), guided filter (Eq. 2), winner takes all (Eq. 3), compiled.
-
 Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 """Displacement, log2 of the scale, rotation."""
 
@@ -184,9 +179,9 @@ def aggregate_and_choose(
         starts: `Superpixels.starts`.
         centres: float32 ``[K, 2]``, full-image pixels.
         candidates: float32 ``[K, C, 4]``, labels around the centres; NaN means none.
-        reference: `cost.Side`.
-        target: `cost.Side`.
-        tables: `cost.CostTables` without support.
+        reference: `matching_cost.Side`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables` without support.
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
         radius: Of the guided filter, half-resolution pixels.
         epsilon: Of the guided filter.
@@ -233,14 +228,14 @@ def aggregate_and_choose(
 
 
 @inlined
-def patch_around(members: Longs, rows: int, columns: int, room: int) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the box around pixels, with `room` on every side as far as the image goes."""
+def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the box around pixels, with a margin, clipped at the image's edge."""
     top, bottom, left, right = rows, -1, columns, -1
     for member in members:
         y, x = member // columns, member % columns
         top, bottom, left, right = min(top, y), max(bottom, y), min(left, x), max(right, x)
-    top, left = max(top - room, 0), max(left - room, 0)
-    bottom, right = min(bottom + room, rows - 1), min(right + room, columns - 1)
+    top, left = max(top - margin, 0), max(left - margin, 0)
+    bottom, right = min(bottom + margin, rows - 1), min(right + margin, columns - 1)
     return top, left, bottom - top + 1, right - left + 1
 
 

@@ -1,4 +1,4 @@
-"""Where a DAISY descriptor samples the orientation maps, for every scale and rotation a label can name.
+"""The DAISY descriptor's sampling pattern for every quantised label, and the arrangement of the orientation maps.
 
 The layout is DAISY Filter Flow's: radius 16 px, two rings of eight histograms around a centre, eight bins each:
 (2 * 8 + 1) * 8 = 136 numbers. The Gaussian of ring r has sigma (r + 1) * 16 / 4 = 4, 8 px; the centre shares ring 0's.
@@ -84,9 +84,6 @@ def sampling_table() -> SamplingTable:
     return SamplingTable(np.rint(points * SUBPIXEL).astype(np.int32), np.asarray(levels, dtype=np.int32))
 
 
-# Where the levels of the orientation maps lie in one flat array.
-
-
 class MapGeometry(NamedTuple):
     """Where each level lies in the flat histogram array.
 
@@ -125,10 +122,4 @@ def map_geometry(height: int, width: int) -> MapGeometry:
         shift.append(int(np.log2(step * SUBPIXEL)))
         bias.append(SUBPIXEL // 2 + margin * step * SUBPIXEL)
         total += (rows + 2 * margin) * (columns + 2 * margin)
-    return MapGeometry(
-        np.asarray(base, dtype=np.int64),
-        np.asarray(stride, dtype=np.int64),
-        np.asarray(shift, dtype=np.int64),
-        np.asarray(bias, dtype=np.int64),
-        total,
-    )
+    return MapGeometry(*(np.asarray(column, dtype=np.int64) for column in (base, stride, shift, bias)), total)

@@ -23,12 +23,23 @@ from dynslam_bench.flow.orientation_maps import OrientationMaps
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, descriptor_sum
 
+Term = tuple[float, float]
+"""Weight and limit of a term of Eq. 1."""
+
 OUTSIDE = 1 << 20
 """Cost of a label that leaves the target image."""
+MAX_COST = 0.75
+"""Share of the largest cost above which a point is not valid."""
+TRUNCATION = 0.882
+"""t of Eq. 1: largest L1 distance of one histogram of unit norm (not stated in the paper)."""
+INTENSITY: Term = (55.0, 7 / 255)
+"""alpha and t1 of Eq. 1, for images in [0, 1] (not stated in the paper)."""
+GRADIENT: Term = (190.0, 2 / 255)
+"""beta and t2 of Eq. 1, likewise."""
 
 
 class CostTables(NamedTuple):
-    """Everything the cost needs beside the images.
+    """Tables of the cost that depend on the image size and the weights only.
 
     Attributes:
         samples: int32 ``[SCALES, ROTATIONS, 4, 17]``, byte offset of each histogram from the centre's cell, for the
@@ -76,7 +87,7 @@ class Reference(NamedTuple):
 
 
 class MatchingCosts(NamedTuple):
-    """What the searches compute costs from: points, the image they are sought in, tables."""
+    """Arguments of the cost: points, target image, tables."""
 
     reference: Reference
     target: Side
@@ -89,33 +100,26 @@ def side(maps: OrientationMaps) -> Side:
 
 
 def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
-    """The tables of an image's shape ``(H, W)`` under the settings' terms and weights of Eq. 1."""
-    height, width = shape[:2]
-    alpha, beta = (settings.intensity_weight, settings.gradient_weight) if settings.terms == 3 else (0.0, 0.0)
-    intensity, gradient = (alpha, settings.intensity_limit), (beta, settings.gradient_limit)
-    support = (settings.support, settings.support_spacing_px)
-    return cost_tables(height, width, settings.truncation, intensity, gradient, support)
-
-
-Term = tuple[float, float]
-"""Weight and limit of a term of Eq. 1."""
+    """The tables of an image's shape ``(H, W)`` under the settings' terms and support of Eq. 1."""
+    terms = (INTENSITY, GRADIENT) if settings.terms == 3 else ((0.0, 0.0), (0.0, 0.0))
+    return cost_tables(shape[0], shape[1], *terms, settings.support, settings.support_spacing_px)
 
 
 @lru_cache(maxsize=32)
 def cost_tables(
-    height: int, width: int, truncation: float, grey_level: Term, slope: Term, around: tuple[int, int]
+    height: int, width: int, grey_level: Term, slope: Term, support: int = 1, spacing: int = 4
 ) -> CostTables:
     """Tables for an image size and the weights of Eq. 1.
 
     Args:
         height: Image height in pixels.
         width: Image width in pixels.
-        truncation: t, largest L1 distance of one histogram of unit norm.
         grey_level: alpha and t1 (grey levels) of the grey-level term, for images in [0, 1].
         slope: beta and t2 (grey levels a pixel) of the gradient term, likewise.
-        around: Number of points around p (1, 5 for a cross, 9 for a square) and their distance in pixels.
+        support: Number of points around p (1, 5 for a cross, 9 for a square).
+        spacing: Their distance in pixels.
     """
-    (alpha, intensity_limit), (beta, gradient_limit), (support, spacing) = grey_level, slope, around
+    (alpha, intensity_limit), (beta, gradient_limit) = grey_level, slope
     pattern = layout.sampling_table()
     geometry = map_geometry(height, width)
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
@@ -128,7 +132,7 @@ def cost_tables(
     square = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)][:support]
     intensity = np.rint(255 * alpha * np.minimum(grey, intensity_limit)).astype(np.int32)
     gradient = np.rint(255 * beta * np.minimum(grey, gradient_limit)).astype(np.int32)
-    limit = round(truncation * 255)
+    limit = round(TRUNCATION * 255)
     return CostTables(
         samples.astype(np.int32),
         np.ascontiguousarray(per_level[pattern.ring_level[:, 0]]),
@@ -312,20 +316,6 @@ def reference_appearance(points: Floats, image: Side, tables: CostTables, out: I
 
 
 @kernel
-def label_costs(
-    start: int, stop: int, labels: Floats, reference: Reference, target: Side, tables: CostTables, out: Longs
-) -> None:
-    """Cost of one label a point: float32 ``[N, 4]`` to int64 ``[N]``; labels that are not finite cost `OUTSIDE`."""
-    for i in range(start, stop):
-        out[i] = label_cost(
-            i, labels[i, 0], labels[i, 1], labels[i, 2], labels[i, 3], reference, target, tables, OUTSIDE
-        )
-
-
-# A parabola through matching costs: the first sub-pixel step of a label.
-
-
-@kernel
 def parabola(
     start: int, stop: int, labels: Floats, step: float, reference: Reference, target: Side, tables: CostTables,
     used: Longs,
@@ -337,9 +327,9 @@ def parabola(
         stop: One past the last.
         labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
         step: Pixels.
-        reference: `cost.Reference`.
-        target: `cost.Side`.
-        tables: `cost.CostTables`.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
         used: int64 ``[N]``, cost evaluations, counted on.
     """
     far = np.int64(1 << 40)

@@ -1,9 +1,9 @@
-"""The moth-flame equations (Eq. 8-22), written once, and which of them are in force.
+"""The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-Everything that flies moths takes them from here: the batched torch search (`torch_search`), the compiled label search
-(`moth_flame_kernel`, which reads `flight_table`, `spiral_table` and `cauchy_table`), the Optuna sampler
-(`dynslam_bench.tuning.samplers`) and the tests' minimiser of benchmark functions. `xp` is numpy or torch; moths
-and flames are arrays of any leading shape with the dimensions of the problem last; `uniform(shape)` draws from [0, 1).
+All searches take them from here: the batched torch search (`torch_flow`), the compiled label search (`search_kernels`,
+which reads `flight_table`, `spiral_table` and `cauchy_table`) and the Optuna sampler (`dynslam_bench.tuning.samplers`).
+`xp` is numpy or torch. Moths and flames are arrays of any leading shape with the dimensions of the problem last;
+`uniform(shape)` draws from [0, 1).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def flame_counts(population: int, iterations: int, rules: MothFlameRules) -> NDA
 
 
 class Flight(NamedTuple):
-    """What an iteration asks of every moth.
+    """Coefficients of an iteration, the same for every moth.
 
     Attributes:
         span: ``r - 1`` (Eq. 9), so that ``t = span U + 1`` (Eq. 10) lies between r and 1.
@@ -80,7 +80,7 @@ class Flight(NamedTuple):
 
 
 def flight(progress: Any, rules: MothFlameRules) -> Flight:
-    """The flight at ``progress = l / T``, in the progress' own precision."""
+    """The coefficients at ``progress = l / T``, in the precision of `progress`."""
     r = 1 + progress if rules.as_printed else -1 - progress  # Eq. 9
     first_half = bool(progress <= 0.5)
     stepping = rules.cauchy and first_half
@@ -104,7 +104,7 @@ def cauchy(xp: Any, uniform: Any) -> Any:
 def moth_positions(
     xp: Any, moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform
 ) -> Any:
-    """Where moths land: a spiral around their flame, a pull of the best one, a Cauchy step (Eq. 8, 10, 12, 13, 17).
+    """New positions: a spiral around the flame, attraction to the best flame, a Cauchy step (Eq. 8, 10, 12, 13, 17).
 
     Args:
         xp: numpy or torch.
@@ -134,7 +134,7 @@ def population_positions(
     scale: Any,
     uniform: Uniform,
 ) -> Any:
-    """Where whole populations land in iteration 1..T: `moth_positions` with what the iteration asks (Eq. 8-18).
+    """New positions of whole populations in iteration 1..T: `moth_positions` with its coefficients (Eq. 8-18).
 
     Args:
         xp: numpy or torch.
@@ -159,10 +159,10 @@ def opposites(xp: Any, members: Any, least: Any, greatest: Any, low: Any, high: 
     Args:
         xp: numpy or torch.
         members: Of the population.
-        least: Its dynamic bounds dy, dz (Eq. 20).
-        greatest: Likewise.
-        low: Bounds beyond which an opposite is drawn anew, within them.
-        high: Likewise.
+        least: Lower dynamic bounds of the population (dy of Eq. 20).
+        greatest: Upper dynamic bounds (dz).
+        low: Lower bounds; an opposite outside the bounds is replaced by a draw within them.
+        high: Upper bounds.
         uniform: Draws.
     """
     opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members  # Eq. 19

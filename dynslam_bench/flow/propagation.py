@@ -1,4 +1,4 @@
-"""What neighbouring points tell each other between the phases of a search: their labels, and the motions they share."""
+"""Label propagation between neighbouring points: nearest neighbours, transported labels, common motions, consensus."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dynslam_bench.flow.search_kernels import advance, scrambled
 from dynslam_bench.flow.simd import Flags, Floats, Longs
 
 VOTERS = 256
-"""Points that vote on a hypothesis, about."""
+"""Approximate number of points that vote on a hypothesis."""
 
 
 @kernel
@@ -20,8 +20,8 @@ def transported_labels(
     """Labels of neighbours and of common motions, as seen from each point.
 
     A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
-    gives p. Scale and rotation are clipped to the point's box; the displacement is not: what neighbours have found
-    is no random guess (the box is where the search starts, not what the scene obeys).
+    gives p. Scale and rotation are clipped to the point's bounds; the displacement is not: a label of a neighbour
+    is a tested match, and the bounds limit only where the search draws.
 
     Args:
         start: First point.
@@ -102,7 +102,7 @@ def common_motions(
 def better_half(costs: Longs) -> Longs:
     """Indices of the lower half of the costs, four at least, ascending; of equal ones the first.
 
-    By numpy: in a kernel, ``np.partition`` would take a tenth of the time in which all kernels compile.
+    In numpy: in a kernel, ``np.partition`` would add a tenth to the compile time of all kernels.
     """
     half = max(len(costs) // 2, 4)
     threshold = np.partition(costs, half - 1)[half - 1]
@@ -156,7 +156,7 @@ def motions_of(
         if best == 0:
             return
         a, b, tx, ty = out[m, 0], out[m, 1], out[m, 2], out[m, 3]
-        # the second motion is sought among those that do not obey the first
+        # the second motion is fitted to the points that do not follow the first
         count = drop_followers(x, y, to_x, to_y, count, a, b, tx, ty, 4 * limit)
 
 
@@ -197,20 +197,17 @@ def drop_followers(
     return left
 
 
-# Nearest neighbours among the points of one image.
-
-
 @kernel
 def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, width: int, out: Longs) -> None:
     """The nearest other points of each point, in an approximate but deterministic search over rows of equal bands.
 
     Args:
-        start: First place in the order.
+        start: First position in the order.
         stop: One past the last.
         ordered: float32 ``[N, 2]``, the points sorted by x.
         order: int64 ``[N]``, their indices.
-        width: Number of points looked at on each side in that order.
-        out: int64 ``[N, K]``, nearest first; -1 where there are fewer. Rows are points, not places.
+        width: Number of points compared on each side in that order.
+        out: int64 ``[N, K]``, nearest first; -1 where there are fewer. Rows are points, not positions in the order.
     """
     n, count = out.shape
     best, index = np.empty(count, dtype=np.float32), np.empty(count, dtype=np.int64)
@@ -238,14 +235,11 @@ def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, wid
             out[i, slot] = index[slot]
 
 
-# A second opinion for points that contradict their neighbours, e.g. one period off on a repetitive texture.
-
-
 @kernel
 def dissenting_labels(
     predictions: Floats, labels: Floats, tolerance: Scalar, alternative: Floats, dissents: Flags
 ) -> None:
-    """Find the points about which the neighbours agree among themselves, but not with the point's own label.
+    """Find points whose neighbours agree with each other but not with the point, e.g. one period off on a texture.
 
     Args:
         predictions: float32 ``[N, K, 4]``, the neighbours' labels as seen from each point; NaN means none.

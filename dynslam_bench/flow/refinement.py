@@ -1,7 +1,7 @@
 """Photometric refinement of labels: Lucas-Kanade with four degrees of freedom.
 
 Inverse compositional (Baker and Matthews 2004): template gradients and Hessian are computed once a point, the label's
-warp is updated until it stands. Patch means are removed, so that a change of brightness does not pull.
+warp is updated until it converges. Patch means are removed, so that a change of brightness has no influence.
 """
 
 from __future__ import annotations
@@ -90,12 +90,12 @@ def similarity_lucas_kanade(
 ) -> None:  # fmt: skip
     """Refine labels by photometric alignment of a square window.
 
-    The target is warped by the label into the template's frame; within that patch only the translation moves (cheap),
-    between two warps scale and rotation are corrected as well, unless they stand. A label changes only if the windows'
+    The target is warped by the label into the template's frame. Within that patch only the translation changes (cheap);
+    between two warps scale and rotation are corrected as well. A label changes only if the windows'
     correlation grows.
 
-    All windows lie flat at the patch's pitch, so that a shift by whole pixels is an offset; what is not of the window
-    has zero gradients and mask.
+    All windows are flat arrays at the patch's pitch, so that a shift by whole pixels is an offset. Elements outside the
+    window have zero gradients and mask.
 
     Args:
         start: First point.
@@ -105,7 +105,7 @@ def similarity_lucas_kanade(
         template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full resolution, edges repeated.
         target_image: Likewise.
         window: `Window`, and when to stop.
-        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1 if flat or not seen.
+        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1 if flat or outside.
     """
     step, radius, margin, warps, iterations, tolerance = window
     border = BORDER
@@ -265,30 +265,6 @@ def similarity_lucas_kanade(
             labels[i, 1] = (best_y - border + half) * np.float32(step) - half - points[i, 1]
             labels[i, 2] = half * np.float32(np.log2(best_a * best_a + best_b * best_b))
             labels[i, 3] = np.float32(np.arctan2(best_b, best_a))
-
-
-@kernel
-def coarse_to_fine(
-    start: int, stop: int, points: Floats, labels: Floats, half_template: Bytes, half_target: Bytes, template: Bytes,
-    target: Bytes, coarse: Window, fine: Window, correlation: Floats,
-) -> None:  # fmt: skip
-    """`similarity_lucas_kanade` at half, then at full resolution.
-
-    Args:
-        start: First point.
-        stop: One past the last.
-        points: float32 ``[N, 2]``.
-        labels: float32 ``[N, 4]``, changed in place.
-        half_template: Half-resolution template image.
-        half_target: Half-resolution target image.
-        template: Template image.
-        target: Target image.
-        coarse: `Window` at half resolution.
-        fine: `Window` at full resolution.
-        correlation: float32 ``[N]``, filled with that of the full resolution.
-    """
-    similarity_lucas_kanade(start, stop, points, labels, half_template, half_target, coarse, correlation)
-    similarity_lucas_kanade(start, stop, points, labels, template, target, fine, correlation)
 
 
 @inlined

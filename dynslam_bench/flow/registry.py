@@ -1,11 +1,11 @@
-"""Flows by id: built in or plug-ins (entry-point group ``dynslam_bench.flow``)."""
+"""Flows by id: built in or plug-ins (entry-point group ``dynslam_bench.flow``), and how settings become a flow."""
 
 from __future__ import annotations
 
 from dynslam_bench.contracts.flow import FlowEstimator, FlowSpec
 from dynslam_bench.core.errors import DynslamError, PluginError
 from dynslam_bench.core.plugins import Registry, load_object
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 
 __all__ = ["FLOWS", "FlowSpec"]
 
@@ -18,25 +18,22 @@ BUILT_IN = (
     ),
     FlowSpec(
         "lucas-kanade",
-        "dynslam_bench.flow.registry:build_lucas_kanade",
+        "dynslam_bench.flow.opencv:LucasKanadeFlow",
         "pyramidal Lucas-Kanade (OpenCV)",
         "Apache-2.0",
     ),
-    FlowSpec("dis", "dynslam_bench.flow.registry:build_dis", "dense inverse search (OpenCV)", "Apache-2.0"),
+    FlowSpec("dis", "dynslam_bench.flow.opencv:DisFlow", "dense inverse search (OpenCV)", "Apache-2.0"),
 )
 
 FLOWS: Registry[FlowSpec] = Registry("flow", FlowSpec, lambda: BUILT_IN)
 
 
-# From settings to a flow estimator.
-
-
-def build_flow(settings: FlowSettings | None = None, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
+def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
     """Load and construct the flow that the settings name.
 
     Args:
-        settings: Which flow, and how; None for the defaults.
-        device: ``cpu`` takes the compiled kernels, any other torch device the batched torch path (DAISY only).
+        settings: Which flow, and its options; None for the defaults.
+        device: ``cpu`` uses the compiled kernels, any other torch device the batched torch path (DAISY only).
         threads: Processor threads; results do not depend on their number.
 
     Raises:
@@ -57,30 +54,18 @@ def build_flow(settings: FlowSettings | None = None, *, device: str = "cpu", thr
     return flow
 
 
-def build_daisy(settings: FlowSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
+def build_daisy(settings: FlowMethodSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
     """DAISY Filter Flow, sparse or dense; the dense one on the processor, whatever the device."""
-    if settings.mode == "dense":
-        from dynslam_bench.flow.dense_flow import DensePointFlow
+    if isinstance(settings, DenseFlowSettings):
+        from dynslam_bench.flow.dense_flow import DenseDaisyFlow
 
-        return DensePointFlow(settings, threads=threads)
+        return DenseDaisyFlow(settings, threads=threads)
     from dynslam_bench.flow.sparse import SparseDaisyFlow
 
+    if not isinstance(settings, FlowSettings):  # a system with another flow by default: DAISY's own options are absent
+        settings = FlowSettings(**settings.model_dump())
     if device != "cpu":
         from dynslam_bench.flow.torch_flow import TorchSparseFlow
 
         return TorchSparseFlow(settings, device=device, threads=threads)
     return SparseDaisyFlow(settings, threads=threads)
-
-
-def build_lucas_kanade(settings: FlowSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
-    """Pyramidal Lucas-Kanade; OpenCV's own threads, processor only."""
-    from dynslam_bench.flow.opencv import LucasKanadeFlow
-
-    return LucasKanadeFlow(settings)
-
-
-def build_dis(settings: FlowSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
-    """Dense inverse search; OpenCV's own threads, processor only."""
-    from dynslam_bench.flow.opencv import DisFlow
-
-    return DisFlow(settings)

@@ -1,4 +1,9 @@
-"""What all label searches share: their state, their random numbers, and how a label enters the population."""
+"""Compiled label searches: moth-flame populations (Eq. 4-22, corrected Algorithm 1), PatchMatch, random and none.
+
+Positions are labels; a moth's fitness is the matching cost of its label (Eq. 5-7). The moth-flame equations are those
+of `moth_flame`: values that depend on the iteration alone come from there as a table, and `move_moths` is
+`moth_flame.moth_positions` for one point, with spirals and Cauchy numbers from tables.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +23,14 @@ _MIX2 = np.uint64(0x94D049BB133111EB)
 
 
 class SearchState(NamedTuple):
-    """The best labels so far, of all points.
+    """The state of a search at all points.
 
     Attributes:
-        moths: float32 ``[N, P, 4]``, where each point's population is.
+        moths: float32 ``[N, P, 4]``, positions of each point's population.
         flames: float32 ``[N, P, 4]``, the best labels ever evaluated, best first.
         costs: int64 ``[N, P]``, their costs (Eq. 5, 7).
         used: int64 ``[N]``, cost evaluations spent.
-        lower: float32 ``[N, 4]``, the box that is searched.
+        lower: float32 ``[N, 4]``, bounds of the search.
         upper: float32 ``[N, 4]``.
     """
 
@@ -103,15 +108,13 @@ def insert(flames: Floats, costs: Longs, label: Floats, cost: Scalar) -> None:
 
 @inlined
 def widen(lower: Floats, upper: Floats, flames: Floats) -> None:
-    """Let a point's box contain the surroundings of its best displacement, which a neighbour may have brought."""
+    """Extend a point's bounds to 8 px around its best displacement, which may come from a neighbour."""
     room = np.float32(8)
     for j in range(2):
         lower[j], upper[j] = min(lower[j], flames[0, j] - room), max(upper[j], flames[0, j] + room)
 
 
-# Moth-flame label search (Eq. 4-22, corrected Algorithm 1), one population a point.
-
-CANDIDATES, FOUNDING, OPPOSITES, FLIGHT = 0, 1, 2, 3
+CANDIDATES, INITIAL, OPPOSITES, FLIGHT = 0, 1, 2, 3
 """Stages of a phase; all but the first and the last belong to phase 0."""
 
 
@@ -126,13 +129,13 @@ def moth_flame_phase(
     Args:
         start: First point.
         stop: One past the last.
-        reference: `cost.Reference`.
-        target: `cost.Side`.
-        tables: `cost.CostTables`.
-        state: `common.SearchState`, changed in place.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
+        state: `search_kernels.SearchState`, changed in place.
         candidates: float32 ``[N, C, 4]``, labels to try first (neighbours', the guess, ...); not finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
-        phase: Number of the phase; 0 founds the population.
+        phase: Number of the phase; 0 initialises the population.
         seed: Of the frame.
         table: `moth_flame.FlightTable`.
         spiral: `moth_flame.spiral_table`.
@@ -140,30 +143,24 @@ def moth_flame_phase(
         steps: float32 ``[4]``, scale of the Cauchy steps.
     """
     population, iterations = state.costs.shape[1], len(table.counts)
-    founding = population * (2 if table.opposition else 1)
-    moths, flames = np.empty((population, 4), dtype=np.float32), np.empty((population, 4), dtype=np.float32)
-    costs = np.empty(population, dtype=np.int64)
-    lower, upper = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
+    initial = population * (2 if table.opposition else 1)
     low, high = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
     label = np.empty(4, dtype=np.float32)
     for i in range(start, stop):
-        copy_population(state.lower[i], state.upper[i], state.moths[i], state.flames[i], lower, upper, moths, flames)
-        for m in range(population):
-            costs[m] = state.costs[i, m]
+        lower, upper, moths = state.lower[i], state.upper[i], state.moths[i]
+        flames, costs = state.flames[i], state.costs[i]
         random = first_state(seed, i, phase)
         used, placed = state.used[i], 0
         stage = CANDIDATES
-        while True:  # one place where costs are computed: what differs is which labels are tried
+        while True:  # costs are computed in one place; the stages differ in the labels that are tried
             count = 0
             if stage == CANDIDATES:
                 count = finite_labels(candidates[i], trials)
                 if phase == 0:
                     placed = min(count, population, end - used)
-                    for m in range(placed):
-                        for j in range(4):
-                            moths[m, j] = trials[m, j]
-            elif stage == FOUNDING:
+                    moths[:placed] = trials[:placed]
+            elif stage == INITIAL:
                 random = place_moths(moths, placed, lower, upper, trials, random)
                 count = population - placed
             elif stage == OPPOSITES:
@@ -172,7 +169,7 @@ def moth_flame_phase(
             else:
                 if used >= end:
                     break
-                iteration = min(max((used - founding) // population, 0), iterations - 1)
+                iteration = min(max((used - initial) // population, 0), iterations - 1)
                 random = move_moths(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random)
                 count = population
                 for m in range(population):
@@ -188,8 +185,8 @@ def moth_flame_phase(
                 used += 1
             if stage == CANDIDATES:
                 widen(lower, upper, flames)
-                stage = FOUNDING if phase == 0 else FLIGHT
-            elif stage == FOUNDING:
+                stage = INITIAL if phase == 0 else FLIGHT
+            elif stage == INITIAL:
                 stage = OPPOSITES if table.opposition else FLIGHT
             elif stage == OPPOSITES:
                 for m in range(population):  # the best N of X and its opposites
@@ -198,21 +195,6 @@ def moth_flame_phase(
                             moths[m, j] = flames[m, j]
                 stage = FLIGHT
         state.used[i] = used
-        copy_population(lower, upper, moths, flames, state.lower[i], state.upper[i], state.moths[i], state.flames[i])
-        for m in range(population):
-            state.costs[i, m] = costs[m]
-
-
-@inlined
-def copy_population(
-    from_lower: Floats, from_upper: Floats, from_moths: Floats, from_flames: Floats, lower: Floats, upper: Floats,
-    moths: Floats, flames: Floats,
-) -> None:  # fmt: skip
-    """Copy a point's box, moths and flames."""
-    for j in range(4):
-        lower[j], upper[j] = from_lower[j], from_upper[j]
-        for m in range(len(moths)):
-            moths[m, j], flames[m, j] = from_moths[m, j], from_flames[m, j]
 
 
 @inlined
@@ -230,7 +212,7 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
 
 @inlined
 def place_moths(moths: Floats, placed: int, lower: Floats, upper: Floats, trials: Floats, random: Scalar) -> Scalar:
-    """Place the moths from `placed` on anywhere in the box, and try them; returns the next random state."""
+    """Draw the moths from `placed` on within the bounds, and try them; returns the next random state."""
     for m in range(placed, len(moths)):
         random = advance(random)
         bits = scrambled(random)
@@ -294,9 +276,6 @@ def move_moths(
     return random
 
 
-# Searches without a population: PatchMatch's halving windows, uniform random draws, or no draws at all.
-
-
 @kernel
 def shrinking_window_phase(
     start: int, stop: int, reference: Reference, target: Side, tables: CostTables, state: SearchState,
@@ -307,10 +286,10 @@ def shrinking_window_phase(
     Args:
         start: First point.
         stop: One past the last.
-        reference: `cost.Reference`.
-        target: `cost.Side`.
-        tables: `cost.CostTables`.
-        state: `common.SearchState`, changed in place; only the best label is used.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
+        state: `search_kernels.SearchState`, changed in place; only the best label is used.
         candidates: float32 ``[N, C, 4]``, labels to try first; not finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase.
@@ -319,13 +298,9 @@ def shrinking_window_phase(
             0 draws nothing: the candidates are all that is tried, and the rest of the budget is left.
     """
     label = np.empty(4, dtype=np.float32)
-    flames, costs = np.empty((1, 4), dtype=np.float32), np.empty(1, dtype=np.int64)
-    lower, upper = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
     for i in range(start, stop):
         random = first_state(seed, i, phase)
-        for j in range(4):
-            lower[j], upper[j], flames[0, j] = state.lower[i, j], state.upper[i, j], state.flames[i, 0, j]
-        costs[0] = state.costs[i, 0]
+        lower, upper, flames, costs = state.lower[i], state.upper[i], state.flames[i], state.costs[i]
         used, given, widened = state.used[i], 0, False
         window = np.float32(0.5)
         while used < end:
@@ -354,9 +329,7 @@ def shrinking_window_phase(
             used += 1
         if not widened:
             widen(lower, upper, flames)
-        state.used[i], state.costs[i, 0] = used, costs[0]
-        for j in range(4):
-            state.lower[i, j], state.upper[i, j], state.flames[i, 0, j] = lower[j], upper[j], flames[0, j]
+        state.used[i] = used
 
 
 @inlined

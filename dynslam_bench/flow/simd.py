@@ -1,4 +1,10 @@
-"""Arrays as the kernels take them, named for what they hold."""
+"""SIMD vectors inside the compiled kernels: sixteen float32 or thirty-two uint16 numbers as one value.
+
+Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. The order of
+every sum is part of the program, so that results do not depend on the processor. The uint16 operations are exact but
+for one square root and division, which IEEE 754 defines to the last bit; `tests/flow/torch_reference.py` gives the same
+bytes.
+"""
 
 from __future__ import annotations
 
@@ -23,52 +29,55 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
-# Instructions of the kernels: functions whose code is written as LLVM's, not as Python.
-
 Code: TypeAlias = Any
-"""A type, value or builder of numba and llvmlite, neither of which says its types."""
+"""A type, value or builder of numba and llvmlite, neither of which is annotated."""
 
 Arguments = ParamSpec("Arguments")
 Definition: TypeAlias = tuple[Code, Callable[[Code, Code, Code, Code], Code]]
-"""Numba's signature of an instruction, and what writes its code, of context, builder, signature and arguments."""
+"""Numba's signature of an instruction, and the function that writes its code."""
 
 
 def instruction(define: Callable[Concatenate[Code, Arguments], Definition]) -> Callable[Arguments, Code]:
-    """Make an instruction that kernels call, of a function of numba's typing context and its arguments' types."""
+    """Make an instruction for kernels from a function of numba's typing context and the types of the arguments."""
     return cast("Callable[Arguments, Code]", intrinsic(define))
 
 
-# Sixteen float32 numbers as one value inside the compiled kernels, with `+`, `-` and `*`.
-
-FLOAT_LANES = 16
-_FLOAT, _WORD, _BYTE, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(8), ir.IntType(64)
-_FLOATS, _WORDS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_WORD, FLOAT_LANES)
-_BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
-_PAIR = ir.IntType(16)
-_PAIRS = ir.VectorType(_PAIR, FLOAT_LANES)
-
-
-class Float32x16Type(types.Type):
-    """Numba's type of sixteen float32 lanes."""
-
-    def __init__(self) -> None:
-        super().__init__(name="Float32x16")
+FLOAT_LANES, UINT16_LANES = 16, 32
+_FLOAT, _INT64, _INT32, _UINT16, _BYTE = ir.FloatType(), ir.IntType(64), ir.IntType(32), ir.IntType(16), ir.IntType(8)
+_FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT_LANES)
+_BYTES16, _PAIRS = ir.VectorType(_BYTE, FLOAT_LANES), ir.VectorType(_UINT16, FLOAT_LANES)
+_HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
+COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
+"""Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
+DERIVATIVE_SHIFT = 11
+"""From differences of sums over 2 x 2 pixels times `COSINES` to 256ths of a grey level a full-image pixel."""
 
 
-FLOAT32X16 = Float32x16Type()
+class SimdType(types.Type):
+    """Numba's type of a vector.
+
+    Args:
+        name: Of the type.
+        vector: LLVM's type.
+    """
+
+    def __init__(self, name: str, vector: ir.VectorType) -> None:
+        super().__init__(name=name)
+        self.vector = vector
 
 
-@register_model(Float32x16Type)
-class _LanesModel(models.PrimitiveModel):
+@register_model(SimdType)
+class _SimdModel(models.PrimitiveModel):
     def __init__(self, manager: Code, kind: Code) -> None:
-        super().__init__(manager, kind, _FLOATS)
+        super().__init__(manager, kind, kind.vector)
+
+
+FLOAT32X16, UINT16X32 = SimdType("Float32x16", _FLOATS), SimdType("UInt16x32", _HALVES)
 
 
 class _Arithmetic(AbstractTemplate):
-    def generic(self, arguments: Code, keywords: Code) -> Code:
-        if len(arguments) == 2 and all(isinstance(a, Float32x16Type) for a in arguments):
-            return signature(FLOAT32X16, FLOAT32X16, FLOAT32X16)
-        return None
+    def generic(self, arguments: Code, keyhalves: Code) -> Code:
+        return signature(FLOAT32X16, *arguments) if arguments == (FLOAT32X16, FLOAT32X16) else None
 
 
 def _define(symbol: Code, operation: str) -> None:
@@ -77,7 +86,7 @@ def _define(symbol: Code, operation: str) -> None:
     def lowered(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return getattr(builder, operation)(*arguments)
 
-    lower_builtin(symbol, Float32x16Type, Float32x16Type)(lowered)
+    lower_builtin(symbol, SimdType, SimdType)(lowered)
 
 
 for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
@@ -96,8 +105,8 @@ def _float_constant(kind: ir.VectorType, value: float) -> Code:
 
 def splat(builder: Code, kind: ir.VectorType, value: Code) -> Code:
     """Code for a vector of sixteen equal numbers."""
-    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_WORD, 0))
-    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _float_constant(_WORDS, 0))
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0))
+    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _float_constant(_INTS, 0))
 
 
 @instruction
@@ -119,13 +128,13 @@ def load_bytes(typing_context: Code, array: Code, index: Code) -> Definition:
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _BYTES16))
         loaded.align = 1
-        return builder.sitofp(builder.zext(loaded, _WORDS), _FLOATS)
+        return builder.sitofp(builder.zext(loaded, _INTS), _FLOATS)
 
     return FLOAT32X16(array, types.int64), generate
 
 
 @instruction
-def store(typing_context: Code, array: Code, index: Code, lanes: Code) -> Definition:
+def store(typing_context: Code, array: Code, index: Code, vector: Code) -> Definition:
     """Write sixteen adjacent numbers of a flat float32 array; nothing is checked."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
@@ -138,7 +147,7 @@ def store(typing_context: Code, array: Code, index: Code, lanes: Code) -> Defini
 
 @instruction
 def spread(typing_context: Code, value: Code) -> Definition:
-    """The same float32 in every lane."""
+    """The same float32 in every place."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return splat(builder, _FLOATS, arguments[0])
@@ -147,8 +156,8 @@ def spread(typing_context: Code, value: Code) -> Definition:
 
 
 @instruction
-def total(typing_context: Code, lanes: Code) -> Definition:
-    """Sum of the lanes: halves onto halves, always in the same order."""
+def total(typing_context: Code, vector: Code) -> Definition:
+    """Sum of the numbers: halves onto halves, always in the same order."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         rest, width = arguments[0], FLOAT_LANES
@@ -156,14 +165,14 @@ def total(typing_context: Code, lanes: Code) -> Definition:
             width //= 2
             parts = [
                 builder.shuffle_vector(
-                    rest, rest, ir.Constant(ir.VectorType(_WORD, width), list(range(first, first + width)))
+                    rest, rest, ir.Constant(ir.VectorType(_INT32, width), list(range(first, first + width)))
                 )
                 for first in (0, width)
             ]
             rest = builder.fadd(*parts)
-        return builder.extract_element(rest, ir.Constant(_WORD, 0))
+        return builder.extract_element(rest, ir.Constant(_INT32, 0))
 
-    return types.float32(lanes), generate
+    return types.float32(vector), generate
 
 
 @instruction
@@ -193,67 +202,40 @@ def sample(
         pixels, stride, columns, rows, at, column, row, step_x, step_y = arguments
         grid = []
         for k, array in ((2, columns), (3, rows)):
-            loaded = builder.load(pointer_to(context, builder, kind.args[k], array, at, _WORDS))
+            loaded = builder.load(pointer_to(context, builder, kind.args[k], array, at, _INTS))
             loaded.align = 4
             grid.append(loaded)
-        dx, dy = (splat(builder, _WORDS, step) for step in (step_x, step_y))
-        x = builder.add(splat(builder, _WORDS, column), builder.mul(grid[0], dx))
+        dx, dy = (splat(builder, _INTS, step) for step in (step_x, step_y))
+        x = builder.add(splat(builder, _INTS, column), builder.mul(grid[0], dx))
         x = builder.sub(x, builder.mul(grid[1], dy))
-        y = builder.add(splat(builder, _WORDS, row), builder.mul(grid[0], dy))
+        y = builder.add(splat(builder, _INTS, row), builder.mul(grid[0], dy))
         y = builder.add(y, builder.mul(grid[1], dx))
-        sixteen, low = _float_constant(_WORDS, 16), _float_constant(_WORDS, 65535)
+        sixteen, low = _float_constant(_INTS, 16), _float_constant(_INTS, 65535)
         whole = [builder.ashr(value, sixteen) for value in (x, y)]
         share = [
             builder.fmul(builder.sitofp(builder.and_(value, low), _FLOATS), _float_constant(_FLOATS, 1 / 65536))
             for value in (x, y)
         ]
-        offset = builder.add(builder.mul(whole[1], splat(builder, _WORDS, stride)), whole[0])
+        offset = builder.add(builder.mul(whole[1], splat(builder, _INTS, stride)), whole[0])
         data = context.make_array(kind.args[0])(context, builder, pixels).data
         pairs = [ir.Constant(_PAIRS, ir.Undefined)] * 2  # two adjacent pixels in each lane, of the upper and lower row
         for lane in range(FLOAT_LANES):
-            index = ir.Constant(_WORD, lane)
-            first = builder.gep(data, [builder.sext(builder.extract_element(offset, index), _LONG)])
-            second = builder.gep(first, [builder.sext(stride, _LONG)])
+            index = ir.Constant(_INT32, lane)
+            first = builder.gep(data, [builder.sext(builder.extract_element(offset, index), _INT64)])
+            second = builder.gep(first, [builder.sext(stride, _INT64)])
             for line, place in enumerate((first, second)):
-                pair = builder.load(builder.bitcast(place, _PAIR.as_pointer()))
+                pair = builder.load(builder.bitcast(place, _UINT16.as_pointer()))
                 pair.align = 1
                 pairs[line] = builder.insert_element(pairs[line], pair, index)
         lines = []
         for pair in pairs:
-            words = builder.zext(pair, _WORDS)
-            left = builder.sitofp(builder.and_(words, _float_constant(_WORDS, 255)), _FLOATS)
-            right = builder.sitofp(builder.lshr(words, _float_constant(_WORDS, 8)), _FLOATS)
+            both = builder.zext(pair, _INTS)
+            left = builder.sitofp(builder.and_(both, _float_constant(_INTS, 255)), _FLOATS)
+            right = builder.sitofp(builder.lshr(both, _float_constant(_INTS, 8)), _FLOATS)
             lines.append(builder.fadd(left, builder.fmul(share[0], builder.fsub(right, left))))
         return builder.fadd(lines[0], builder.fmul(share[1], builder.fsub(lines[1], lines[0])))
 
     return FLOAT32X16(image, types.int32, columns, rows, types.int64, *([types.int32] * 4)), generate
-
-
-# Thirty-two uint16 numbers as one value inside the compiled kernels: four histograms of eight bins.
-
-UINT16_LANES = 32
-_HALF, _INT32, _INT8, _FLOAT32 = ir.IntType(16), ir.IntType(32), ir.IntType(8), ir.FloatType()
-_HALVES, _BYTES32 = ir.VectorType(_HALF, UINT16_LANES), ir.VectorType(_INT8, UINT16_LANES)
-COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
-"""Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
-DERIVATIVE_SHIFT = 11
-"""From differences of sums over 2 x 2 pixels times `COSINES` to 256ths of a grey level a full-image pixel."""
-
-
-class UInt16x32Type(types.Type):
-    """Numba's type of thirty-two uint16 lanes."""
-
-    def __init__(self) -> None:
-        super().__init__(name="UInt16x32")
-
-
-UINT16X32 = UInt16x32Type()
-
-
-@register_model(UInt16x32Type)
-class _WordsModel(models.PrimitiveModel):
-    def __init__(self, manager: Code, kind: Code) -> None:
-        super().__init__(manager, kind, _HALVES)
 
 
 def _mask(places: list[int]) -> Code:
@@ -284,7 +266,7 @@ def load_uint16(typing_context: Code, array: Code, index: Code) -> Definition:
 
 
 @instruction
-def store_uint16(typing_context: Code, array: Code, index: Code, words: Code) -> Definition:
+def store_uint16(typing_context: Code, array: Code, index: Code, halves: Code) -> Definition:
     """Write thirty-two adjacent numbers of a flat uint16 array; nothing is checked."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
@@ -297,7 +279,7 @@ def store_uint16(typing_context: Code, array: Code, index: Code, words: Code) ->
 
 @instruction
 def average(typing_context: Code, first: Code, second: Code) -> Definition:
-    """Rounded mean ``(a + b + 1) >> 1`` of every lane."""
+    """Rounded mean ``(a + b + 1) >> 1`` of every number."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return _average(builder, *arguments)
@@ -335,7 +317,7 @@ def derivatives(typing_context: Code, sums: Code, here: Code, above: Code, below
     """
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        four, wide = ir.VectorType(_HALF, 4), ir.VectorType(_INT32, 4)
+        four, wide = ir.VectorType(_UINT16, 4), ir.VectorType(_INT32, 4)
 
         def pixels(index: Code) -> Code:
             loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], index, four))
@@ -358,27 +340,27 @@ def derivatives(typing_context: Code, sums: Code, here: Code, above: Code, below
 
 
 @instruction
-def store_normalised(typing_context: Code, array: Code, index: Code, words: Code, floor: Code) -> Definition:
+def store_normalised(typing_context: Code, array: Code, index: Code, halves: Code, floor: Code) -> Definition:
     """Write four histograms as 32 bytes: each divided by its Euclidean norm plus `floor`, times 255, rounded."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        array, index, words, floor = arguments
-        wide = builder.zext(words, ir.VectorType(_INT32, UINT16_LANES))
+        array, index, halves, floor = arguments
+        wide = builder.zext(halves, ir.VectorType(_INT32, UINT16_LANES))
         squares, count = builder.mul(wide, wide), UINT16_LANES
         while count > 4:
             parts = [builder.shuffle_vector(squares, squares, _mask(list(range(odd, count, 2)))) for odd in (0, 1)]
             squares, count = builder.add(*parts), count // 2
-        floats = ir.VectorType(_FLOAT32, 4)
+        floats = ir.VectorType(_FLOAT, 4)
         root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(floats, [floats]), "llvm.sqrt.v4f32")
         norm = builder.call(root, [builder.sitofp(squares, floats)])
         spread = _mask([pixel for pixel in range(4) for _ in range(8)])
         first = builder.insert_element(ir.Constant(floats, ir.Undefined), floor, ir.Constant(_INT32, 0))
         floors = builder.shuffle_vector(first, first, _mask([0] * 4))
-        gain = builder.fdiv(_vector(_FLOAT32, [255.0] * 4), builder.fadd(norm, floors))
+        gain = builder.fdiv(_vector(_FLOAT, [255.0] * 4), builder.fadd(norm, floors))
         gains = builder.shuffle_vector(gain, gain, spread)
-        scaled = builder.fmul(builder.sitofp(wide, ir.VectorType(_FLOAT32, UINT16_LANES)), gains)
+        scaled = builder.fmul(builder.sitofp(wide, ir.VectorType(_FLOAT, UINT16_LANES)), gains)
         rounded = builder.fptosi(
-            builder.fadd(scaled, _vector(_FLOAT32, [0.5] * UINT16_LANES)), ir.VectorType(_INT32, UINT16_LANES)
+            builder.fadd(scaled, _vector(_FLOAT, [0.5] * UINT16_LANES)), ir.VectorType(_INT32, UINT16_LANES)
         )
         builder.store(
             builder.trunc(rounded, _BYTES32),
@@ -390,18 +372,13 @@ def store_normalised(typing_context: Code, array: Code, index: Code, words: Code
     return types.void(array, types.int64, UINT16X32, types.float32), generate
 
 
-# The sum of truncated histogram distances that matching costs consist of, as one instruction.
-
-_OCTET, _INDEX, _INT64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
-
-
 def _repeated(element: Code, value: int, count: int) -> Code:
     return ir.Constant(ir.VectorType(element, count), [value] * count)
 
 
 def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -> Code:
     """L1 distances of `count` histograms of eight bytes, as ``count`` 64-bit lanes."""
-    bytes_ = ir.VectorType(_OCTET, 8 * count)
+    bytes_ = ir.VectorType(_BYTE, 8 * count)
     first, second = builder.bitcast(first, bytes_), builder.bitcast(second, bytes_)
     above = builder.icmp_unsigned(">", first, second)
     total = builder.sub(builder.select(above, first, second), builder.select(above, second, first))
@@ -453,17 +430,17 @@ def descriptor_sum(
                 place = builder.gep(base, [builder.sext(offset, _INT64)])
                 histogram = builder.load(builder.bitcast(place, _INT64.as_pointer()))
                 histogram.align = 1
-                theirs = builder.insert_element(theirs, histogram, ir.Constant(_INDEX, k))
+                theirs = builder.insert_element(theirs, histogram, ir.Constant(_INT32, k))
             own = builder.load(builder.bitcast(builder.gep(mine, [ir.Constant(_INT64, 8 * first)]), lanes.as_pointer()))
             own.align = 1
             distances = _histogram_distances(builder, theirs, own, count)
             limit = ir.Constant(lanes, ir.Undefined)
             for k in range(count):
-                limit = builder.insert_element(limit, truncation, ir.Constant(_INDEX, k))
+                limit = builder.insert_element(limit, truncation, ir.Constant(_INT32, k))
             below = builder.icmp_unsigned("<", distances, limit)
             kept = builder.select(below, distances, limit)
             for k in range(count):
-                total = builder.add(total, builder.extract_element(kept, ir.Constant(_INDEX, k)))
+                total = builder.add(total, builder.extract_element(kept, ir.Constant(_INT32, k)))
         return total
 
     return signature, generate

@@ -1,13 +1,13 @@
-"""The orientation maps on any torch device.
+"""DAISY Filter Flow with the label search on a torch device, as batched torch code; also the reference of the kernels.
 
-`quantised_maps` computes what `maps` computes for the processor, in the same arrangement, so that both index it with
-the same tables.
+Costs are the same whole numbers as those of `matching_cost`. Random numbers come from a generator on the processor, so
+that every device uses the same ones. Orientation maps, descriptors, propagation of labels, photometric refinement and
+the forward-backward check are computed on the processor, in `sparse.SparseDaisyFlow`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,96 +17,15 @@ from torch import Tensor
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.label_search import Phase, Plan, cauchy_steps
-from dynslam_bench.flow.layout import MapGeometry, map_geometry
 from dynslam_bench.flow.matching_cost import OUTSIDE, CostTables, Reference
 from dynslam_bench.flow.moth_flame import MothFlameRules, opposites, population_positions
-from dynslam_bench.flow.orientation_maps import FIXED_POINT, NORM_FLOOR, OrientationMaps, framed, half_image
 from dynslam_bench.flow.search_kernels import SearchState
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.simd import COSINES, DERIVATIVE_SHIFT
 from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
 
 
-def quantised_maps(gray: Tensor) -> tuple[Tensor, MapGeometry]:
-    """The orientation maps of `maps.orientation_maps` on any device.
-
-    Args:
-        gray: uint8 ``[H, W]``.
-
-    Returns:
-        uint8 ``[total, 8]`` histograms, equal to those of the processor's kernels, and their arrangement.
-    """
-    height, width = int(gray.shape[0]), int(gray.shape[1])
-    geometry = map_geometry(height, width)
-    histograms = torch.zeros((geometry.total, layout.BINS), dtype=torch.uint8, device=gray.device)
-    maps = _whole_derivatives(gray)
-    step = layout.LEVEL_STEPS[0]
-    for level, (level_step, (taps, distance)) in enumerate(zip(layout.LEVEL_STEPS, layout.LEVEL_BLURS, strict=True)):
-        if level_step != step:
-            maps, step = _halve(maps), level_step
-        for axis in (1, 2):
-            maps = _binomial(maps, axis, taps, distance)
-        norm = maps.square().sum(dim=0, keepdim=True).float().sqrt()
-        gain = torch.full_like(norm, 255) / (norm + torch.full_like(norm, NORM_FLOOR * FIXED_POINT))
-        cells = (maps.float() * gain + 0.5).to(torch.uint8).permute(1, 2, 0)
-        margin = layout.MARGIN // step
-        base, stride = int(geometry.base[level]), int(geometry.stride[level])
-        rows, columns = cells.shape[:2]
-        area = histograms[base : base + (rows + 2 * margin) * stride].view(rows + 2 * margin, stride, layout.BINS)
-        area[margin : margin + rows, margin : margin + columns] = cells
-    return histograms, geometry
-
-
-def _whole_derivatives(gray: Tensor) -> Tensor:
-    """Rectified derivatives int32 ``[8, h, w]`` of the half-resolution image, 256ths of a level a full-image pixel."""
-    pixels = _even(gray.int())
-    sums = (pixels[::2, ::2] + pixels[::2, 1::2]) + (pixels[1::2, ::2] + pixels[1::2, 1::2])
-    gx = _moved(sums, 1, 1) - _moved(sums, 1, -1)
-    gy = _moved(sums, 0, 1) - _moved(sums, 0, -1)
-    bins = [gx * COSINES[b] + gy * COSINES[(b - 2) % 8] for b in range(layout.BINS)]
-    return ((torch.stack(bins) + (1 << (DERIVATIVE_SHIFT - 1))) >> DERIVATIVE_SHIFT).clamp(min=0)
-
-
-def _binomial(maps: Tensor, axis: int, taps: int, distance: int) -> Tensor:
-    """One blur of `smoothing.smooth_line` along an axis, edges repeated."""
-    near = _mean(_moved(maps, axis, -distance), _moved(maps, axis, distance))
-    if taps == 3:
-        return _mean(maps, near)
-    far = _mean(_moved(maps, axis, -2 * distance), _moved(maps, axis, 2 * distance))
-    return _mean(near, _mean(maps, _mean(maps, far)))
-
-
-def _mean(first: Tensor, second: Tensor) -> Tensor:
-    return (first + second + 1) >> 1
-
-
-def _moved(maps: Tensor, axis: int, by: int) -> Tensor:
-    """The neighbour `by` places on along an axis, the edge's own value beyond it."""
-    last = maps.shape[axis] - 1
-    return maps.index_select(axis, (torch.arange(last + 1, device=maps.device) + by).clamp(0, last))
-
-
-def _even(maps: Tensor) -> Tensor:
-    """The last two axes cut to even lengths; a single row or column is doubled."""
-    for axis in (-2, -1):
-        count = maps.shape[axis]
-        index = torch.arange(2 * max(1, count // 2), device=maps.device).clamp(max=count - 1)
-        maps = maps.index_select(axis, index)
-    return maps
-
-
-def _halve(maps: Tensor) -> Tensor:
-    """Mean of 2 x 2 histograms, rounded as in `smoothing.fine_levels`: rows first, then columns."""
-    maps = _even(maps)
-    tall = _mean(maps[:, ::2], maps[:, 1::2])
-    return _mean(tall[..., ::2], tall[..., 1::2])
-
-
-# Matching cost and label searches as batched torch code: the reference of the kernels, and the path for GPUs.
-
-
 class TorchTables(NamedTuple):
-    """`cost.CostTables` on a device."""
+    """`matching_cost.CostTables` on a device."""
 
     samples: Tensor
     ring0: Tensor
@@ -149,22 +68,6 @@ def sample(histograms: Tensor, xy: Tensor, scale: Tensor, rotation: Tensor, tabl
     return histograms[torch.cat([first, second], dim=-1)]
 
 
-def rotated_descriptors(histograms: Tensor, points: Tensor, tables: TorchTables) -> Tensor:
-    """Reference descriptors uint8 ``[N, S, ROTATIONS, 17, 8]`` of points float32 ``[N, 2]``."""
-    limit = torch.tensor([tables.width - 1, tables.height - 1], dtype=points.dtype, device=points.device)
-    xy = (points[:, None] + tables.support.to(points.dtype)).clamp(min=0).minimum(limit)
-    neutral = torch.full(xy.shape[:-1], -layout.SCALE_LOW, device=points.device)
-    straight = torch.full_like(neutral, -layout.ANGLE_LOW)
-    plain = sample(histograms, xy, neutral, straight, tables).int()
-    turned = []
-    for sixths in range(layout.ANGLE_LOW, layout.ANGLE_HIGH + 1):
-        whole, part = divmod(sixths, 6)
-        far = part * 171  # of 1026
-        near_bins, far_bins = plain.roll(whole, dims=-1), plain.roll(whole + 1, dims=-1)
-        turned.append((((1026 - far) * near_bins + far * far_bins + 512) >> 10).to(torch.uint8))
-    return torch.stack(turned, dim=2)
-
-
 def quantise(labels: Tensor) -> tuple[Tensor, Tensor]:
     """Scale and rotation indices of labels ``[..., 4]``."""
     scale = (labels[..., 2] * 4 + 0.5).floor().long() - layout.SCALE_LOW
@@ -177,7 +80,7 @@ def label_costs(points: Tensor, labels: Tensor, descriptors: Tensor, histograms:
 
     Args:
         points: float32 ``[N, 2]``.
-        labels: float32 ``[N, L, 4]``; labels that are not finite or leave the image cost `cost.OUTSIDE`.
+        labels: float32 ``[N, L, 4]``; labels that are not finite or leave the image cost `matching_cost.OUTSIDE`.
         descriptors: uint8 ``[N, S, ROTATIONS, 17, 8]``.
         histograms: uint8 ``[total, 8]`` of the target.
         tables: Of the image size.
@@ -205,7 +108,7 @@ def label_costs(points: Tensor, labels: Tensor, descriptors: Tensor, histograms:
 
 
 class TorchState:
-    """The batched counterpart of `searches.common.SearchState`."""
+    """The batched counterpart of `search_kernels.SearchState`."""
 
     def __init__(
         self, points: Tensor, descriptors: Tensor, histograms: Tensor, tables: TorchTables, lower: Tensor,
@@ -239,14 +142,14 @@ class TorchState:
         self.flames = everything.gather(1, best[..., None].expand(-1, -1, 4))
 
     def widen(self) -> None:
-        """Let each box contain the surroundings of the best displacement (see `searches.common.widen`)."""
+        """Extend the bounds to 8 px around the best displacement (see `search_kernels.widen`)."""
         best = self.flames[:, :1, :2]
         self.lower[..., :2] = self.lower[..., :2].minimum(best - 8)
         self.upper[..., :2] = self.upper[..., :2].maximum(best + 8)
 
 
 def random_phase(state: TorchState, candidates: Tensor, end: int, shrink: float) -> None:
-    """The batched counterpart of `searches.patchmatch.shrinking_window_phase`."""
+    """The batched counterpart of `search_kernels.shrinking_window_phase`."""
     state.evaluate(candidates, end)
     state.widen()
     window, extent = 0.5, state.upper - state.lower
@@ -266,7 +169,7 @@ def moth_flame_phase(
     state: TorchState, candidates: Tensor, end: int, phase: int, rules: MothFlameRules, iterations: int,
     steps: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """The batched counterpart of `searches.moth_flame_kernel.moth_flame_phase` (Eq. 4-22)."""
+    """The batched counterpart of `search_kernels.moth_flame_phase` (Eq. 4-22)."""
     count, population = state.costs.shape
     device = state.points.device
     state.evaluate(candidates, end)
@@ -275,8 +178,8 @@ def moth_flame_phase(
         placed = min(candidates.shape[1], population)
         state.moths = state.lower + (state.upper - state.lower) * state.random((count, population, 4))
         state.evaluate(state.moths[:, placed:], end)
-        known = candidates[:, :placed].isfinite().all(-1, keepdim=True)
-        state.moths[:, :placed] = torch.where(known, candidates[:, :placed], state.moths[:, :placed])
+        finite = candidates[:, :placed].isfinite().all(-1, keepdim=True)
+        state.moths[:, :placed] = torch.where(finite, candidates[:, :placed], state.moths[:, :placed])
         if rules.opposition:
             least, greatest = state.moths.amin(1, keepdim=True), state.moths.amax(1, keepdim=True)  # Eq. 20
             state.evaluate(opposites(torch, state.moths, least, greatest, state.lower, state.upper, state.random), end)
@@ -292,21 +195,11 @@ def moth_flame_phase(
         state.evaluate(state.moths, end)
 
 
-# Sparse DAISY Filter Flow with maps, costs and search on a torch device.
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceMaps(OrientationMaps):
-    """`OrientationMaps` whose histograms also lie on a device, as uint8 ``[total, 8]``."""
-
-    on_device: Tensor
-
-
 class TorchSparseFlow(SparseDaisyFlow):
     """Sparse flow on any torch device; see `contracts.flow.FlowEstimator`.
 
     Args:
-        settings: How. The appearance terms of Eq. 1 exist on the processor only.
+        settings: Search, refinement and checks. The appearance terms of Eq. 1 exist on the processor only.
         device: For example ``cuda:0``; ``cpu`` runs the same code as a reference.
         threads: For the part on the processor.
 
@@ -328,24 +221,18 @@ class TorchSparseFlow(SparseDaisyFlow):
             reason = str(error).strip().splitlines()[0]
             raise SettingsError(f"device '{device}' cannot be used: {reason}", "device='cpu' always works") from None
 
-    def prepare(self, gray: NDArray[np.uint8]) -> DeviceMaps:
-        """The orientation maps of a uint8 ``[H, W]`` image."""
-        gray = np.ascontiguousarray(gray)
-        histograms, geometry = quantised_maps(torch.from_numpy(gray.copy()).to(self.device))
-        half = half_image(gray)
-        return DeviceMaps(gray, framed(gray), framed(half), histograms.cpu().numpy(), geometry, histograms)
-
     def _runner(self, plan: Plan, described: Reference, pair: Pair, state: SearchState, seed: int) -> Phase:
-        reference, target = pair.reference, pair.target
-        assert isinstance(reference, DeviceMaps) and isinstance(target, DeviceMaps)
-        device_tables = torch_tables(pair.tables, reference.gray.shape, self.device)
-        points = torch.from_numpy(described.points).to(self.device)
-        descriptors = rotated_descriptors(reference.on_device, points, device_tables)
-        lower, upper = torch.from_numpy(state.lower).to(self.device), torch.from_numpy(state.upper).to(self.device)
-        batch = TorchState(points, descriptors, target.on_device, device_tables, lower, upper, plan.population, seed)
+        def upload(array: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(array).to(self.device)
+
+        tables = torch_tables(pair.tables, pair.target.gray.shape, self.device)
+        shape = (len(described.points), len(pair.tables.support), layout.ROTATIONS, layout.HISTOGRAMS, layout.BINS)
+        descriptors, target = upload(described.descriptors).view(shape), upload(pair.target.histograms)
+        lower, upper, points = upload(state.lower), upload(state.upper), upload(described.points)
+        batch = TorchState(points, descriptors, target, tables, lower, upper, plan.population, seed)
 
         def run(number: int, candidates: NDArray[np.float32]) -> None:
-            labels, end = torch.from_numpy(candidates).to(self.device), plan.ends[number]
+            labels, end = upload(candidates), plan.ends[number]
             if plan.rules is None:
                 random_phase(batch, labels, end, plan.shrink)
             else:

@@ -179,13 +179,13 @@ def read_stamps(path: Path) -> NDArray[np.int64]:
     Raises:
         TrajectoryError: The file cannot be read, or a line does not begin with a stamp.
     """
-    found = []
+    stamps = []
     for number, parts in _lines(path):
         try:
-            found.append(parse_ns(parts[0]))
+            stamps.append(parse_ns(parts[0]))
         except ValueError:
             raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds") from None
-    return np.array(found, dtype=np.int64)
+    return np.array(stamps, dtype=np.int64)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -208,11 +208,11 @@ def _parts(line: str) -> list[str]:
 
 def _line_of(path: Path, ns: int) -> int | None:
     """The last line that begins with a stamp."""
-    found = None
+    last = None
     for number, parts in _lines(path):
         with suppress(ValueError):
-            found = number if parse_ns(parts[0]) == ns else found
-    return found
+            last = number if parse_ns(parts[0]) == ns else last
+    return last
 
 
 def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[str]]:
@@ -244,9 +244,9 @@ def _plain_table(path: Path, columns: int) -> tuple[NDArray[np.float64], list[st
             text = path.read_text(encoding="utf-8-sig").replace(",", " ")
             texts = [parts[0] for line in text.splitlines() if (parts := line.partition("#")[0].split(None, 1))]
             if texts:  # numpy warns of a table of nothing
-                found = np.loadtxt(io.StringIO(text), ndmin=2)
-                if found.shape == (len(texts), columns):
-                    return found, texts
+                table = np.loadtxt(io.StringIO(text), ndmin=2)
+                if table.shape == (len(texts), columns):
+                    return table, texts
     return None
 
 
@@ -272,20 +272,13 @@ def _hint(parts: list[str]) -> str:
 _MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 
 
-def read_kitti(
-    path: str | Path,
-    times: str | Path | NDArray[np.float64] | None = None,
-    *,
-    fps: float = 10.0,
-    described: str = "",
-) -> Trajectory:
+def read_kitti(path: str | Path, times: str | Path | None = None, *, fps: float = 10.0) -> Trajectory:
     """Read a KITTI pose file.
 
     Args:
         path: The poses.
-        times: Stamps in seconds ``[N]``, or a file of them, one a line; None for ``i / fps``.
+        times: A file whose lines begin with the stamps in seconds, one a pose; None for ``i / fps``.
         fps: Frame rate in Hz where there is no `times` (KITTI's is 10).
-        described: Where stamps that are no file come from, for messages.
 
     Returns:
         Camera-to-world poses; rotations are made orthonormal exactly (files hold about seven digits).
@@ -293,8 +286,7 @@ def read_kitti(
     Raises:
         TrajectoryError: A file cannot be read, a line is malformed or no rigid pose, or the stamps do not fit.
     """
-    path = Path(path)
-    rows = read_table(path, 12, _MEANING)
+    rows = read_table(Path(path), 12, _MEANING)
     poses = np.zeros((len(rows), 4, 4))
     poses[:, :3] = rows.reshape(-1, 3, 4)
     poses[:, 3, 3] = 1.0
@@ -303,21 +295,14 @@ def read_kitti(
             raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     poses[:, :3, :3] = u @ vt
-    exact = None
-    if times is None:
-        if not (np.isfinite(fps) and fps > 0):
-            raise TrajectoryError(f"the frame rate is {fps!r}, not a positive number of Hz")
-        stamps = np.arange(len(poses)) / fps
-    else:
-        named = described or (str(times) if isinstance(times, (str, Path)) else "the list")
-        if isinstance(times, (str, Path)):
-            exact = read_stamped_table(Path(times), 1, "timestamp")[1]
-            stamps = to_seconds(exact)
-        else:
-            stamps = times
-        if len(stamps) != len(poses):
-            raise TrajectoryError(f"{path} has {len(poses)} poses but {named} has {len(stamps)} stamps")
-    return Trajectory(stamps, poses, exact)
+    if times is not None:
+        ns = read_stamps(Path(times))
+        if len(ns) != len(poses):
+            raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
+        return Trajectory(to_seconds(ns), poses, ns)
+    if not (np.isfinite(fps) and fps > 0):
+        raise TrajectoryError(f"the frame rate is {fps!r}, not a positive number of Hz")
+    return Trajectory(np.arange(len(poses)) / fps, poses)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:
@@ -349,19 +334,7 @@ def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> T
         TrajectoryError: A file cannot be read, is malformed, or the stamps do not fit the poses.
     """
     path = Path(path)
-    if timestamps is None or _values(path) != KITTI_VALUES:
+    if timestamps is None or len(next(_lines(path), (0, []))[1]) != KITTI_VALUES:
         return load_tum(path)
-    ns = read_stamps(Path(timestamps))
-    seconds = to_seconds(ns)
-    trajectory = read_kitti(path, seconds, described=str(timestamps))
-    trajectory = trajectory.with_exact(dict(zip(seconds.tolist(), ns.tolist(), strict=True)))
+    trajectory = read_kitti(path, timestamps)
     return TumFile(trajectory, FileNotes(lines=len(trajectory)))
-
-
-def _values(path: Path) -> int:
-    """Values in the first line that holds any."""
-    for line in read_lines(path, kind=TrajectoryError):
-        parts = line.partition("#")[0].replace(",", " ").split()
-        if parts:
-            return len(parts)
-    return 0

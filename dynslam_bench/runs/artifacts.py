@@ -1,8 +1,8 @@
-"""What the tracker saw on some frames of a run: its features, kept or culled, and its mask; for pictures afterwards."""
+"""What a run leaves beside its trajectory: snapshots of frames, the map, the sheet, the video."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
-from dynslam_bench.core.array_files import read_npz
 from dynslam_bench.core.errors import RunError, TrackerError
+from dynslam_bench.core.reading import read_npz
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
@@ -85,9 +85,9 @@ class SnapshotWriter:
         self._size = (shape[0], shape[1])
         error = None if outcome.error is None else outcome.error.frame_trans_m
         if outcome.index in self._spread:
-            self._even.append(taken(outcome.index, result))
+            self._even.append(snapshot_of(outcome.index, result))
         elif error is not None and (len(self._worst) < WORST or error > self._worst[-1][0]):
-            self._worst.append((error, taken(outcome.index, result)))
+            self._worst.append((error, snapshot_of(outcome.index, result)))
             self._worst = sorted(self._worst, key=lambda pair: -pair[0])[:WORST]
 
     def write(self) -> None:
@@ -108,8 +108,8 @@ class SnapshotWriter:
         )
 
 
-def taken(index: int, result: TrackResult) -> Snapshot:
-    """What a tracker saw on a frame."""
+def snapshot_of(index: int, result: TrackResult) -> Snapshot:
+    """The snapshot of a frame that was tracked."""
     points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
     kept = result.keypoints_keep
     mask = result.dynamic_mask
@@ -138,11 +138,11 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     path = folder / SNAPSHOTS_FILE
     if not path.is_file():
         return (0, 0), []
-    found = read_npz(path, kind=RunError)
+    arrays = read_npz(path, kind=RunError)
     try:
-        height, width = map(int, found["size"])
-        index, count, points, kept = found["index"], found["count"], found["points"], found["kept"]
-        masks, masked = found["masks"], found["masked"]
+        height, width = map(int, arrays["size"])
+        index, count, points, kept = arrays["index"], arrays["count"], arrays["points"], arrays["kept"]
+        masks, masked = arrays["masks"], arrays["masked"]
         if masks.dtype != np.uint8 or masks.shape[1:] != (height, -(-width // 8)):
             raise ValueError(f"masks of {masks.dtype} {masks.shape} do not fit {width} x {height} pixels")
         if not (
@@ -165,62 +165,46 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     return (height, width), shots
 
 
-# What is kept of the map at the end of a run.
-
-
-@dataclass(frozen=True)
-class KeptMap:
-    """A run's map.
-
-    Attributes:
-        outputs: Keyframes and points; None if the tracker offers none.
-        counts: ``keyframes``, ``map_points`` and ``maps`` for the record; None for what the tracker does not say.
-        notes: What a reader should know of it.
-    """
-
-    outputs: MapOutputs | None
-    counts: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(("keyframes", "map_points", "maps")))
-    notes: tuple[str, ...] = ()
-
-
-def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> KeptMap:
+def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> tuple[MapOutputs | None, dict[str, int | None], list[str]]:
     """Write ``keyframes.csv``, ``map.ply`` and, if it was asked for, ``map.npz``.
+
+    Returns:
+        Keyframes and points, None if the tracker offers none; ``keyframes``, ``map_points`` and ``maps`` for the
+        record, None for what the tracker does not say; and notes for a reader.
 
     Raises:
         DynslamError: A file cannot be written.
     """
-    not_saved = _save(env, folder, spec) if spec.save_map else ()
+    notes: list[str] = []
+    if spec.save_map:
+        try:
+            env.save_map(folder / MAP_FILE, _origin_of_map(env, spec))
+        except TrackerError as error:
+            notes.append(f"no {MAP_FILE}: {error}")
     outputs = env.map_outputs()
     if outputs is None:
-        return KeptMap(None, notes=not_saved)
+        return None, dict.fromkeys(("keyframes", "map_points", "maps")), notes
     write_keyframes_csv(folder / "keyframes.csv", outputs, env.exact_stamps)
     write_ply(folder / "map.ply", outputs)
-    numbers = np.array([record.map for record in outputs.keyframes])
+    numbers = np.array([keyframe.map for keyframe in outputs.keyframes])
     maps = len(np.unique(numbers))
-    counts = {"keyframes": len(outputs.keyframes), "map_points": len(outputs.positions), "maps": maps}
-    apart = int(np.count_nonzero(numbers))
-    met = (
-        f"{maps} maps that never met: {apart} of {len(numbers)} keyframes lie in others than the first, whose place "
-        "in it is unknown; frames tracked there count as lost, and no points of it are in map.ply"
-    )
-    return KeptMap(outputs, counts, (*not_saved, *([met] if maps > 1 else [])))
+    if maps > 1:
+        notes.append(
+            f"{maps} maps that never met: {np.count_nonzero(numbers)} of {len(numbers)} keyframes lie in others than "
+            "the first, whose place in it is unknown; frames tracked there count as lost, and no points of it are in "
+            "map.ply"
+        )
+    return outputs, {"keyframes": len(numbers), "map_points": len(outputs.positions), "maps": maps}, notes
 
 
-def _save(env: SlamEnv, folder: Path, spec: RunSpec) -> tuple[str, ...]:
-    """Write the map; why that was not possible, if it was not."""
+def _origin_of_map(env: SlamEnv, spec: RunSpec) -> str:
+    """Which run made a map, in words."""
     start, stop = spec.frames_seen or (0, None)
     asked = spec.settings | {f"degrade.{kind}": strength for kind, strength in spec.degrade.items()}
     words = [f"{env.tracker_spec.id} on {env.sequence.id}", f"frames {start}:{'' if stop is None else stop}"]
     words += [f"stride {spec.stride}"] * (spec.stride != 1) + [f"seed {spec.seed}"]
-    words += [f"{name}={value}" for name, value in asked.items()]
-    try:
-        env.save_map(folder / MAP_FILE, ", ".join(words))
-    except TrackerError as error:
-        return (f"no {MAP_FILE}: {error}",)
-    return ()
+    return ", ".join([*words, *(f"{name}={value}" for name, value in asked.items())])
 
-
-# Collects what the five-panel sheet of a run shows while the run goes on, and writes it at the end.
 
 SHOWN = 9
 """Frames, and keyframes, on a sheet."""
@@ -239,7 +223,7 @@ class SheetWriter:
     def __init__(self, path: Path, env: SlamEnv) -> None:
         self._path, self._env = path, env
         self._canvas = Canvas(env.sequence, env.tracker_spec.label)
-        self._wanted = set(_spread(len(env.sequence)))
+        self._wanted = set(spread(len(env.sequence), SHOWN))
         self._frames: list[Image] = []
 
     def add(self) -> None:
@@ -256,20 +240,13 @@ class SheetWriter:
         """
         sequence = self._env.sequence
         own = [record.frame for record in outputs.keyframes if record.frame >= 0]  # others are of an earlier run
-        shown = [own[row] for row in _spread(len(own))]
+        shown = [own[row] for row in spread(len(own), SHOWN)]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth, ate_m = aligned_truth(sequence.ground_truth, track)
         sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES)
         write_sheet(self._path, sheet)
 
-
-def _spread(count: int) -> list[int]:
-    """At most `SHOWN` indices spread over `count` things, the first and the last among them."""
-    return sorted({int(index) for index in np.linspace(0, max(count - 1, 0), min(SHOWN, count)).round()})
-
-
-# The video of a run, in a format that browsers play: VP9 in WebM, which OpenCV brings along.
 
 VIDEO_FILE = "video.webm"
 
@@ -313,9 +290,6 @@ class VideoWriter:
             self._writer.release()
 
 
-# The ground truth laid over a run's trajectory, for pictures of it.
-
-
 def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajectory | None, float | None]:
     """The ground truth at the track's stamps, moved onto the track by least squares, and what is left in metres (RMSE).
 
@@ -325,13 +299,13 @@ def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajecto
         return None, None
     errors = OnlineError(truth)
     poses = [errors.truth_at(float(stamp)) for stamp in track.timestamps]
-    known = [row for row, pose in enumerate(poses) if pose is not None]
-    if len(known) < 3:
+    rows = [row for row, pose in enumerate(poses) if pose is not None]
+    if len(rows) < 3:
         return None, None
-    true = np.array([poses[row] for row in known])
-    fit = align(track.T_world_cam[known], true, "se3")
+    true = np.array([poses[row] for row in rows])
+    fit = align(track.T_world_cam[rows], true, "se3")
     move = np.eye(4)
     move[:3, :3], move[:3, 3] = fit.rotation, fit.translation
-    moved = Trajectory(track.timestamps[known], se3.inverse(move) @ true)
-    left = moved.positions - track.positions[known]
+    moved = Trajectory(track.timestamps[rows], se3.inverse(move) @ true)
+    left = moved.positions - track.positions[rows]
     return moved, float(np.sqrt(np.square(left).sum(axis=1).mean()))

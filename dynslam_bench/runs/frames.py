@@ -1,4 +1,4 @@
-"""One frame of a run: a line of the child's log and a row of ``frames.csv``, written and read by the same code."""
+"""The frames of a run: lines of the child's log, rows of ``frames.csv``, and a pandas frame."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, field_validator
+from pydantic.dataclasses import dataclass as validated
 
 from dynslam_bench.core.errors import DynslamError, RunError
-from dynslam_bench.core.reading import parse_json, read_lines
+from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.sanitise import storable
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import format_ns, ns_of
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -24,14 +28,13 @@ from dynslam_bench.runs.store import RunStore
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dynslam_bench.envs.episode import FrameOutcome, FrameState
-
+    from dynslam_bench.envs.episode import FrameOutcome
 
 FRAMES_FILE = "frames.jsonl"
 """The child's log: one line a frame, complete before the next frame begins; gone when the run is stored."""
 CSV_FILE = "frames.csv"
 """The stored table: one row a frame."""
-STATES: tuple[FrameState, ...] = ("initialising", "ok", "lost", "dropped")
+ONLINE_FILE = "trajectory_online.txt"
 FIXED = (
     *("index", "timestamp", "state"),
     *("frame_error_trans_m", "frame_error_rot_deg", "pose_error_trans_m", "pose_error_rot_deg"),
@@ -46,7 +49,7 @@ _STAT = "stat_"
 _SECONDS = "_s"
 
 
-@dataclass(frozen=True)
+@validated(frozen=True, config=ConfigDict(extra="forbid"))
 class FrameRow:
     """What is kept of one frame.
 
@@ -68,19 +71,26 @@ class FrameRow:
         dynamic_share: Share of the pixels that show people, by the exact masks, 0 to 1; None without such masks.
     """
 
-    index: int
-    timestamp: float
-    state: FrameState
+    index: Annotated[int, Field(ge=0, lt=MOST_FRAMES)]
+    timestamp: Annotated[float, Field(allow_inf_nan=False)]
+    state: Literal["initialising", "ok", "lost", "dropped"]
     frame_error_trans_m: float | None = None
     frame_error_rot_deg: float | None = None
     pose_error_trans_m: float | None = None
     pose_error_rot_deg: float | None = None
     reward_m: float = 0.0
     mask_iou: float | None = None
-    timings: Mapping[str, float] = field(default_factory=dict)
-    stats: Mapping[str, float] = field(default_factory=dict)
-    pose: Sequence[float] | None = None
+    timings: dict[str, float] = field(default_factory=dict)
+    stats: dict[str, float] = field(default_factory=dict)
+    pose: list[float] | None = None
     dynamic_share: float | None = None
+
+    @field_validator("pose")
+    @classmethod
+    def _is_pose(cls, pose: list[float] | None) -> list[float] | None:
+        if pose is not None and (len(pose) != 7 or not np.isfinite(pose).all() or math.hypot(*pose[3:]) < 1e-8):
+            raise ValueError("it holds no pose")
+        return pose
 
     @classmethod
     def of(cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None) -> FrameRow:
@@ -101,7 +111,7 @@ class FrameRow:
             reward_m=outcome.reward,
             mask_iou=mask_iou,
             timings=dict(outcome.timings),
-            stats=dict(outcome.stats),
+            stats=storable(dict(outcome.stats)),
             pose=pose,
             dynamic_share=dynamic_share,
         )
@@ -118,71 +128,13 @@ class FrameRow:
         return json.dumps(vars(self)) + "\n"
 
 
-def read_log(path: Path) -> tuple[list[FrameRow], str]:
-    """Read the child's log; no file is no frames.
-
-    Returns:
-        The rows up to the first that is damaged, and what is wrong with that, empty for none. A line that a dying
-        process left unfinished is not taken, and no damage.
-    """
-    rows: list[FrameRow] = []
-    if not path.is_file():
-        return rows, ""
-    try:
-        for line in read_lines(path, kind=RunError):
-            if line.endswith("\n"):
-                row = _from_json(line)
-                if rows and row.timestamp <= rows[-1].timestamp:
-                    raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
-                rows.append(row)
-    except (DynslamError, LookupError, TypeError, ValueError, OverflowError) as error:
-        reason = " ".join(str(error).split())[:200]
-        return rows, f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})"
-    return rows, ""
-
-
-def _from_json(line: str) -> FrameRow:
-    values = parse_json(line, "it", kind=RunError)
-    if not isinstance(values, dict) or not set(values) <= set(FrameRow.__dataclass_fields__):
-        raise ValueError("it is no frame")
-    pose = values.get("pose")
-    if pose is not None:
-        pose = [float(number) for number in pose]
-        if len(pose) != 7 or not all(map(math.isfinite, pose)) or math.hypot(*pose[3:]) < 1e-8:
-            raise ValueError("it holds no pose")
-    numbers = {name: _number(values[name]) for name in (*FIXED[3:], _SHARE) if values.get(name) is not None}
-    timestamp = float(values["timestamp"])
-    if not math.isfinite(timestamp):
-        raise ValueError(f"stamp {timestamp}")
-    return FrameRow(
-        index=_index(values["index"]),
-        timestamp=timestamp,
-        state=_state(values["state"]),
-        **numbers,
-        timings={str(name): _number(number) for name, number in dict(values.get("timings", {})).items()},
-        stats={str(name): _number(number) for name, number in dict(values.get("stats", {})).items()},
-        pose=pose,
-    )
-
-
-def _index(value: Any) -> int:
-    index = int(value)
-    if not 0 <= index < MOST_FRAMES:
-        raise ValueError(f"index {str(value)[:40]}")
-    return index
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{str(value)[:40]!r} is no number")
-    float(value)  # an integer may be too large for one
-    return value
+_LINE = TypeAdapter(FrameRow)
 
 
 def column_names(rows: Iterable[FrameRow]) -> list[str]:
     """The columns of a table of frames: `FIXED`, the stages' times, the stats, in the order they appeared in."""
-    seen = dict.fromkeys(name for row in rows for name in row.cells())
-    others = [name for name in seen if name not in FIXED]
+    names = dict.fromkeys(name for row in rows for name in row.cells())
+    others = [name for name in names if name not in FIXED]
     return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT))]
 
 
@@ -190,63 +142,37 @@ def write_csv(path: Path, rows: Sequence[FrameRow], exact: Mapping[float, int] |
     """Write ``frames.csv``; `exact` gives the nanoseconds of stamps by their seconds."""
     columns = column_names(rows)
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        table = csv.writer(file)
-        table.writerow(columns)
+        table = csv.DictWriter(file, columns)
+        table.writeheader()
         for row in rows:
-            cells = row.cells() | {"timestamp": format_ns((exact or {}).get(row.timestamp) or ns_of(row.timestamp))}
-            table.writerow([cells.get(name) for name in columns])
+            stamp = (exact or {}).get(row.timestamp) or ns_of(row.timestamp)
+            table.writerow(row.cells() | {"timestamp": format_ns(stamp)})
 
 
 def read_csv(path: Path) -> list[FrameRow]:
-    """Read a ``frames.csv``, of today or of an older version; columns of another kind are left out.
+    """Read a ``frames.csv``; columns of another kind are left out.
 
     Raises:
         RunError: There is no such file, or it holds something else.
     """
     rows: list[FrameRow] = []
     try:
-        rows.extend(_parse(line) for line in csv.DictReader(read_lines(path, kind=RunError)))
-    except (LookupError, TypeError, ValueError, OverflowError, csv.Error) as error:
-        raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({error!r})") from error
+        rows.extend(map(_parse, csv.DictReader(read_lines(path, kind=RunError))))
+    except (TypeError, ValueError, csv.Error) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({reason})") from error
     return rows
 
 
-def _parse(line: Mapping[str, str]) -> FrameRow:
+def _parse(line: dict[str, str]) -> FrameRow:
     if None in line or None in line.values():
         raise ValueError("another number of cells than the heading has")
-    cells = {name: float(text) for name, text in line.items() if text and name not in FIXED[:3]}
-    stats = {name[len(_STAT) :]: value for name, value in cells.items() if name.startswith(_STAT)}
-    timings = {
-        name[: -len(_SECONDS)]: value
-        for name, value in cells.items()
-        if name.endswith(_SECONDS) and not name.startswith(_STAT)
-    }
-    return FrameRow(
-        index=_index(line["index"]),
-        timestamp=float(line["timestamp"]),
-        state=_state(line["state"]),
-        frame_error_trans_m=cells.get("frame_error_trans_m"),
-        frame_error_rot_deg=cells.get("frame_error_rot_deg"),
-        pose_error_trans_m=cells.get("pose_error_trans_m"),
-        pose_error_rot_deg=cells.get("pose_error_rot_deg"),
-        reward_m=cells["reward_m"],
-        mask_iou=cells.get("mask_iou"),
-        timings=timings,
-        stats=stats,
-        dynamic_share=cells.get(_SHARE),
-    )
-
-
-def _state(text: object) -> FrameState:
-    for known in STATES:
-        if text == known:
-            return known
-    raise ValueError(f"unknown state '{text}'")
-
-
-# From the child's frame log to `frames.csv`, the online trajectory and the sums of a record.
-
-ONLINE_FILE = "trajectory_online.txt"
+    cells = {name: text for name, text in line.items() if text}
+    known: dict[str, Any] = {name: cells.pop(name) for name in (*FIXED, _SHARE) if name in cells}
+    stats = {name.removeprefix(_STAT): text for name, text in cells.items() if name.startswith(_STAT)}
+    times = {name: text for name, text in cells.items() if name.endswith(_SECONDS) and not name.startswith(_STAT)}
+    timings = {name.removesuffix(_SECONDS): text for name, text in times.items()}
+    return _LINE.validate_python(known | {"stats": stats, "timings": timings})
 
 
 @dataclass
@@ -263,8 +189,23 @@ class FrameLog:
 
     @classmethod
     def read(cls, path: Path) -> FrameLog:
-        """Read the child's log; a line that a dying process left unfinished is not taken."""
-        return cls(*read_log(path))
+        """Read the child's log up to the first damaged row; no file is no frames.
+
+        A line that a dying process left unfinished is not taken, and no damage.
+        """
+        log = cls()
+        rows = log.rows
+        try:
+            for line in read_lines(path, kind=RunError) if path.is_file() else ():
+                if line.endswith("\n"):
+                    row = _LINE.validate_json(line)
+                    if rows and row.timestamp <= rows[-1].timestamp:
+                        raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
+                    rows.append(row)
+        except (DynslamError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+            log.damage = f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})"
+        return log
 
     def count(self, state: str) -> int:
         """Frames of a state."""
@@ -272,12 +213,8 @@ class FrameLog:
 
     def lost_streak(self) -> int:
         """Frames lost in a row at the end."""
-        streak = 0
-        for row in reversed(self.rows):
-            if row.state != "lost":
-                break
-            streak += 1
-        return streak
+        lost = takewhile(lambda row: row.state == "lost", reversed(self.rows))
+        return sum(1 for _ in lost)
 
     def trajectory(self) -> Trajectory:
         """The online trajectory."""
@@ -289,13 +226,13 @@ class FrameLog:
     def timings(self) -> dict[str, StageTime]:
         """Median, p95 and mean of every stage over the frames that reached the tracker."""
         frames = [row.timings for row in self.rows if row.timings]
-        found = {}
+        times = {}
         for stage in dict.fromkeys(stage for frame in frames for stage in frame):
             values = np.array([frame.get(stage, 0.0) for frame in frames])
-            found[stage] = StageTime(
+            times[stage] = StageTime(
                 median_s=float(np.median(values)), p95_s=float(np.percentile(values, 95)), mean_s=float(values.mean())
             )
-        return found
+        return times
 
     def mask_iou(self) -> float | None:
         """Mean overlap of the dynamic mask with the exact masks of people over the frames where either has pixels."""
@@ -325,8 +262,6 @@ class FrameLog:
         write_tum(folder / ONLINE_FILE, self.trajectory().with_exact(exact or {}), comment=comment)
         write_csv(folder / CSV_FILE, self.rows, exact)
 
-
-# The frames of a stored run as a pandas frame, one row a frame.
 
 _KINDS = {"index": "int64", "timestamp": "float64", "state": "string", "reward_m": "float64"}
 """Columns that are never missing; all others are ``Float64``."""

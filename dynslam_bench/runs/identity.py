@@ -31,8 +31,7 @@ from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
-from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, weights_digest
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import DATASETS
 from dynslam_bench.sequences.view import part_of
@@ -40,7 +39,7 @@ from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-_ROOMS = (
+_PACKAGES = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
     *("culling", "slam", "trackers", "envs"),
 )
@@ -104,6 +103,10 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
     by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
     part = part_of(sequence, spec.offset)
+    installed = versions()  # another version of what computes with the run's data may give other bits
+    libraries = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
+    dataset = next((each.spec for each in DATASETS.all() if each.spec.id == spec.sequence.partition("/")[0]), None)
+    sequence_plugin = "" if dataset is None else plugin_digest(dataset.entry_point)
     identity = {
         "scheme": IDENTITY_SCHEME,
         "tracker": tracker.id,
@@ -114,7 +117,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "settings": flatten(settings) | by_content,
         "segmentation": source,
         "weights": weights,
-        **files_of(tracker, settings),
+        **({"files": _files_digest(tracker, settings)} if tracker.files else {}),
         "sequence": part.id,
         "content": part.content,
         "camera": part.camera,
@@ -129,28 +132,10 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
-        "libraries": libraries_of(settings),
-        **sequence_plugin_of(spec.sequence),
+        "libraries": {name: installed.get(name, "") for name in libraries},
+        **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
     }
     return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
-
-
-def libraries_of(settings: Settings) -> dict[str, str]:
-    """Versions of the libraries that compute with the run's data: another version may give other bits."""
-    known = versions()
-    names = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
-    return {name: known.get(name, "") for name in names}
-
-
-def sequence_plugin_of(sequence: str) -> dict[str, str]:
-    """``sequence_plugin``: digest of the code of the plug-in that reads the sequence; nothing for the readers here.
-
-    Raises:
-        PluginError: Its code cannot be read.
-    """
-    found = next((each.spec for each in DATASETS.all() if each.spec.id == sequence.partition("/")[0]), None)
-    code = "" if found is None else plugin_digest(found.entry_point)
-    return {"sequence_plugin": code} if code else {}
 
 
 def distribution_of(tracker: TrackerSpec) -> str:
@@ -172,27 +157,17 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     Raises:
         PluginError: A plug-in is unknown, or its code cannot be read.
     """
-    points = {} if settings is None else entry_points_of(settings, source)
-    own = code_digest(tracker.entry_point, _ROOMS)
-    return digest([own, {name: plugin_digest(point) for name, point in sorted(points.items())}])
-
-
-def entry_points_of(settings: Settings, source: str = "") -> dict[str, str]:
-    """Entry points of the plug-ins that settings name, by the setting's name.
-
-    Raises:
-        PluginError: A plug-in is unknown.
-    """
     registries: dict[str, Registry[Any]] = {"features": FEATURES, "flow": FLOWS}
-    found = {
-        name: registries[kind].get(value).entry_point
-        for name, (kind, value) in named(settings).items()
+    names = {} if settings is None else named(settings)
+    plugins = {
+        name: plugin_digest(registries[kind].get(value).entry_point)
+        for name, (kind, value) in sorted(names.items())
         if kind in registries
     }
-    prefix, _, argument = source.partition(":")
+    prefix, _, segmenter = source.partition(":")
     if prefix == "plugin":
-        found["segmentation.source"] = SEGMENTERS.get(argument).entry_point
-    return found
+        plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
+    return digest([code_digest(tracker.entry_point, _PACKAGES), plugins])
 
 
 def weights_of(settings: Settings, source: str) -> dict[str, str]:
@@ -201,23 +176,21 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
     Raises:
         PluginError: A file cannot be read.
     """
-    found = named_digests(settings)
+    digests = named_digests(settings)
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
-        found[source] = weights_digest(group.model_copy(update={"source": source}))
-    return found
+        digests[source] = weights_digest(group.model_copy(update={"source": source}))
+    return digests
 
 
-def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, str]:
-    """``files``: digest of what the tracker's spec says decides its results beside its settings; else nothing.
+def _files_digest(tracker: TrackerSpec, settings: Settings) -> str:
+    """Digest of the files that, by the tracker's spec, decide its results beside its settings.
 
     Raises:
         PluginError: One of the files cannot be read.
     """
-    if not tracker.files:
-        return {}
     try:
-        return {"files": contents_digest(load_object(tracker.files)(settings))}
+        return contents_digest(load_object(tracker.files)(settings))
     except OSError as error:
         raise PluginError(f"cannot read a file of tracker '{tracker.id}': {error}") from error
 
@@ -228,9 +201,6 @@ def _check_degradation(strengths: dict[str, float]) -> None:
     if unknown:
         raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], known))
     Degradation(seed=0, **strengths)
-
-
-# The map that a run begins in, looked up before anything runs.
 
 
 def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:

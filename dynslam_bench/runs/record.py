@@ -15,7 +15,7 @@ RUN_SCHEMA = 1
 METRIC_SCHEMA = 1
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
-IDENTITY_SCHEME = 2
+IDENTITY_SCHEME = 1
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 _CODE = ("tracker_version", "distribution", "source", "requires", "files")
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
@@ -307,7 +307,6 @@ class MetricRecord(Record):
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.
         code: Digest of the evaluation code that computed them.
-        inputs: Digest of the trajectories, the stamps and the ground truth that they were computed from.
         trajectory: Which of the two the protocol asks for.
         online: Evaluation of the online trajectory; None if it cannot be evaluated.
         final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
@@ -320,7 +319,6 @@ class MetricRecord(Record):
     protocol_id: str
     protocol_digest: str
     code: str = ""
-    inputs: str = ""
     trajectory: Literal["online", "final"] = "online"
     online: Evaluation | None = None
     final: Evaluation | None = None

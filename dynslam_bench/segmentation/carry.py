@@ -16,11 +16,11 @@ CORNERS = 40
 """Corners that are tracked on each object in sparse mode."""
 LEAST_CORNERS = 6
 ROUND_TRIP_PX = 1.0
-"""A corner that does not come back to within this distance is not trusted."""
+"""Largest forward-backward error of a corner that is used."""
 
 
 def dense_flow(previous: Gray, current: Gray) -> NDArray[np.float32]:
-    """Where each pixel of the previous image went, by DIS (Kroeger et al. 2016).
+    """Dense flow from the previous image to the current one, by DIS (Kroeger et al. 2016).
 
     Args:
         previous: uint8 ``[H, W]``.
@@ -41,8 +41,8 @@ def dense_flow(previous: Gray, current: Gray) -> NDArray[np.float32]:
 def object_flow(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.float32]:
     """The flow of one object, smoothed and continued beyond its edge.
 
-    Dense flow blurs across the edge of a moving object, which would leave a trail of its mask behind; only the inside
-    is believed, and its local means are continued outwards.
+    Dense flow blurs across the edge of a moving object and would leave a trail of its mask. Only the flow inside the
+    object is used; its local means are continued outwards.
 
     Args:
         mask: bool ``[h, w]``.
@@ -70,7 +70,7 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
         field: Flow ``[h, w, 2]`` from the mask's image to the next, in its own pixels; a smaller field is interpolated.
 
     Returns:
-        Bool ``[H, W]``; an object that was cut by the image's edge is continued as it comes in.
+        Bool ``[H, W]``; an object that the image's edge cuts is continued when it moves in.
     """
     height, width = mask.shape
     rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
@@ -94,49 +94,47 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
     return np.asarray(np.asarray(moved) >= 128)
 
 
-def carry_dense(found: Instances, previous: Gray, current: Gray) -> Instances:
+def carry_dense(instances: Instances, previous: Gray, current: Gray) -> Instances:
     """The objects of the previous image in the current one, moved by dense flow; lost objects are left out."""
-    if not len(found):
-        return found
+    if not len(instances):
+        return instances
     flow = dense_flow(previous, current)
-    masks = np.zeros_like(found.masks)
-    for index, mask in enumerate(found.masks):
+    masks = np.zeros_like(instances.masks)
+    for index, mask in enumerate(instances.masks):
         _carry_object(mask, flow, masks[index])
-    return _moved(found, masks)
+    return _moved(instances, masks)
 
 
 def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32], moved: NDArray[np.bool_]) -> None:
-    """Write one object's moved mask into `moved`, working in the object's surroundings only."""
+    """Write one object's moved mask into `moved`, working in a window around the object only."""
     step_y, step_x = mask.shape[0] / flow.shape[0], mask.shape[1] / flow.shape[1]
     small = cv2.resize(mask.view(np.uint8), (flow.shape[1], flow.shape[0]), interpolation=cv2.INTER_NEAREST) > 0
     rows, columns = np.flatnonzero(small.any(axis=1)), np.flatnonzero(small.any(axis=0))
     if not rows.size:
         return
     inside = flow[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    reach = 4 + int(np.ceil(min(float(np.abs(inside).max()), max(flow.shape[:2]))))
-    y0, y1 = max(0, int(rows[0]) - reach), min(flow.shape[0], int(rows[-1]) + 1 + reach)
-    x0, x1 = max(0, int(columns[0]) - reach), min(flow.shape[1], int(columns[-1]) + 1 + reach)
+    margin = 4 + int(np.ceil(min(float(np.abs(inside).max()), max(flow.shape[:2]))))
+    y0, y1 = max(0, int(rows[0]) - margin), min(flow.shape[0], int(rows[-1]) + 1 + margin)
+    x0, x1 = max(0, int(columns[0]) - margin), min(flow.shape[1], int(columns[-1]) + 1 + margin)
     field = object_flow(np.ascontiguousarray(small[y0:y1, x0:x1]), np.ascontiguousarray(flow[y0:y1, x0:x1]))
     part = (slice(round(y0 * step_y), round(y1 * step_y)), slice(round(x0 * step_x), round(x1 * step_x)))
     moved[part] = push_mask(np.ascontiguousarray(mask[part]), field)
 
 
-def carry_sparse(found: Instances, previous: Gray, current: Gray) -> Instances:
+def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instances:
     """The objects of the previous image in the current one, each moved by the similarity of its tracked corners.
 
     Corners on each object are tracked there and back by pyramidal Lucas-Kanade; RANSAC fits a similarity. An object
     with fewer than six consistent corners keeps its place.
     """
-    if not len(found):
-        return found
-    height, width = current.shape
-    masks = found.masks.copy()
-    for index, mask in enumerate(found.masks):
+    if not len(instances):
+        return instances
+    masks = instances.masks.copy()
+    for index, mask in enumerate(instances.masks):
         motion = _similarity(mask, previous, current)
         if motion is not None:
-            moved = cv2.warpAffine(mask.view(np.uint8) * np.uint8(255), motion, (width, height), flags=cv2.INTER_LINEAR)
-            masks[index] = np.asarray(moved) >= 128
-    return _moved(found, masks)
+            masks[index] = _warp(mask, motion)
+    return _moved(instances, masks)
 
 
 def shift_mask(mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0) -> NDArray[np.bool_]:
@@ -146,7 +144,11 @@ def shift_mask(mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0
         return mask
     centre = np.array([(columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2])
     move = np.array([[scale, 0, centre[0] * (1 - scale) + dx], [0, scale, centre[1] * (1 - scale) + dy]])
-    moved = cv2.warpAffine(mask.view(np.uint8) * np.uint8(255), move, (mask.shape[1], mask.shape[0]))
+    return _warp(mask, move)
+
+
+def _warp(mask: NDArray[np.bool_], motion: NDArray[np.float64]) -> NDArray[np.bool_]:
+    moved = cv2.warpAffine(mask.view(np.uint8) * np.uint8(255), motion, mask.shape[::-1], flags=cv2.INTER_LINEAR)
     return np.asarray(np.asarray(moved) >= 128)
 
 
@@ -169,7 +171,7 @@ def _similarity(mask: NDArray[np.bool_], previous: Gray, current: Gray) -> NDArr
     return None if motion is None else np.asarray(motion, np.float64)
 
 
-def _moved(found: Instances, masks: NDArray[np.bool_]) -> Instances:
+def _moved(instances: Instances, masks: NDArray[np.bool_]) -> Instances:
     """The same objects under new masks, without those that left the image."""
-    moved = Instances(masks, boxes_of(masks), found.class_names, found.scores, found.moving)
+    moved = Instances(masks, boxes_of(masks), instances.class_names, instances.scores, instances.moving)
     return pick(moved, np.asarray(masks.any(axis=(1, 2))))

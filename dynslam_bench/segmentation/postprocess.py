@@ -1,8 +1,6 @@
-"""Bring whatever image a caller has into the form that segmenters take."""
+"""From instances to the dynamic pixels: selection, repair, dilation. Pure functions."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import cv2
 import numpy as np
@@ -10,55 +8,10 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings
 
-
-def as_rgb(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """A uint8 ``[H, W, 3]`` image from a grey, RGB or RGBA one of any size.
-
-    Args:
-        image: ``[H, W]``, ``[H, W, 1]``, ``[H, W, 3]`` or ``[H, W, 4]`` (alpha is dropped); uint8, uint16 (scaled by
-            1/257), bool, or floating point in [0, 1].
-
-    Raises:
-        SegmentationError: Another shape, an empty image, another type, or floats outside [0, 1].
-    """
-    array = np.asarray(image)
-    if array.ndim == 2:
-        array = array[:, :, None]
-    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or 0 in array.shape:
-        raise SegmentationError(
-            f"an image of shape {np.shape(image)} cannot be segmented", "expected HxW, HxWx1, HxWx3 or HxWx4"
-        )
-    if array.shape[2] == 1:
-        array = np.repeat(array, 3, axis=2)
-    array = array[:, :, :3]
-    if array.dtype == np.uint16:
-        array = (array // 257).astype(np.uint8)
-    elif array.dtype == np.bool_:
-        array = array.astype(np.uint8) * 255
-    elif np.issubdtype(array.dtype, np.floating):
-        low, high = float(array.min()), float(array.max())  # NaN if there is one
-        if not (0.0 <= low and high <= 1.0):
-            raise SegmentationError(f"a floating-point image has values {low:g}..{high:g}", "expected 0..1, no NaN")
-        array = np.rint(array * 255).astype(np.uint8)
-    elif array.dtype != np.uint8:
-        raise SegmentationError(f"an image of type {array.dtype} cannot be segmented", "expected uint8")
-    return np.ascontiguousarray(array)
-
-
-def check_mask_shape(mask: NDArray[Any], frame_shape: tuple[int, ...], where: str) -> None:
-    """Raise if a mask does not have the frame's size.
-
-    Raises:
-        SegmentationError: Names both sizes.
-    """
-    height, width = frame_shape[:2]
-    if mask.shape[:2] != (height, width):
-        raise SegmentationError(
-            f"{where}: the mask is {mask.shape[1]}x{mask.shape[0]}, the frame {width}x{height}",
-            "masks must have the frame's size",
-        )
+HOLE_RADIUS_PX = 3
+"""Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is this project's)."""
 
 
 def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -72,22 +25,13 @@ def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
     return boxes
 
 
-# From detected objects to the pixels that are held for dynamic: selection, repair, dilation. Pure functions.
-
-HOLE_RADIUS_PX = 3
-"""Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is our assumption)."""
-
-
 def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
-    """The objects that count: confident and large enough, of a dynamic class or one of `also`, or known to move."""
+    """The objects that count: confident, and of a dynamic class or one of `also`, or known to move."""
     names = settings.class_names() | also
     wanted = np.array([name in names for name in instances.class_names], dtype=bool)
     if instances.moving is not None:
         wanted |= instances.moving
-    keep = wanted & (instances.scores >= settings.confidence)
-    if settings.min_area_px > 0:
-        keep &= np.count_nonzero(instances.masks, axis=(1, 2)) >= settings.min_area_px
-    return pick(instances, keep)
+    return pick(instances, wanted & (instances.scores >= settings.confidence))
 
 
 def pick(instances: Instances, keep: NDArray[np.bool_]) -> Instances:
@@ -102,15 +46,15 @@ def pick(instances: Instances, keep: NDArray[np.bool_]) -> Instances:
 def dynamic_mask(
     instances: Instances, settings: SegmentationSettings, depth: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_]:
-    """The pixels held for dynamic.
+    """The dynamic pixels.
 
     Args:
-        instances: What the segmenter found.
+        instances: The objects that the segmenter returned.
         settings: Classes, confidence, repair and dilation.
-        depth: float32 ``[H, W]`` metres, 0 missing; only ``repair = depth`` uses it, and does without if it is None.
+        depth: float32 ``[H, W]`` metres, 0 missing, for ``repair = depth``; None fills holes only.
 
     Returns:
-        Bool ``[H, W]``; all false if nothing dynamic was found.
+        Bool ``[H, W]``; all false without dynamic objects.
 
     Raises:
         SegmentationError: The depth image does not have the masks' size.
@@ -122,22 +66,17 @@ def dynamic_mask(
             f"the depth image is {depth.shape[1]}x{depth.shape[0]}, the masks {width}x{height}",
             "masks must have the frame's size",
         )
-    if not len(chosen):
-        return np.zeros((height, width), bool)
-    if settings.repair == "none":
-        union = chosen.union()
-    else:
-        union = np.zeros((height, width), bool)
-        for mask in chosen.masks:
-            union |= repair(mask, depth if settings.repair == "depth" else None, settings)
-    return dilate(union, settings.dilation_px)
+    union = chosen.union()
+    if settings.repair == "depth" and len(chosen):
+        union = np.any([repair(mask, depth, settings.repair_depth_m) for mask in chosen.masks], axis=0)
+    return dilate(np.asarray(union), settings.dilation_px)
 
 
 def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """Grow a bool ``[H, W]`` mask by a disc of `radius` pixels.
 
-    A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel centres): the disc that
-    DynaSLAM's 31 x 31 ellipse approximates for radius 15.
+    A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel centres). For radius 15,
+    DynaSLAM's 31 x 31 ellipse approximates this disc.
     """
     if radius <= 0:
         return mask
@@ -151,29 +90,26 @@ def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     return grown
 
 
-def repair(
-    mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, settings: SegmentationSettings
-) -> NDArray[np.bool_]:
+def repair(mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, step_m: float) -> NDArray[np.bool_]:
     """Fill the holes of one object's mask; with depth, also fit its border to the depth edges.
 
-    Within `repair_band_px` of the mask's edge a pixel with valid depth belongs to the object exactly if its depth is
-    within `repair_depth_m` of the mean depth of the object's core nearby (mask repair by depth fusion as in Blitz-SLAM
-    and MOR-SLAM; the band and the local mean are our assumption). Pixels without depth stay as they are.
+    Within `REPAIR_BAND_PX` of the mask's edge, a pixel with valid depth belongs to the object if its depth is within
+    `step_m` of the mean depth of the object's core nearby. This is mask repair by depth fusion as in Blitz-SLAM and
+    MOR-SLAM; band and local mean are assumptions. Pixels without depth stay as they are.
     """
-    band = settings.repair_band_px
-    part = _region(mask, band + HOLE_RADIUS_PX + 1)
+    part = _region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
     if part is None:
         return mask
     patch = fill_holes(mask[part])
     if depth is not None:
-        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), band, settings.repair_depth_m)
+        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
     repaired = mask.copy()
     repaired[part] = patch
     return repaired
 
 
 def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Close gaps of up to `HOLE_RADIUS_PX` and fill whatever background the mask encloses."""
+    """Close gaps of up to `HOLE_RADIUS_PX` and fill the background that the mask encloses."""
     radius = HOLE_RADIUS_PX
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = np.pad(mask, radius + 1).view(np.uint8)
@@ -184,7 +120,8 @@ def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(filled[inner, inner] | mask)
 
 
-def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], band: int, step: float) -> NDArray[np.bool_]:
+def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float) -> NDArray[np.bool_]:
+    band = REPAIR_BAND_PX
     valid = np.isfinite(depth) & (depth > 0)
     inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     outside = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3)
@@ -197,7 +134,7 @@ def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], band: int
         np.where(core, depth, 0).astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
     )
     judged = valid & (weight >= 1) & (inside <= band) & (outside <= band) & ~core
-    near = np.abs(depth - total / np.maximum(weight, 1)) <= step
+    near = np.abs(depth - total / np.maximum(weight, 1)) <= step_m
     return np.asarray(np.where(judged, near, mask))
 
 

@@ -1,4 +1,4 @@
-"""Masks that somebody else's network wrote to disk: one PNG a frame."""
+"""Masks that no network computes here: read from PNG files, written to them, or exact masks of the sequence."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.reading import read_json
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
-from dynslam_bench.segmentation.postprocess import boxes_of, check_mask_shape
+from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
 
 CLASSES_FILE = "classes.json"
 MAX_DIFFERENCE_S = 0.02
+"""Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
+ORIGIN_FILE = "recorded.json"
+"""Beside the masks: the sequence and the settings that they were made of."""
 
 
 class RecordedSegmenter:
@@ -69,6 +72,7 @@ class RecordedSegmenter:
             ) from error
         self.by_stamp = bool(stamped)
         order = np.argsort(numbers, kind="stable")
+        self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
         self._keys: NDArray[np.float64] = np.asarray(numbers, np.float64)[order]
         self._files = [files[i] for i in order]
         self._names = read_classes(self.folder / CLASSES_FILE)
@@ -81,7 +85,7 @@ class RecordedSegmenter:
         """
         path = self._find(frame)
         height, width = frame.rgb.shape[:2]
-        image = read_image(
+        labels = read_image(
             path,
             size=(width, height),
             mismatch=f"but the frame is {width}x{height}",
@@ -89,12 +93,14 @@ class RecordedSegmenter:
             flags=cv2.IMREAD_UNCHANGED,
             kind=SegmentationError,
         )
-        labels = _one_channel(image, path)
-        check_mask_shape(labels, frame.rgb.shape, str(path))
+        if labels.ndim == 3:
+            if (labels[:, :, :3] != labels[:, :, :1]).any():
+                raise SegmentationError(
+                    f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
+                )
+            labels = np.asarray(labels[:, :, 0])
         values = [int(value) for value in np.unique(labels) if value != 0]
-        if not values:
-            return Instances.empty(*labels.shape)
-        masks = labels[None] == np.array(values, labels.dtype)[:, None, None]
+        masks = _planes(labels, values)
         names = tuple(self._name(value, path) for value in values)
         return Instances(masks, boxes_of(masks), names, np.ones(len(values), np.float32))
 
@@ -104,30 +110,29 @@ class RecordedSegmenter:
         Args:
             timestamps: Stamps in seconds of all frames, in their order.
         """
-        wanted = timestamps if self.by_stamp else np.arange(len(timestamps), dtype=np.float64)
-        after = np.searchsorted(self._keys, wanted).clip(1, max(len(self._keys) - 1, 1))
-        near = np.stack([self._keys[after - 1], self._keys[np.minimum(after, len(self._keys) - 1)]])
-        distance = np.abs(near - wanted).min(axis=0)
-        found = distance < MAX_DIFFERENCE_S if self.by_stamp else distance == 0
-        return [int(index) for index in np.flatnonzero(~found)]
+        keys = timestamps.tolist() if self.by_stamp else range(len(timestamps))
+        return [index for index, key in enumerate(keys) if self._nearest(key)[1] >= self._tolerance]
+
+    def _nearest(self, key: float) -> tuple[int, float]:
+        """The file nearest to a stamp or index, and its distance."""
+        distance = np.abs(self._keys - key)
+        nearest = int(np.argmin(distance))
+        return nearest, float(distance[nearest])
 
     def _find(self, frame: Frame) -> Path:
-        wanted = frame.timestamp if self.by_stamp else float(frame.index)
-        nearest = int(np.argmin(np.abs(self._keys - wanted)))
-        difference = abs(float(self._keys[nearest]) - wanted)
-        if self.by_stamp and difference >= MAX_DIFFERENCE_S:
+        nearest, distance = self._nearest(frame.timestamp if self.by_stamp else frame.index)
+        if distance < self._tolerance:
+            return self._files[nearest]
+        if self.by_stamp:
             raise SegmentationError(
                 f"no recorded mask within {MAX_DIFFERENCE_S} s of frame {frame.index} ({frame.timestamp:.6f} s) "
                 f"in {self.folder}",
-                f"the nearest is {self._files[nearest].name}, {difference:.3f} s away",
+                f"the nearest is {self._files[nearest].name}, {distance:.3f} s away",
             )
-        if not self.by_stamp and difference > 0:
-            raise SegmentationError(
-                f"no recorded mask of frame {frame.index} in {self.folder}",
-                f"there are {len(self._files)}, indices {self._keys[0]:.0f} to {self._keys[-1]:.0f}",
-            )
-        path: Path = self._files[nearest]
-        return path
+        raise SegmentationError(
+            f"no recorded mask of frame {frame.index} in {self.folder}",
+            f"there are {len(self._files)}, indices {self._keys[0]:.0f} to {self._keys[-1]:.0f}",
+        )
 
     def _name(self, value: int, path: Path) -> str:
         if self._names is None:
@@ -140,22 +145,15 @@ class RecordedSegmenter:
         return self._names[value]
 
 
-def _one_channel(image: NDArray[Any], path: Path) -> NDArray[Any]:
-    if image.ndim == 2:
-        return image
-    colour = image[:, :, :3]
-    if (colour == colour[:, :, :1]).all():
-        return np.asarray(colour[:, :, 0])
-    raise SegmentationError(
-        f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
-    )
+def _planes(labels: NDArray[Any], values: list[int]) -> NDArray[np.bool_]:
+    return np.asarray(labels[None] == np.array(values, labels.dtype)[:, None, None])
 
 
 def read_classes(path: Path) -> dict[int, str] | None:
-    """The COCO name of each number in the label images; None where no file says it.
+    """The COCO name of each number in the label images; None without that file.
 
     Raises:
-        SegmentationError: The file cannot be read, or names something else.
+        SegmentationError: The file cannot be read, or names an unknown class.
     """
     if not path.is_file():
         return None
@@ -169,13 +167,6 @@ def read_classes(path: Path) -> dict[int, str] | None:
     return names
 
 
-# Write a segmenter's masks to disk, in the form that `recorded` reads.
-
-Progress = Callable[[int, int], None]
-ORIGIN_FILE = "recorded.json"
-"""Beside the masks: what they were made of and with."""
-
-
 def record_masks(
     sequence: Sequence,
     folder: Path,
@@ -183,16 +174,16 @@ def record_masks(
     *,
     device: str = "cpu",
     threads: int = 1,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Segment every frame of a sequence, one PNG a frame, named by stamp; frames that are there already are kept.
+    """Segment every frame of a sequence, one PNG a frame, named by stamp; existing files are kept.
 
-    What is written are the objects of the settings' classes and confidence, before repair and dilation: those are done
-    when the masks are used. Where two objects overlap, the surer one has the pixel. Scores are not kept.
+    The files hold the objects of the settings' classes and confidence, before repair and dilation, which are done when
+    the masks are used. Where two objects overlap, the one with the higher score has the pixel. Scores are not stored.
 
     Args:
-        sequence: Whose frames are segmented.
-        folder: Made if it is not there.
+        sequence: The frames.
+        folder: Made if it does not exist.
         settings: Source, classes, confidence.
         device: ``cpu`` or ``cuda:N``.
         threads: Threads a network may use.
@@ -207,45 +198,39 @@ def record_masks(
     segmenter = build_segmenter(settings, sequence_id=sequence.id, masks=sequence.masks, device=device, threads=threads)
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to record")
-    _begin(folder, _origin(sequence, settings, segmenter.source))
+    origin = {
+        "sequence": sequence.id,
+        "source": segmenter.source,
+        "weights": weights_digest(settings, sequence.id, sequence.masks),
+        "classes": settings.classes,
+        "confidence": settings.confidence,
+    }
+    _begin(folder, origin)
     numbers = LabelNumbers(folder / CLASSES_FILE)
     segmented = 0
     for index in range(len(sequence)):
         path = folder / f"{sequence.timestamps[index]:.6f}.png"
         if not path.exists():
-            frame = sequence[index]
-            labels = numbers.label_image(segmenter.segment(frame))
-            encoded = cv2.imencode(".png", labels)[1]
-            write_atomic(path, encoded.tobytes())
+            labels = numbers.label_image(segmenter.segment(sequence[index]))
+            write_atomic(path, cv2.imencode(".png", labels)[1].tobytes())
             segmented += 1
         if progress is not None:
             progress(index + 1, len(sequence))
     return segmented
 
 
-def _origin(sequence: Sequence, settings: SegmentationSettings, source: str) -> dict[str, object]:
-    return {
-        "sequence": sequence.id,
-        "source": source,
-        "weights": weights_digest(settings, sequence.id, sequence.masks),
-        "classes": settings.classes,
-        "confidence": settings.confidence,
-    }
-
-
 def _begin(folder: Path, origin: dict[str, object]) -> None:
     """Make the folder, or make sure that it holds the same masks."""
     path = folder / ORIGIN_FILE
     if path.is_file():
-        known = read_json(path, kind=SegmentationError)
-        different = [name for name, value in origin.items() if not isinstance(known, dict) or known.get(name) != value]
-        if different:
-            name = different[0]
-            known_value = known.get(name) if isinstance(known, dict) else known
-            raise SegmentationError(
-                f"{folder} holds other masks: {name} is '{known_value}' there and '{origin[name]}' now",
-                "record into a folder of their own",
-            )
+        stored = read_json(path, kind=SegmentationError)
+        before = stored if isinstance(stored, dict) else {}
+        for name, value in origin.items():
+            if before.get(name) != value:
+                raise SegmentationError(
+                    f"{folder} holds other masks: {name} is '{before.get(name)}' there and '{value}' now",
+                    "record into a folder of their own",
+                )
         return
     if folder.exists() and any(folder.iterdir()):
         raise SegmentationError(f"{folder} holds something else", "record into an empty folder")
@@ -264,27 +249,25 @@ class LabelNumbers:
         self._path = path
         self._classes = read_classes(path) or {}
 
-    def label_image(self, found: Instances) -> NDArray[np.uint16]:
-        """uint16 ``[H, W]``: 0 background, else the object's number; the surest object on top."""
-        labels = np.zeros(found.masks.shape[1:], np.uint16)
-        free = dict(sorted(self._classes.items()))
-        for place in np.argsort(found.scores, kind="stable"):
-            name = found.class_names[place]
-            number = next((each for each, known in free.items() if known == name), None)
+    def label_image(self, instances: Instances) -> NDArray[np.uint16]:
+        """uint16 ``[H, W]``: 0 background, else the object's number; the object with the highest score on top."""
+        labels = np.zeros(instances.masks.shape[1:], np.uint16)
+        free = sorted(self._classes)
+        for index in np.argsort(instances.scores, kind="stable"):
+            name = instances.class_names[index]
+            number = next((number for number in free if self._classes[number] == name), None)
             if number is None:
                 number = self._add(name)
-            free.pop(number, None)
-            labels[found.masks[place]] = number
+            else:
+                free.remove(number)
+            labels[instances.masks[index]] = number
         return labels
 
     def _add(self, name: str) -> int:
         number = max(self._classes, default=0) + 1
         self._classes[number] = name
-        write_atomic(self._path, json.dumps({str(each): known for each, known in self._classes.items()}, indent=1))
+        write_atomic(self._path, json.dumps(self._classes, indent=1))
         return number
-
-
-# Exact masks of rendered (or annotated) sequences, as if a perfect network had found them.
 
 
 def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
@@ -308,10 +291,7 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
             f"{where}: instance {nameless[0]} has no class name",
             "known ids: " + (", ".join(map(str, sorted(masks.class_names))) or "none"),
         )
-    if not ids:
-        empty = Instances.empty(labels.shape[0], labels.shape[1])
-        return Instances(empty.masks, empty.boxes, (), empty.scores, np.zeros(0, bool))
-    planes = labels[None] == np.array(ids, dtype=labels.dtype)[:, None, None]
+    planes = _planes(labels, ids)
     return Instances(
         planes,
         boxes_of(planes),
@@ -322,11 +302,11 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
 
 
 class OracleSegmenter:
-    """Hands out a sequence's exact masks: every object, with the flag whether it moves.
+    """A sequence's exact masks: every object, with the flag whether it moves.
 
     Args:
         source: The sequence's masks.
-        motion: Whether to say what moves; without, objects count by their class alone, as a perfect network has them.
+        motion: Whether `Instances.moving` is filled; without, objects count by class, as those of a perfect network.
     """
 
     def __init__(self, source: MaskSource, *, motion: bool = True) -> None:
@@ -346,8 +326,12 @@ class OracleSegmenter:
             raise SegmentationError(f"there are no exact masks for frame {frame.index}") from error
         except MemoryError:
             raise
-        except Exception as error:  # the masks of a data set of the user's may raise anything
+        except Exception as error:  # the masks of a plug-in's data set may raise anything
             raise SegmentationError(f"the exact masks of frame {frame.index} cannot be read: {error}") from error
-        check_mask_shape(np.asarray(masks.instances), frame.rgb.shape, f"exact masks of frame {frame.index}")
-        found = instances_of(masks, where=f"exact masks of frame {frame.index}")
-        return found if self.motion else replace(found, moving=None)
+        (height, width), (rows, columns) = np.shape(masks.instances)[:2], frame.rgb.shape[:2]
+        if (height, width) != (rows, columns):
+            raise SegmentationError(
+                f"exact masks of frame {frame.index}: the mask is {width}x{height}, the frame {columns}x{rows}"
+            )
+        instances = instances_of(masks, where=f"exact masks of frame {frame.index}")
+        return instances if self.motion else replace(instances, moving=None)

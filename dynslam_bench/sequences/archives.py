@@ -9,8 +9,9 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import IO, BinaryIO, Protocol, cast
+from typing import IO, Any, BinaryIO, cast
 
 from dynslam_bench.core.download import CHUNK, Progress, Report
 from dynslam_bench.core.errors import SequenceError
@@ -23,6 +24,10 @@ MAX_MEMBERS = 200_000
 """Most files and folders of an archive; the largest public sequence has fewer than 20,000."""
 MAX_HEADER = 1 << 20
 """Most bytes of one name or one set of attributes in a tar archive."""
+
+# What Python's readers of archives raise over damaged ones; OSError is gzip's, too.
+_DAMAGE = (tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError,
+           ValueError, TypeError, LookupError, NotImplementedError, RuntimeError, OverflowError)  # fmt: skip
 
 
 def extract(archive: Path, target: Path, progress: Report | None = None) -> dict[str, str]:
@@ -42,89 +47,47 @@ def extract(archive: Path, target: Path, progress: Report | None = None) -> dict
         OSError: The disk is full, or the target cannot be written.
     """
     sums: dict[str, str] = {}
-    room = _Room(archive)
-    members = _members(archive, room)
-    while (member := _next(members, archive)) is not None:
-        name, stream = member
-        path = target / safe_name(archive, name)
+    done = 0
+    members = (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(archive)
+    while True:
+        with _reading(archive):
+            member = next(members, None)
+        if member is None:
+            return sums
+        path = target / safe_name(archive, member[0])
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.open("xb")
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
             raise SequenceError(f"{archive.name} holds one name twice: {error.filename}, refused") from error
-        value = hashlib.sha256()
+        checksum = hashlib.sha256()
         with file:
-            while block := _read(stream, archive):
+            for block in _blocks(archive, member[1]):
                 file.write(block)
-                value.update(block)
-        sums[path.relative_to(target).as_posix()] = value.hexdigest()
+                checksum.update(block)
+                done += len(block)
+        sums[path.relative_to(target).as_posix()] = checksum.hexdigest()
         if progress is not None:
-            progress(Progress("extract", room.taken, None))
-    return sums
+            progress(Progress("extract", done, None))
 
 
-class _Stream(Protocol):
-    def read(self, size: int = -1, /) -> bytes: ...
+def _blocks(archive: Path, stream: IO[bytes]) -> Iterator[bytes]:
+    while True:
+        with _reading(archive):
+            block = stream.read(CHUNK)
+        if not block:
+            return
+        yield block
 
 
-_Member = tuple[str, _Stream]
-
-
-class _Room:
-    """What an archive may unpack to: bytes of its files, of what lies between and behind them, and entries."""
-
-    def __init__(self, archive: Path) -> None:
-        self.archive = archive
-        self.limit = archive.stat().st_size * MAX_RATIO + MAX_SLACK
-        self.taken = 0
-        self.members = 0
-
-    def take(self, count: int) -> None:
-        self.taken += count
-        if self.taken > self.limit:
-            raise SequenceError(f"{self.archive.name} unpacks to more than {self.limit / 1e9:.1f} GB, refused")
-
-    def take_member(self) -> None:
-        self.members += 1
-        if self.members > MAX_MEMBERS:
-            raise SequenceError(f"{self.archive.name} holds more than {MAX_MEMBERS} files, refused")
-
-
-class _Counted:
-    """A stream that takes what is read of it out of the room that there is."""
-
-    def __init__(self, stream: IO[bytes], room: _Room) -> None:
-        self.stream = stream
-        self.room = room
-
-    def read(self, size: int = -1) -> bytes:
-        block = self.stream.read(size)
-        self.room.take(len(block))
-        return block
-
-
-def _next(members: Iterator[_Member], archive: Path) -> _Member | None:
+@contextmanager
+def _reading(archive: Path) -> Iterator[None]:
+    """Errors of damaged archives become one line."""
     try:
-        return next(members, None)
+        yield
     except _DAMAGE as error:
-        raise _damaged(archive, error) from error
-
-
-def _read(stream: _Stream, archive: Path) -> bytes:
-    try:
-        return stream.read(CHUNK)
-    except _DAMAGE as error:
-        raise _damaged(archive, error) from error
-
-
-# What Python's readers of archives raise over damaged ones; OSError is gzip's, too, and only ever met while reading.
-_DAMAGE = (tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError,
-           ValueError, TypeError, LookupError, NotImplementedError, RuntimeError, OverflowError)  # fmt: skip
-
-
-def _damaged(archive: Path, error: Exception) -> SequenceError:
-    size = archive.stat().st_size
-    return SequenceError(f"{archive.name} is damaged ({size} bytes): {error}", "fetch it again")
+        size = archive.stat().st_size
+        raise SequenceError(f"{archive.name} is damaged ({size} bytes): {error}", "fetch it again") from error
 
 
 def safe_name(archive: Path, name: str) -> PurePosixPath:
@@ -134,41 +97,47 @@ def safe_name(archive: Path, name: str) -> PurePosixPath:
         SequenceError: It is absolute, leaves the folder, or is empty.
     """
     if not is_inside(name) or ":" in name:
-        shown = f"{archive.name} holds {name[:100]!r}"
-        raise SequenceError(f"{shown}, which would lie outside the sequence's folder, refused")
+        raise SequenceError(
+            f"{archive.name} holds {name[:100]!r}, which would lie outside the sequence's folder, refused"
+        )
     return PurePosixPath(name)
 
 
-def _members(archive: Path, room: _Room) -> Iterator[_Member]:
-    """Names and streams of all regular files."""
-    if zipfile.is_zipfile(archive):
-        yield from _zip_members(archive, room)
-    else:
-        yield from _tar_members(archive, room)
+def _check_size(archive: Path, size: int) -> None:
+    limit = archive.stat().st_size * MAX_RATIO + MAX_SLACK
+    if size > limit:
+        raise SequenceError(f"{archive.name} unpacks to more than {limit / 1e9:.1f} GB, refused")
 
 
-def _zip_members(archive: Path, room: _Room) -> Iterator[_Member]:
+def _check_members(archive: Path, count: int) -> None:
+    if count > MAX_MEMBERS:
+        raise SequenceError(f"{archive.name} holds more than {MAX_MEMBERS} files, refused")
+
+
+def _zip_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
+    """Names and streams of all regular files; zipfile never reads more of a file than its header states."""
     with zipfile.ZipFile(archive) as source:
-        for member in source.infolist():
-            room.take_member()
-            kind = (member.external_attr >> 16) & 0o170000
-            if kind not in (0, 0o100000, 0o040000):
-                raise SequenceError(f"{archive.name} holds {member.filename!r}, no regular file, refused")
-            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        entries = source.infolist()
+        _check_members(archive, len(entries))
+        _check_size(archive, sum(entry.file_size for entry in entries))
+        for entry in entries:
+            if (entry.external_attr >> 16) & 0o170000 not in (0, 0o100000, 0o040000):
+                raise SequenceError(f"{archive.name} holds {entry.filename!r}, no regular file, refused")
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise SequenceError(f"{archive.name} is compressed in a way that is not unpacked here, refused")
-            if member.is_dir():
-                safe_name(archive, member.filename)
+            if entry.is_dir():
+                safe_name(archive, entry.filename)
             else:
-                with source.open(member) as stream:
-                    yield member.filename, _Counted(stream, room)
+                with source.open(entry) as stream:
+                    yield entry.filename, stream
 
 
-def _tar_members(archive: Path, room: _Room) -> Iterator[_Member]:
+def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
     with archive.open("rb") as raw, _decompressed(raw) as file:
-        counted = cast("BinaryIO", _Counted(file, room))
-        with tarfile.open(fileobj=counted, mode="r|", tarinfo=_Header) as tar:
-            for entry in tar:
-                room.take_member()
+        counted = _Counted(archive, file)
+        with tarfile.open(fileobj=cast("BinaryIO", counted), mode="r|", tarinfo=_Header) as tar:
+            for number, entry in enumerate(tar, 1):
+                _check_members(archive, number)
                 tar.members = []  # type: ignore[attr-defined]  # it would keep the header of every file
                 if entry.isdir():
                     if PurePosixPath(entry.name).parts:  # "." names the archive itself
@@ -180,6 +149,19 @@ def _tar_members(archive: Path, room: _Room) -> Iterator[_Member]:
                 yield entry.name, stream
         while counted.read(CHUNK):  # tarfile stops before the end of the stream, where gzip keeps its checksum
             pass
+
+
+class _Counted:
+    """A stream that refuses to give more bytes than the archive may unpack to."""
+
+    def __init__(self, archive: Path, stream: IO[bytes]) -> None:
+        self.archive, self.stream, self.total = archive, stream, 0
+
+    def read(self, size: int = -1) -> bytes:
+        block = self.stream.read(size)
+        self.total += len(block)
+        _check_size(self.archive, self.total)
+        return block
 
 
 class _Header(tarfile.TarInfo):
@@ -194,7 +176,7 @@ class _Header(tarfile.TarInfo):
         return header
 
 
-def _decompressed(raw: BinaryIO) -> BinaryIO:
+def _decompressed(raw: BinaryIO) -> Any:
     start = raw.read(2)
     raw.seek(0)
-    return cast("BinaryIO", gzip.GzipFile(fileobj=raw)) if start == b"\x1f\x8b" else raw
+    return gzip.GzipFile(fileobj=raw) if start == b"\x1f\x8b" else raw

@@ -90,7 +90,7 @@ def unpack_bag(
             }
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
-                lines = [pose_line(found) for found in _read(reader, topics.connection(chosen_truth))]
+                lines = [pose_line(message) for message in _read(reader, topics.connection(chosen_truth))]
                 (work / "groundtruth.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
             count = len(open_folder(work))
     notes = []
@@ -118,7 +118,7 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
         with _opened(source) as reader:
             topics = _Topics(reader, source)
             chosen = topics.pose(topic, "--topic")
-            lines = [pose_line(found) for found in _read(reader, topics.connection(chosen))] if chosen else []
+            lines = [pose_line(message) for message in _read(reader, topics.connection(chosen))] if chosen else []
     except OSError as error:  # e.g. a file that its metadata name is missing
         raise SequenceError(f"bag {source} cannot be read: {error.strerror or error}") from error
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
@@ -132,15 +132,15 @@ class _Topics:
 
     def __init__(self, reader: Any, source: Path) -> None:
         self.reader, self.source = reader, source
-        self.found: dict[str, list[Any]] = {}
+        self.connections: dict[str, list[Any]] = {}
         for connection in reader.connections:
-            self.found.setdefault(connection.topic, []).append(connection)
+            self.connections.setdefault(connection.topic, []).append(connection)
 
     def connection(self, topic: str) -> list[Any]:
-        return self.found[topic]
+        return self.connections[topic]
 
     def of_types(self, types: Sequence[str]) -> list[str]:
-        return sorted(topic for topic, found in self.found.items() if found[0].msgtype in types)
+        return sorted(topic for topic, connections in self.connections.items() if connections[0].msgtype in types)
 
     def image(self, kind: str, wanted: str | None) -> str:
         candidates = self.of_types(IMAGES)
@@ -163,7 +163,7 @@ class _Topics:
         return camera_of(self._first(beside[0]), f"{beside[0]} of {self.source}")
 
     def _first(self, topic: str) -> Any:
-        for message in _read(self.reader, self.found[topic]):
+        for message in _read(self.reader, self.connections[topic]):
             return message
         raise SequenceError(f"topic {topic} of {self.source} has no message")
 

@@ -188,26 +188,22 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> tu
     """
     if isinstance(choice, Camera):
         return choice, None
-    inside = folder / CAMERA_FILE
-    if choice is None:
-        if not inside.is_file():
-            return None
-        file = read_camera(inside)
-        return file.camera(), file.fps
+    if choice is None and not (folder / CAMERA_FILE).is_file():
+        return None
     if str(choice) in CAMERAS:
         return CAMERAS[str(choice)], None
-    path = Path(choice).expanduser()
-    if path.suffix == ".toml" or path.is_file():
-        file = read_camera(path)
-        return file.camera(), file.fps
-    return known_camera(str(choice)), None
+    path = folder / CAMERA_FILE if choice is None else Path(choice).expanduser()
+    if path.suffix != ".toml" and not path.is_file():
+        return known_camera(str(choice)), None
+    file = read_camera(path)
+    return file.camera(), file.fps
 
 
 def find_camera(
     folder: Path,
     choice: str | Path | Camera | None = None,
     *,
-    told: Camera | None = None,
+    stated: Camera | None = None,
     otherwise: str | None = None,
 ) -> tuple[Camera, float | None]:
     """The camera of a folder, and its nominal frame rate where a file states it.
@@ -215,17 +211,17 @@ def find_camera(
     Args:
         folder: A sequence's folder.
         choice: See `chosen_camera`; it wins over everything else.
-        told: What the folder's own calibration says, before what its published name tells.
-        otherwise: Name of the camera if nothing else tells it, from the catalogue.
+        stated: What the folder's own calibration says; it wins over what its published name implies.
+        otherwise: Name of the camera if nothing else states it, from the catalogue.
 
     Raises:
-        SequenceError: The choice is not understood, or nothing tells the camera.
+        SequenceError: The choice is not understood, or nothing states the camera.
     """
     chosen = chosen_camera(folder, choice)
     if chosen is not None:
         return chosen
-    if told is not None:
-        return told, None
+    if stated is not None:
+        return stated, None
     name = folder.resolve().name
     for prefix, camera in PUBLISHED_PREFIXES.items():
         if name.startswith(prefix):

@@ -1,4 +1,7 @@
-"""The camera's motion between frames of one RGB-D sequence, measured by tracked corners and their depth."""
+"""The camera's motion between frames of an RGB-D sequence, and the agreement of a ground truth with it.
+
+The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
+"""
 
 from __future__ import annotations
 
@@ -112,10 +115,10 @@ def relative_pose(
     nothing = np.zeros(len(pixels_first), bool)
     points = camera.unproject(pixels_first, depth_first)
     cv2.setRNGSeed(0)
-    found, rotation, translation, index = cv2.solvePnPRansac(
+    success, rotation, translation, index = cv2.solvePnPRansac(
         points, pixels_second, camera.matrix, None, iterationsCount=200, reprojectionError=INLIER_PX, confidence=0.999
     )
-    if not found or index is None or len(index) < max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
+    if not success or index is None or len(index) < max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
         return nothing, None
     inliers = nothing.copy()
     inliers[np.asarray(index).reshape(-1)] = True
@@ -133,14 +136,14 @@ def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     window = np.ones((5, 5), np.uint8)
     near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
     mask = ((near > 0) & (far - near < _DEPTH_EDGE * near)).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+    corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
+    return np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners, np.float32).reshape(-1, 2)
 
 
 def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels) -> tuple[Pixels, NDArray[np.bool_]]:
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
-    good = (found.reshape(-1) == 1) & (found_back.reshape(-1) == 1)
+    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
+    good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < _BACK_AND_FORTH_PX
     height, width = after.shape
     good &= (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
@@ -152,10 +155,10 @@ def _at(depth: NDArray[np.float32], pixels: Pixels) -> Array:
     return np.asarray(depth[y, x], dtype=np.float64)
 
 
-# The motion that a ground truth tells, read in several conventions, beside the one that was measured.
+# Motions of a ground truth, read in several conventions, compared with the measured ones.
 
 
-READINGS = ("as it stands", "inverted", "w first", "w first, inverted", "rotations inverted")
+READINGS = ("as stored", "inverted", "w first", "w first, inverted", "rotations inverted")
 ROTATION_NOISE = np.radians(0.25)
 TRANSLATION_NOISE = 0.006
 """Of a measured motion: as a part of the median depth."""
@@ -286,7 +289,7 @@ def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Ar
 
 @dataclass(frozen=True)
 class Match:
-    """How well a truth, read in one way and shifted in time, tells the measured motions.
+    """How well a truth, read in one convention and shifted in time, agrees with the measured motions.
 
     Attributes:
         reading: One of `READINGS`.

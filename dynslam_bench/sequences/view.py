@@ -1,8 +1,8 @@
-"""Part of a sequence, renumbered from 0."""
+"""Parts of a sequence: a view with renumbered frames, and the identity of the frames that it shows."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence as PySequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -44,7 +44,7 @@ class SequenceView:
 
     @property
     def depth_timestamps(self) -> NDArray[np.float64]:
-        """Stamps of the selected frames' depth images; the frames' own where the sequence does not tell."""
+        """Stamps of the selected frames' depth images; the frames' own where the sequence does not state them."""
         stamps = getattr(self.base, "depth_timestamps", self.base.timestamps)
         return np.asarray(stamps[self.range.start : self.range.stop : self.range.step])
 
@@ -52,7 +52,7 @@ class SequenceView:
     def masks(self) -> MaskSource | None:
         """Masks of the selected frames, under their new indices."""
         source = self.base.masks
-        return None if source is None else _SelectedMasks(source, self.range)
+        return None if source is None else Masks(lambda index: source[self.range[index]])
 
     def __len__(self) -> int:
         return len(self.range)
@@ -63,15 +63,16 @@ class SequenceView:
 
 
 @dataclass(frozen=True)
-class _SelectedMasks:
-    source: MaskSource
-    selected: PySequence[int]
+class Masks:
+    """A `MaskSource` that is a function of the frame's index."""
+
+    masks_of: Callable[[int], FrameMasks]
 
     def __getitem__(self, index: int) -> FrameMasks:
-        return self.source[self.selected[index]]
+        return self.masks_of(index)
 
 
-# What part of which sequence is seen, whatever it is called: equal frames have one identity in every spelling.
+# Identity of the frames: equal frames have one identity in every spelling.
 
 
 @dataclass(frozen=True)

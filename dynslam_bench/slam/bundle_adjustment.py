@@ -7,7 +7,6 @@ order: equal input gives equal bits.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,18 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.map_kernels import distinct
 from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, NEAR_M, apply_twist, cholesky_solve
-from dynslam_bench.slam.settings import BundleAdjustmentSettings
 
 Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
 Index = NDArray[np.int64]
+
+FIXED_KEYFRAMES = 6
+"""Further keyframes that observe the same points and stay where they are."""
+MAX_OBSERVATIONS = 6000
+"""Observations used at most: the budget that bounds the time of a keyframe."""
+FIXED_SIGMA = 1e-5
+"""For gtsam: standard deviation (rad, m) of the prior of a fixed pose; an equality constraint is seven times slower."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,20 +285,20 @@ def reprojection_chi2(problem: BundleProblem, poses: Array, points: Array) -> tu
     """Huber cost and chi-square of each observation ``[N]`` at given poses and points; inf behind the camera."""
     c = problem.camera
     chi2 = np.zeros(len(problem.obs_pose))
-    guess, seen = (np.ascontiguousarray(poses), np.ascontiguousarray(points)), (problem.obs_pose, problem.obs_point)
+    guess = np.ascontiguousarray(poses), np.ascontiguousarray(points)
     measured = problem.uv, problem.right, problem.info, problem.info_right
-    cost = _cost(*guess, *seen, *measured, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2)
+    cost = _cost(
+        *guess, problem.obs_pose, problem.obs_point, *measured, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2
+    )
     return float(cost), chi2
 
 
-# Which poses, points and observations a bundle adjustment takes from the map.
-
-Slots = NDArray[np.int64]
+# ---------------------------------------------------------------------- the bundle of a map
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A bundle adjustment, and where its parts lie in the map.
+    """A bundle adjustment, and where its parts are stored in the map.
 
     Attributes:
         problem: What is to be solved.
@@ -308,28 +313,28 @@ class Bundle:
     features: Slots
 
 
-def around(world: Map, slot: int, settings: BundleAdjustmentSettings) -> Bundle | None:
+def local_bundle(world: Map, slot: int, window: int) -> Bundle | None:
     """The local window around a keyframe, cut to the observation budget; None if there is nothing to refine.
 
-    Variable are the keyframe and its most covisible ones; fixed are further keyframes that see the same points, and
+    Variable are the keyframe and its most covisible ones; fixed are further keyframes that observe the same points, and
     always at least one. The oldest keyframe of all is never variable.
     """
     near, _ = world.covisible(slot)
-    variable = np.concatenate([[slot], near[: settings.window - 1]]).astype(np.int64)
+    variable = np.concatenate([[slot], near[: window - 1]]).astype(np.int64)
     variable = variable[world.kf_id[variable] > 0]
     if not len(variable):
         return None
-    points = distinct(world.kf_point[variable], world.alive.size)
-    further, _ = world.covisible_of(points)
-    further = further[~np.isin(further, variable)][: settings.fixed]
-    if not len(further):
+    points = world.points_of(variable)
+    fixed, _ = world.covisible_of(points)
+    fixed = fixed[~np.isin(fixed, variable)][:FIXED_KEYFRAMES]
+    if not len(fixed):
         if len(variable) < 2:
             return None
-        further, variable = variable[-1:], variable[:-1]
-    return _bundle(world, variable, further, points, settings.observations)
+        fixed, variable = variable[-1:], variable[:-1]
+    return _bundle(world, variable, fixed, points, MAX_OBSERVATIONS)
 
 
-def whole(world: Map) -> Bundle | None:
+def full_bundle(world: Map) -> Bundle | None:
     """All keyframes and points; the oldest keyframe stays. None if there are no two keyframes."""
     keyframes = world.keyframes
     if len(keyframes) < 2:
@@ -337,23 +342,23 @@ def whole(world: Map) -> Bundle | None:
     return _bundle(world, keyframes[1:], keyframes[:1], world.points, int(world.n_obs[world.points].sum()))
 
 
-def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, observations: int) -> Bundle | None:
+def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int) -> Bundle | None:
     poses = np.concatenate([variable, fixed])
-    rank = np.full(world.kf_alive.size, -1, np.int64)
-    rank[poses] = np.arange(len(poses))
+    pose_number = np.full(world.kf_alive.size, -1, np.int64)
+    pose_number[poses] = np.arange(len(poses))
     rows = world.observations(points)
-    of_point, pose = np.repeat(np.arange(len(points)), world.n_obs[points]), rank[world.obs_kf[rows]]
+    of_point, pose = np.repeat(np.arange(len(points)), world.n_obs[points]), pose_number[world.obs_kf[rows]]
     support = np.bincount(of_point[pose >= 0], minlength=len(points))
-    worth = np.flatnonzero(support >= 2)
-    order = worth[np.lexsort((world.id[points[worth]], -support[worth]))]  # long tracks first
-    order = order[np.cumsum(support[order]) <= observations]
+    supported = np.flatnonzero(support >= 2)
+    order = supported[np.lexsort((world.id[points[supported]], -support[supported]))]  # long tracks first
+    order = order[np.cumsum(support[order]) <= max_observations]
     order.sort()
     if not len(order):
         return None
-    number = np.full(len(points), -1, np.int64)
-    number[order] = np.arange(len(order))
-    used = (pose >= 0) & (number[of_point] >= 0)
-    obs_point, obs_pose, points = number[of_point[used]], pose[used], points[order]
+    point_number = np.full(len(points), -1, np.int64)
+    point_number[order] = np.arange(len(order))
+    used = (pose >= 0) & (point_number[of_point] >= 0)
+    obs_point, obs_pose, points = point_number[of_point[used]], pose[used], points[order]
     features = world.obs_ft[rows[used]].astype(np.int64)
     at = poses[obs_pose]
     problem = BundleProblem(
@@ -364,85 +369,58 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, observatio
     return Bundle(problem, poses, points, features)
 
 
-# The same local bundle adjustment through gtsam: the reference that the own solver is measured against.
-
-FIXED_SIGMA = 1e-5
-"""Standard deviation (rad, m) of the prior that holds a fixed pose; an equality constraint is seven times slower."""
+# ---------------------------------------------------------------------- the reference solver
 
 
 def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult:
-    """Minimise the Huber reprojection error with gtsam's Levenberg-Marquardt.
+    """The same minimisation by gtsam's Levenberg-Marquardt: the reference that `adjust_bundle` is compared with.
 
     Args:
-        problem: As for `bundle.adjust_bundle`.
+        problem: As for `adjust_bundle`.
         iterations: Levenberg-Marquardt iterations at most.
 
     Raises:
         TrackerError: gtsam is not installed.
     """
-    gtsam = load_gtsam("backend.bundle_adjustment.solver = gtsam")
+    try:
+        import gtsam
+    except ImportError as error:
+        message = f"backend.bundle_adjustment.solver = gtsam needs a package that cannot be imported: {error}"
+        raise TrackerError(message, f"{install_hint('gtsam')}, or leave the setting") from error
     camera = problem.camera
     mono = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
     stereo = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     pose_keys = [gtsam.symbol("x", i) for i in range(len(problem.poses))]
     point_keys = [gtsam.symbol("l", i) for i in range(len(problem.points))]
-    hold = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)
+    prior = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)
     for i, pose in enumerate(np.linalg.inv(problem.poses)):
-        start = gtsam.Pose3(pose)
-        values.insert(pose_keys[i], start)
+        values.insert(pose_keys[i], gtsam.Pose3(pose))
         if i >= problem.variable:
-            graph.add(gtsam.PriorFactorPose3(pose_keys[i], start, hold))
+            graph.add(gtsam.PriorFactorPose3(pose_keys[i], gtsam.Pose3(pose), prior))
     for key, point in zip(point_keys, problem.points, strict=True):
         values.insert(key, point)
-    models: dict[tuple[float, float], Any] = {}
-    for k in range(len(problem.obs_pose)):
-        info, info_right = float(problem.info[k]), float(problem.info_right[k])
-        if (info, info_right) not in models:
-            models[info, info_right] = _noise(gtsam, info, info_right)
+    limits = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
+    for k, limit in enumerate(limits.tolist()):
         keys = pose_keys[problem.obs_pose[k]], point_keys[problem.obs_point[k]]
         u, v = problem.uv[k]
-        if info_right > 0:
+        sigma = problem.info[k] ** -0.5
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(float(np.sqrt(limit)))
+        if problem.info_right[k] > 0:
+            noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, problem.info_right[k] ** -0.5, sigma]))
             measured = gtsam.StereoPoint2(u, problem.right[k], v)
-            graph.add(gtsam.GenericStereoFactor3D(measured, models[info, info_right], *keys, stereo))
+            robust = gtsam.noiseModel.Robust.Create(huber, noise)
+            graph.add(gtsam.GenericStereoFactor3D(measured, robust, *keys, stereo))
         else:
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(problem.uv[k], models[info, info_right], *keys, mono))
+            robust = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(problem.uv[k], robust, *keys, mono))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-    result = optimiser.optimize()
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     poses = problem.poses.copy()
     for i in range(problem.variable):
         poses[i] = np.linalg.inv(result.atPose3(pose_keys[i]).matrix())
     points = np.array([result.atPoint3(key) for key in point_keys]).reshape(-1, 3)
-    limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
     before, _ = reprojection_chi2(problem, problem.poses, problem.points)
     after, chi2 = reprojection_chi2(problem, poses, points)
-    return BundleResult(poses, points, chi2 <= limit, before, after)
-
-
-def load_gtsam(wanted_by: str) -> Any:
-    """The module.
-
-    Args:
-        wanted_by: The setting that needs it.
-
-    Raises:
-        TrackerError: It is not installed.
-    """
-    try:
-        import gtsam
-    except ImportError as error:
-        message = f"{wanted_by} needs a package that cannot be imported: {error}"
-        raise TrackerError(message, f"{install_hint('gtsam')}, or leave the setting") from error
-    return gtsam
-
-
-def _noise(gtsam: Any, info: float, info_right: float) -> Any:
-    sigma = info**-0.5
-    if info_right > 0:
-        base = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, info_right**-0.5, sigma]))
-        limit = CHI2_DEPTH
-    else:
-        base, limit = gtsam.noiseModel.Isotropic.Sigma(2, sigma), CHI2_MONO
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(float(np.sqrt(limit))), base)
+    return BundleResult(poses, points, chi2 <= limits, before, after)

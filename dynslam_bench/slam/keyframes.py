@@ -1,32 +1,40 @@
-"""When does a frame become a keyframe?"""
+"""Keyframes: when a frame becomes one, and the view of keyframes and points that filters and files get."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import KeyframeView
+from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.motion_model import pose_covariance, smooth
-from dynslam_bench.slam.settings import KeyframeSettings, MotionModelSettings
-from dynslam_bench.slam.table_space import TableSpace
+from dynslam_bench.slam.settings import KeyframeSettings
 from dynslam_bench.slam.tracking import TrackedFrame
 
 Array = NDArray[np.float64]
 
 MIN_INLIERS = 15
 """Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
+ESTABLISHED = 3
+"""Keyframes that observe an established point at least."""
+MIN_CLOSE, NEW_CLOSE = 100, 70
+"""A keyframe is made when fewer close points are tracked and more close features are not in the map (ORB-SLAM2)."""
+VIEW_SHARE = 0.9
+"""A keyframe is made when less than this share of the last keyframe's points lies in the image."""
+MOVED_SHARE = 0.97
+"""The view has moved when less than this share of the last keyframe's points lies in the image."""
+DEPTH_IMAGES = 8
+"""Newest keyframes that keep their depth image, for filters."""
 
 
-class KeyframeRule:
-    """Decides, frame by frame, whether too little of the map is left in view, and the frame has something to add.
+class KeyframePolicy:
+    """Decides whether a tracked frame becomes a keyframe: too little of the map is in view, and the frame adds to it.
 
-    Points that many keyframes observe are what counts (ORB-SLAM2's rule): on people who walk by, young points come and
-    go, and a keyframe for each of them would only carry the map along with the people. Where the view itself moves on,
-    the young points count as well.
+    Points that many keyframes observe count (ORB-SLAM2's rule). On moving people young points come and go, and a
+    keyframe for each of them would carry the map along with the people. Where the view itself moves on, young points
+    count as well.
 
     Args:
         settings: The thresholds.
@@ -36,16 +44,15 @@ class KeyframeRule:
     def __init__(self, settings: KeyframeSettings, close_m: float) -> None:
         self.settings = settings
         self._close_m = close_m
-        self._last = -1
-        self._peak = 0
+        self.made(-1)
 
     def made(self, frame: int) -> None:
         """The frame of this index has become a keyframe."""
         self._last = frame
-        self._peak = 0
+        self._most_inliers = 0
 
-    def wants(self, world: Map, tracked: TrackedFrame, frame: int, reference: int) -> bool:
-        """Whether a tracked frame should become one.
+    def needed(self, world: Map, tracked: TrackedFrame, frame: int, reference: int) -> bool:
+        """Whether a tracked frame should become a keyframe.
 
         Args:
             world: The map.
@@ -53,33 +60,29 @@ class KeyframeRule:
             frame: Its index.
             reference: Slot of the keyframe that shares most points with it.
         """
-        s = self.settings
-        gap = frame - self._last
-        if gap <= s.min_gap:
+        s, gap = self.settings, frame - self._last
+        if gap <= 0:
             return False
-        close = (tracked.seen.z > 0) & (tracked.seen.z < self._close_m)
-        known = tracked.point >= 0
-        tracked_close = int(np.count_nonzero(close & known))
-        new_close = int(np.count_nonzero(close & ~known))
-        inliers = int(np.count_nonzero(known))
-        self._peak = max(self._peak, inliers)
+        close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
+        matched = tracked.point >= 0
+        inliers = int(np.count_nonzero(matched))
+        self._most_inliers = max(self._most_inliers, inliers)
         if inliers <= MIN_INLIERS:
             return False
-        if new_close > s.new_close and (tracked_close < s.min_close or gap >= s.max_gap):
+        few_close = np.count_nonzero(close & matched) < MIN_CLOSE
+        if np.count_nonzero(close & ~matched) > NEW_CLOSE and (few_close or gap >= s.max_gap):
             return True
-        if inliers < s.tracked_share * established(world, reference, s.established):
+        if inliers < s.tracked_share * established_points(world, reference):
             return True
         view = share_in_view(world, int(world.keyframes[-1]), tracked.T_cam_world)
-        return view < s.view_share or (view < s.moved_share and inliers < s.tracked_share * self._peak)
+        return view < VIEW_SHARE or (view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers)
 
 
-def established(world: Map, keyframe: int, observations: int) -> int:
-    """How many of a keyframe's points at least so many keyframes observe (or all of its submap, if that is young)."""
+def established_points(world: Map, keyframe: int) -> int:
+    """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
     points = world.kf_point[keyframe]
-    points = points[points >= 0]
-    return int(
-        np.count_nonzero(world.n_obs[points] >= min(observations, len(world.submap(int(world.kf_map[keyframe])))))
-    )
+    required = min(ESTABLISHED, len(world.submap(int(world.kf_map[keyframe]))))
+    return int(np.count_nonzero(world.n_obs[points[points >= 0]] >= required))
 
 
 def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
@@ -94,82 +97,84 @@ def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
     return float(np.mean(inside))
 
 
-# The poses of all tracked frames, each kept relative to a keyframe so that later refinement moves it along.
-
-
-TABLES = ("_stamp", "_reference", "_relative", "_information")
-RESTS = 64
-"""After so many frames those before them may leave the memory."""
-
-
-class TrajectoryHistory:
-    """Frames with stamp, reference keyframe and pose relative to it; grows by doubling.
+class MapViews:
+    """Keyframes and points of a map for filters, files and the sheet; filters' views are kept until `clear`.
 
     Args:
-        space: Where its tables have room to grow.
+        world: The map.
+        depth_images: How many of the newest keyframes keep their depth image.
     """
 
-    def __init__(self, space: TableSpace) -> None:
-        self.count = 0
-        self._space = space
-        self._stamp = np.zeros(64)
-        self._reference = np.zeros(64, np.int32)
-        self._relative = np.zeros((64, 4, 4))
-        self._information = np.zeros((64, 6, 6), np.float32)
+    def __init__(self, world: Map, depth_images: int = DEPTH_IMAGES) -> None:
+        self._world = world
+        self._most_images = depth_images
+        self._depth_images: dict[int, NDArray[np.float32]] = {}
+        self._keyframes: dict[tuple[int, int], tuple[KeyframeView, ...]] = {}
+        self._points: dict[int, tuple[NDArray[np.int64], Array]] = {}
 
-    def append(self, stamp: float, reference: int, T_cam_ref: Array, information: Array) -> None:
-        """Note a tracked frame: stamp, reference keyframe's slot, ``T_cam_ref`` and the information of the pose."""
-        if self.count == len(self._stamp):
-            for name in TABLES:
-                setattr(self, name, self._space.grown(f"history{name}", getattr(self, name), 2 * self.count))
-        if self.count % RESTS == 0:
-            self._space.rest(*(f"history{name}" for name in TABLES))
-        self._stamp[self.count] = stamp
-        self._reference[self.count] = reference
-        self._relative[self.count] = T_cam_ref
-        self._information[self.count] = information
-        self.count += 1
+    def clear(self) -> None:
+        """The map has changed."""
+        self._keyframes.clear()
+        self._points.clear()
 
-    def see_from(self, world: Map, reference: int, T_cam_world: Array) -> None:
-        """The newest frame's pose is known from another keyframe, with its world."""
-        self._reference[self.count - 1] = reference
-        self._relative[self.count - 1] = T_cam_world @ se3.inverse(world.kf_pose[reference])
+    def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
+        """A keyframe was made; those that were culled for it lose their depth images."""
+        self.clear()
+        self._depth_images[slot] = depth
+        newest = self._world.keyframes[-self._most_images :].tolist() if self._most_images else []
+        self._depth_images = {at: image for at, image in self._depth_images.items() if at in newest}
 
-    def inherit(self, dropped: int, heir: int, T_dropped_heir: Array) -> None:
-        """Re-anchor the frames of a removed keyframe."""
-        rows = np.flatnonzero(self._reference[: self.count] == dropped)
-        self._relative[rows] = self._relative[rows] @ T_dropped_heir
-        self._reference[rows] = heir
+    def keyframes(self, limit: int, submap: int) -> tuple[KeyframeView, ...]:
+        """The newest keyframes of a submap, newest first, at most `limit`."""
+        if (limit, submap) not in self._keyframes:
+            newest = self._world.submap(submap)[::-1][: max(limit, 0)].tolist()
+            self._keyframes[limit, submap] = tuple(self._keyframe(slot) for slot in newest)
+        return self._keyframes[limit, submap]
 
-    def rescale(self, factors: Mapping[int, float]) -> None:
-        """Lengths around keyframes were multiplied by factors: so are the ways of their frames from them.
+    def points(self, submap: int) -> tuple[NDArray[np.int64], Array]:
+        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points of a submap."""
+        if submap not in self._points:
+            points = self._points_of(submap)
+            self._points[submap] = self._world.id[points], self._world.position[points]
+        return self._points[submap]
 
-        Args:
-            factors: Of each keyframe's slot; keyframes that are not named keep their lengths.
-        """
-        for reference, factor in factors.items():
-            rows = np.flatnonzero(self._reference[: self.count] == reference)
-            self._relative[rows, :3, 3] *= factor
-            self._information[rows, :3] /= factor
-            self._information[rows, :, :3] /= factor
+    def outputs(self) -> MapOutputs:
+        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet; of points the root map's alone."""
+        world, points = self._world, self._points_of(0)
+        records = tuple(self._record(slot) for slot in world.keyframes.tolist())
+        observations = world.n_obs[points].astype(np.int64)
+        return MapOutputs(records, world.id[points], world.position[points], world.rgb[points], observations)
 
-    def poses(self, world: Map) -> tuple[Array, Array, Array]:
-        """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``.
+    def _points_of(self, submap: int) -> NDArray[np.int64]:
+        world, points = self._world, self._world.points
+        return np.asarray(points[world.kf_map[world.obs_kf[world.obs_at[points]]] == submap])
 
-        Frames of submaps that never met the first map are left out: where they were taken in its world is unknown.
-        """
-        rows = np.flatnonzero(world.kf_map[self._reference[: self.count]] == 0)
-        poses = self._relative[rows] @ world.kf_pose[self._reference[rows]]
-        return self._stamp[rows], poses, self._information[rows].astype(np.float64)
+    def _keyframe(self, slot: int) -> KeyframeView:
+        world, n = self._world, int(self._world.kf_count[slot])
+        keypoints = Keypoints(
+            world.kf_raw[slot, :n],
+            world.kf_octave[slot, :n].astype(np.int32),
+            world.kf_angle[slot, :n],
+            world.kf_response[slot, :n],
+            world.kf_words[slot, :n].view(np.uint8),
+        )
+        return KeyframeView(
+            world.T_world_cam(slot),
+            keypoints,
+            world.kf_xy[slot, :n],
+            world.kf_z[slot, :n],
+            self._depth_images.get(slot),
+            float(world.kf_stamp[slot]),
+        )
 
-    def trajectory(self, world: Map, motion: MotionModelSettings) -> Trajectory:
-        """Camera-to-world poses in the order of their stamps, smoothed where the settings say so."""
-        stamps, poses, information = self.poses(world)
-        order = np.argsort(stamps, kind="stable")
-        fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
-        rows = order[fresh]
-        stamps, poses = stamps[rows], poses[rows]
-        if motion.smooth and len(stamps) > 2:
-            spread = [pose_covariance(*pair, motion.inflation) for pair in zip(poses, information[rows], strict=True)]
-            poses = smooth(stamps, poses, np.array(spread), motion)
-        return Trajectory(stamps, se3.inverse(poses))
+    def _record(self, slot: int) -> KeyframeRecord:
+        world, n = self._world, int(self._world.kf_count[slot])
+        return KeyframeRecord(
+            int(world.kf_id[slot]),
+            int(world.kf_frame[slot]),
+            float(world.kf_stamp[slot]),
+            world.T_world_cam(slot),
+            n,
+            int(np.count_nonzero(world.kf_point[slot, :n] >= 0)),
+            int(world.kf_map[slot]),
+        )

@@ -16,37 +16,31 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam import map_kernels as kernels
 from dynslam_bench.slam.descriptor_index import DescriptorIndex
 from dynslam_bench.slam.observation import Observations
-from dynslam_bench.slam.table_space import TableSpace
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
-
-FEWEST_ROOM = 4
-"""Observations that find room when a point has its first one."""
-REUSED = 1 << 15
-"""Slots of points, the newest, that are used again: what is mapped together lies together, and rests together."""
-NEWEST_OBSERVATIONS = 1 << 18
-"""Observations, the newest, that stay in memory, as the newest points do: 2 MB."""
+MIN_CAPACITY = 4
+"""Observations that a point has room for when it gets its first one."""
 
 
 class Map:
     """Keyframes, points and who observes what.
 
-    Attributes:
-        space: Where the tables have room to grow.
-
     Attributes (keyframes, by slot; F is the largest number of features so far):
-        kf_alive, kf_id, kf_map (0 for the map that began first; others began where nothing was recognised),
+        kf_alive, kf_id, kf_map (number of the submap, 0 for the root map),
         kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count, kf_raw
         ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave,
         kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``, kf_point ``[S, F]`` (slot of the observed point, -1).
 
     Attributes (points, by slot):
         alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
-        the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible, found (frames that should
-        have and did see it), born (id of the keyframe that made it), n_obs, obs_at and obs_room (how many observations
-        it has, where they begin in obs_kf and obs_ft, and how many find room there).
+        the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible and found (frames that
+        should have and did observe it), born (id of the keyframe that made it), n_obs, obs_at and obs_capacity (how
+        many observations it has, where they begin in obs_kf and obs_ft, and how many fit there).
+
+    Attributes (others):
+        index: Sorted substrings of the keyframes' descriptors.
 
     Attributes (observations ``[O]``, those of each point in a row, oldest first):
         obs_kf, obs_ft (observing keyframe slots and feature numbers).
@@ -64,12 +58,16 @@ class Map:
         self._vacant: dict[int, list[int]] = {}
         self._features = 0
         self._words = 4
-        self.space = TableSpace()
-        self.pieces = DescriptorIndex()
+        self.index = DescriptorIndex()
         self._allocate()
 
     def _grow(self, name: str, length: int, axis: int = 0) -> None:
-        setattr(self, name, self.space.grown(name, getattr(self, name), length, axis))
+        table = getattr(self, name)
+        shape = [*table.shape]
+        shape[axis] = length
+        longer = np.zeros(shape, table.dtype)
+        longer[tuple(slice(size) for size in table.shape)] = table
+        setattr(self, name, longer)
 
     def _allocate(self) -> None:
         s, f, w, m = 0, self._features, self._words, 0
@@ -104,22 +102,21 @@ class Map:
         self.born = np.zeros(m, np.int64)
         self.n_obs = np.zeros(m, np.int32)
         self.obs_at = np.zeros(m, np.int64)
-        self.obs_room = np.zeros(m, np.int32)
+        self.obs_capacity = np.zeros(m, np.int32)
         self.obs_kf = np.zeros(0, np.int32)
         self.obs_ft = np.zeros(0, np.int32)
 
-    _KEYFRAME_TABLES = (
-        "kf_alive", "kf_id", "kf_map", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_raw",
-        "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right", "kf_words",
-        "kf_point",
-    )  # fmt: skip
     _FEATURE_TABLES = (
         "kf_raw", "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right",
-        "kf_words", "kf_point",
+        "kf_words",
+    )  # fmt: skip
+    _KEYFRAME_TABLES = (
+        "kf_alive", "kf_id", "kf_map", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_point",
+        *_FEATURE_TABLES,
     )  # fmt: skip
     _POINT_TABLES = (
         "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_at",
-        "obs_room",
+        "obs_capacity",
     )  # fmt: skip
 
     # ------------------------------------------------------------------ keyframes
@@ -131,9 +128,13 @@ class Map:
         return slots[np.argsort(self.kf_id[slots], kind="stable")]
 
     def submap(self, number: int) -> Slots:
-        """Slots of the keyframes of an submap, oldest first."""
+        """Slots of the keyframes of a submap, oldest first."""
         slots = self.keyframes
         return slots[np.flatnonzero(self.kf_map[slots] == number)]
+
+    def points_of(self, keyframes: Slots | int) -> Slots:
+        """Slots of the points that keyframes observe, ascending."""
+        return kernels.distinct(np.atleast_2d(self.kf_point[keyframes]), self.alive.size)
 
     @property
     def descriptor_bytes(self) -> int:
@@ -147,19 +148,21 @@ class Map:
 
     @property
     def map_count(self) -> int:
-        """Number of maps that the keyframes are of; more than one where maps of their own never met the first."""
+        """Number of maps: the root map, and the submaps that were not merged with it."""
         return len(set(self.kf_map[self.kf_alive].tolist()))
 
-    def add_keyframe(self, seen: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0) -> int:
+    def add_keyframe(
+        self, observations: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
+    ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
-        if seen.words.shape[1] != self._words:
+        if observations.words.shape[1] != self._words:
             if self.next_keyframe:
-                raise ValueError(f"descriptors changed from {self._words} to {seen.words.shape[1]} words")
-            self._words = seen.words.shape[1]
+                raise ValueError(f"descriptors changed from {self._words} to {observations.words.shape[1]} words")
+            self._words = observations.words.shape[1]
             self._allocate()
-        n = len(seen)
+        n = len(observations)
         if n > self._features:
-            for name in self._FEATURE_TABLES:
+            for name in (*self._FEATURE_TABLES, "kf_point"):
                 self._grow(name, n, axis=1)
             self.kf_point[:, self._features :] = -1
             self._features = n
@@ -178,16 +181,13 @@ class Map:
         self.kf_stamp[slot] = stamp
         self.kf_count[slot] = n
         self.set_pose(slot, T_cam_world)
-        self.kf_raw[slot, :n] = seen.keypoints.xy
-        self.kf_response[slot, :n] = seen.keypoints.response
-        self.kf_xy[slot, :n] = seen.xy
-        self.kf_right[slot, :n] = seen.right
-        self.kf_z[slot, :n] = seen.z
-        self.kf_octave[slot, :n] = seen.octave
-        self.kf_angle[slot, :n] = seen.angle
-        self.kf_info[slot, :n] = seen.info
-        self.kf_info_right[slot, :n] = seen.info_right
-        self.kf_words[slot, :n] = seen.words
+        raw = observations.keypoints
+        features = (
+            raw.xy, raw.response, observations.xy, observations.right, observations.z, observations.octave,
+            observations.angle, observations.info, observations.info_right, observations.words,
+        )  # fmt: skip
+        for name, values in zip(self._FEATURE_TABLES, features, strict=True):
+            getattr(self, name)[slot, :n] = values
         self.kf_point[slot] = -1
         return slot
 
@@ -201,7 +201,7 @@ class Map:
         return se3.inverse(self.kf_pose[slot])
 
     def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
-        """Become the map of complete tables, in which every slot is in use; see `map_store`."""
+        """Become the map of complete tables, in which every slot is in use; see `atlas`."""
         for name in (*self._KEYFRAME_TABLES, *self._POINT_TABLES, "obs_kf", "obs_ft"):
             setattr(self, name, tables[name])
         self._features, self._words = self.kf_words.shape[1:]
@@ -225,26 +225,26 @@ class Map:
         order = np.lexsort((-self.kf_id[slots], -counts[slots]))
         return slots[order], counts[slots[order]]
 
-    def move_submap(self, submap: int, T_new_old: Array, joined_to: int, factor: float = 1.0) -> None:
-        """Move all keyframes of an submap, and their points, to where they belong in another, and join it to that.
+    def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> None:
+        """Move all keyframes of a submap, and their points, into another, and make them part of that.
 
         Args:
-            submap: Its number.
-            T_new_old: From the world as the submap had it to the world as the other has it, ``[4, 4]``.
-            joined_to: The other's number.
-            factor: What lengths in the submap's world are multiplied by before it is moved.
+            number: The submap.
+            T_new_old: From the submap's world to the world of the other, ``[4, 4]``.
+            merged_into: The other's number.
+            scale: What lengths in the submap's world are multiplied by before it is moved.
         """
-        slots = np.flatnonzero(self.kf_alive & (self.kf_map == submap))
-        points = kernels.distinct(self.kf_point[slots], self.alive.size)
-        self.kf_pose[slots, :3, 3] *= factor
+        slots = np.flatnonzero(self.kf_alive & (self.kf_map == number))
+        points = self.points_of(slots)
+        self.kf_pose[slots, :3, 3] *= scale
         for slot in slots.tolist():
             self.set_pose(slot, self.kf_pose[slot] @ se3.inverse(T_new_old))
-        self.position[points] = se3.transform(T_new_old, factor * self.position[points])
-        self.kf_map[slots] = joined_to
+        self.position[points] = se3.transform(T_new_old, scale * self.position[points])
+        self.kf_map[slots] = merged_into
         self.refresh(points)
 
     def remove_keyframe(self, slot: int) -> None:
-        """Remove a keyframe, its observations, and the points that nobody observes any more."""
+        """Remove a keyframe, its observations, and the points that no keyframe observes any more."""
         n = self.kf_count[slot]
         features = np.flatnonzero(self.kf_point[slot, :n] >= 0)
         points = self.kf_point[slot, features].astype(np.int64)
@@ -288,14 +288,14 @@ class Map:
         return slots
 
     def observe(self, keyframe: int, features: Slots, points: Slots) -> None:
-        """Note that features of a keyframe observe points."""
+        """Add observations: features of a keyframe show points."""
         if not len(points):
             return
         self._reserve(points, 1)
         kernels.link(*self._observed, self.kf_point, keyframe, features, points)
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:
-        """Forget observations; points that lose their last one are removed."""
+        """Remove observations; points that lose their last one are removed."""
         points = self.kf_point[keyframes, features].astype(np.int64)
         kernels.unlink_many(*self._observed, self.kf_point, keyframes, features)
         points = np.unique(points[points >= 0])
@@ -310,7 +310,7 @@ class Map:
         self._freed_points.extend(points.tolist())
 
     def merge(self, old: int, new: int) -> None:
-        """Replace a point by another that is the same thing in the world."""
+        """Replace a point by another that is the same point of the scene."""
         if old == new or not self.alive[old] or not self.alive[new]:
             return
         self._reserve(np.array([new]), int(self.n_obs[old]))
@@ -326,17 +326,9 @@ class Map:
         kernels.refresh(points, *of_points, *self._observed, *of_keyframes, self.kf_centre, self.scales)
 
     def release(self) -> None:
-        """Allow the slots freed so far to be used again; called once nobody holds them any more."""
-        newest = self._top - REUSED
-        self._free_points = [slot for slot in self._free_points if slot >= newest]
-        self._free_points.extend(sorted((slot for slot in self._freed_points if slot >= newest), reverse=True))
+        """Allow the slots freed so far to be used again; called once nothing refers to them any more."""
+        self._free_points.extend(sorted(self._freed_points, reverse=True))
         self._freed_points.clear()
-
-    def rest(self) -> None:
-        """Let what is not in use leave the memory; points and observations only where they are not the newest."""
-        self.space.rest(*self._KEYFRAME_TABLES)
-        self.space.rest(*self._POINT_TABLES, rows=self._top - REUSED)
-        self.space.rest("obs_kf", "obs_ft", rows=self._observations - NEWEST_OBSERVATIONS)
 
     @property
     def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:
@@ -349,50 +341,48 @@ class Map:
         return np.repeat(begin, count) + np.arange(count.sum())
 
     def _reserve(self, points: Slots, more: int) -> None:
-        """Make room for so many more observations of each of the points; what they leave is used again."""
-        full = self.n_obs[points] + more > self.obs_room[points]
+        """Make room for so many more observations of each of the points; the room that they leave is used again."""
+        full = self.n_obs[points] + more > self.obs_capacity[points]
         if not full.any():
             return
         short = np.unique(points[full])
-        rooms = np.maximum(2 * self.obs_room[short], FEWEST_ROOM)
+        capacities = np.maximum(2 * self.obs_capacity[short], MIN_CAPACITY)
         if more > 1:
-            rooms = np.maximum(rooms, self.n_obs[short] + more)
-        for room in np.unique(rooms).tolist():
-            wanting = short[rooms == room]
-            vacant = self._vacant.get(room, [])
-            at = [vacant.pop() for _ in range(min(len(vacant), len(wanting)))]
-            fresh = self._observations + room * np.arange(len(wanting) - len(at), dtype=np.int64)
-            self._observations += room * len(fresh)
+            capacities = np.maximum(capacities, self.n_obs[short] + more)
+        for capacity in np.unique(capacities).tolist():
+            moving = short[capacities == capacity]
+            vacant = self._vacant.get(capacity, [])
+            reused = [vacant.pop() for _ in range(min(len(vacant), len(moving)))]
+            fresh = self._observations + capacity * np.arange(len(moving) - len(reused), dtype=np.int64)
+            self._observations += capacity * len(fresh)
             if self._observations > self.obs_kf.size:
                 length = max(self._observations, self.obs_kf.size + self.obs_kf.size // 2)
-                for name in ("obs_kf", "obs_ft"):
-                    self._grow(name, length)
-            left = zip(self.obs_room[wanting].tolist(), self.obs_at[wanting].tolist(), strict=True)
-            kernels.move(*self._observed, wanting, np.concatenate([np.array(at, np.int64), fresh]))
-            self.obs_room[wanting] = room
-            for size, place in left:
+                self._grow("obs_kf", length)
+                self._grow("obs_ft", length)
+            left = zip(self.obs_capacity[moving].tolist(), self.obs_at[moving].tolist(), strict=True)
+            kernels.move(*self._observed, moving, np.concatenate([np.array(reused, np.int64), fresh]))
+            self.obs_capacity[moving] = capacity
+            for size, begin in left:
                 if size:
-                    self._vacant.setdefault(size, []).append(place)
+                    self._vacant.setdefault(size, []).append(begin)
 
     # ------------------------------------------------------------------ views
 
-    def project(
-        self, T_cam_world: Array, candidates: Slots, *, min_cosine: float = 0.5, wide: float = 1.25
-    ) -> tuple[Slots, Array, Array, Slots, Array]:
+    def project(self, T_cam_world: Array, candidates: Slots) -> tuple[Slots, Array, Array, Slots, Array]:
         """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
         c = self.camera
         return kernels.project(
             np.ascontiguousarray(T_cam_world), candidates, self.position, self.normal, self.far,
             c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, float(c.width), float(c.height),
-            float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales), min_cosine, wide,
+            float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales),
         )  # fmt: skip
 
-    def redundancy(self, slot: int, close_m: float, others: int = 3) -> tuple[int, int]:
-        """A keyframe's close points, and how many of them `others` keyframes see, at most one octave coarser.
+    def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
+        """A keyframe's close points, and how many of them three other keyframes see, at most one octave coarser.
 
         All points of a keyframe without any depth count as close.
         """
         depth = self.kf_z[slot, : self.kf_count[slot]]
         close = (depth > 0) & (depth <= close_m) if depth.any() else np.ones(len(depth), bool)
-        total, redundant = kernels.redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed, others)
+        total, redundant = kernels.redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed, 3)
         return int(total), int(redundant)

@@ -1,7 +1,8 @@
-"""A map as a file, ``map.npz``, from which a later run starts: arrays and nothing else, checked before they are used.
+"""Files of a map: ``map.npz``, from which a later run starts, ``keyframes.csv`` and ``map.ply``.
 
-Keyframes and points are stored without gaps, oldest first, and refer to each other by row. Which frames of which
-recording the keyframes were is left out: in another one it means nothing. `docs/backend.md` lists the arrays.
+``map.npz`` holds arrays and nothing else, which are checked before they are used. Keyframes and points are stored
+without gaps, oldest first, and refer to each other by row. Which frames of which recording the keyframes were is left
+out: in another one it means nothing. `docs/backend.md` lists the arrays.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import csv
 import io
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
+from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core.array_files import MOST_BYTES, read_npz
 from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
-from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
+from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
 from dynslam_bench.core.records import Record, schema, write_atomic
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -35,6 +35,7 @@ ARRAY_HEADER_BYTES = 256
 MAKE_ONE = "a map is made by: run --save-map"
 
 Sensors = Literal["rgbd", "rgb"]
+Arrays = Mapping[str, NDArray[Any]]
 
 KEYFRAME_ARRAYS = {
     "kf_id": ("i8", "S"), "kf_map": ("i8", "S"), "kf_pose": ("f8", "S44"), "kf_count": ("i8", "S"),
@@ -53,9 +54,20 @@ POINT_ARRAYS = {
 """Of each point; P points."""
 OBSERVATION_ARRAYS = {"obs_kf": ("i4", "O"), "obs_ft": ("i4", "O")}
 """Of each observation, one point after the other: row of the keyframe, and which of its features; O observations."""
-SUBMAP_ARRAYS = {"submap_start": ("f8", "I3"), "submap_anchor": ("f8", "I3"), "submap_reach": ("f8", "I")}
-"""Of each map that never met the first one (`Atlas`); I of them."""
+SUBMAP_ARRAYS = {"submap_start": ("f8", "I3"), "submap_anchor": ("f8", "I3"), "submap_bound": ("f8", "I")}
+"""Of each submap that was not merged (`Atlas`); I of them."""
 _LAYOUT = KEYFRAME_ARRAYS | FEATURE_ARRAYS | POINT_ARRAYS | OBSERVATION_ARRAYS | SUBMAP_ARRAYS
+
+
+MAX_TABLE_BYTES = 1 << 30
+"""Of all features of a map as tables; two thousand keyframes of a thousand features fill a fifth."""
+MAX_WORDS = 64
+"""Words of 64 bits of a descriptor; ORB's has four."""
+_FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_info", "kf_info_right", "position",
+           "normal", "far", "submap_start", "submap_anchor")  # fmt: skip
+_NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
+              "kf_octave": 0, "kf_point": -1, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_map": 0, "id": 0,
+              "born": 0, "submap_bound": 0}  # fmt: skip
 
 
 class MapFeatures(Record):
@@ -83,7 +95,7 @@ class MapFeatures(Record):
 
 
 class MapHeader(Record):
-    """What a map says of itself.
+    """What a map file says of the map.
 
     Attributes:
         kind: Says that the file is a map.
@@ -110,10 +122,10 @@ class MapHeader(Record):
 
 @dataclass(frozen=True, eq=False)
 class SavedMap:
-    """A map as it lies in a file.
+    """The content of a map file.
 
     Attributes:
-        header: What it says of itself.
+        header: Where it comes from.
         arrays: By name, see `KEYFRAME_ARRAYS` and those after it.
     """
 
@@ -149,7 +161,7 @@ class SavedMap:
 
 
 def described(camera: Camera) -> dict[str, float]:
-    """What of a camera a map depends on: undistorted intrinsics, and what depth becomes a right coordinate by."""
+    """The part of a camera that a map depends on: undistorted intrinsics and baseline."""
     names = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
     return {name: float(value) for name, value in asdict(camera).items() if name in names}
 
@@ -174,134 +186,98 @@ def write_map(path: Path, saved: SavedMap) -> None:
 
 
 def read_map(path: Path) -> SavedMap:
-    """Read a map that `write_map` wrote; every number that something is looked up by is checked.
+    """Read a map that `write_map` wrote; every index is checked.
 
     Raises:
         SettingsError: The file cannot be read, is no map, of a newer version, or damaged; names the first fault.
     """
-    found = read_npz(path, kind=SettingsError)
-    if HEADER not in found:
+    arrays = read_npz(path, kind=SettingsError)
+    if HEADER not in arrays:
         raise SettingsError(f"{path} is no map: it holds no header", MAKE_ONE)
     try:
-        text = found.pop(HEADER).tobytes().decode()
+        text = arrays.pop(HEADER).tobytes().decode()
         header = MapHeader.parse(text, f"{path} (header)")
     except UnicodeDecodeError as error:
         raise SettingsError(f"{path} is no map: its header is no text", MAKE_ONE) from error
     except DynslamError as error:
         raise SettingsError(str(error)) from error
-    arrays = {name: np.ascontiguousarray(array) for name, array in found.items()}
-    numbers = header.next_keyframe, header.next_point, header.features.levels
-    for fault in chain(array_faults(arrays, _LAYOUT), content_faults(arrays, *numbers)):  # basic ones first
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    for fault in _faults(arrays, header):
         raise SettingsError(f"{path} is a damaged map: {fault}", MAKE_ONE)
     return SavedMap(header, arrays)
 
 
-# What may be wrong with the arrays of a map that somebody else wrote; compiled loops look nothing up unchecked.
+def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
+    """Faults of the arrays of a file that anyone may have written: compiled loops check no index.
 
-Arrays = Mapping[str, NDArray[Any]]
-Layout = Mapping[str, tuple[str, str]]
-
-MAX_TABLE_BYTES = 1 << 30
-"""Of all features of a map as tables; two thousand keyframes of a thousand features fill a fifth."""
-MOST_WORDS = 64
-"""Words of 64 bits of a descriptor; ORB's has four."""
-_FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_info", "kf_info_right", "position",
-           "normal", "far", "submap_start", "submap_anchor")  # fmt: skip
-_NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
-              "kf_octave": 0, "kf_point": -1, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_map": 0, "id": 0,
-              "born": 0, "submap_reach": 0}  # fmt: skip
-
-
-def array_faults(arrays: Arrays, layout: Layout) -> Iterator[str]:
-    """Arrays that are missing or too many, of another type or shape; sizes with one letter are the same everywhere.
-
-    Args:
-        arrays: The arrays.
-        layout: Type, and shape with a letter or digit for each axis, by name.
+    Arrays that are missing, unknown, or of another type or shape; values out of bounds; references that contradict each
+    other. Later checks rely on earlier ones.
     """
-    for name in sorted(layout.keys() ^ arrays.keys()):
-        yield f"it holds no array '{name}'" if name in layout else f"it holds an unknown array '{name[:40]}'"
+    for name in sorted(_LAYOUT.keys() ^ arrays.keys()):
+        yield f"it holds no array '{name}'" if name in _LAYOUT else f"it holds an unknown array '{name[:40]}'"
     sizes: dict[str, int] = {}
-    for name, (kind, axes) in layout.items():
-        found = arrays[name]
+    for name, (kind, axes) in _LAYOUT.items():
+        array = arrays[name]
         expected = [int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
-                    for axis, size in zip(axes, found.shape, strict=False)]  # fmt: skip
-        if found.dtype != np.dtype(kind) or found.ndim != len(axes) or list(found.shape) != expected:
-            shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - found.ndim, 0)
-            yield f"'{name}' is {found.dtype} of shape {str(found.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
-
-
-def content_faults(arrays: Arrays, next_keyframe: int, next_point: int, levels: int) -> Iterator[str]:
-    """Values out of bounds, and references that lead nowhere or are not answered.
-
-    Args:
-        arrays: The arrays, complete and of the right shapes.
-        next_keyframe: Number of the next keyframe, above all there are.
-        next_point: Number of the next point, likewise.
-        levels: Levels of the features' image pyramid.
-    """
+                    for axis, size in zip(axes, array.shape, strict=False)]  # fmt: skip
+        if array.dtype != np.dtype(kind) or array.ndim != len(axes) or list(array.shape) != expected:
+            shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
+            yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
     for name in _FINITE:
         if not np.isfinite(arrays[name]).all():
             yield f"'{name}' holds values that are not finite"
+    most = {"kf_map": len(arrays["submap_bound"]), "kf_octave": header.features.levels - 1,
+            "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
+            "kf_point": len(arrays["id"]) - 1, "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
     for name, least in _NOT_BELOW.items():
         if not (arrays[name] >= least).all():
             yield f"'{name}' holds values below {least}"
-    yield from _bounds(arrays, next_keyframe, next_point, levels)
-    yield from _references(arrays)
+        if not (arrays[name] <= most.get(name, np.inf)).all():
+            yield f"'{name}' holds values above {most[name]}"
+    yield from (fault for holds, fault in _contents(arrays) if not holds)
+    yield from (fault for holds, fault in _references(arrays) if not holds)
 
 
-def _bounds(arrays: Arrays, next_keyframe: int, next_point: int, levels: int) -> Iterator[str]:
-    if not len(arrays["kf_id"]):
-        yield "it holds no keyframe"
-    if not (arrays["far"] > 0).all():
-        yield "'far' holds values that are not above 0"
-    most = {"kf_map": len(arrays["submap_reach"]), "kf_octave": levels - 1,
-            "kf_id": next_keyframe - 1, "born": next_keyframe - 1, "id": next_point - 1,
-            "kf_point": len(arrays["id"]) - 1, "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
-    for name, largest in most.items():
-        if not (arrays[name] <= largest).all():
-            yield f"'{name}' holds values above {largest}"
+def _contents(arrays: Arrays) -> Iterator[tuple[Any, str]]:
+    """What has to hold of values, and the fault if it does not."""
+    yield len(arrays["kf_id"]), "it holds no keyframe"
+    yield (arrays["far"] > 0).all(), "'far' holds values that are not above 0"
     for name in ("kf_id", "id"):
-        if not (np.diff(arrays[name]) > 0).all():
-            yield f"'{name}' is not in ascending order"
+        yield (np.diff(arrays[name]) > 0).all(), f"'{name}' is not in ascending order"
     rotation = arrays["kf_pose"][:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3))
-        upright = np.linalg.det(rotation) > 0
-    if not ((off < 1e-6).all() and upright.all() and (arrays["kf_pose"][:, 3] == [0, 0, 0, 1]).all()):
-        yield "'kf_pose' holds what is no rigid transformation"
-    if not np.array_equal(np.isnan(arrays["kf_right"]), arrays["kf_z"] == 0) or np.isinf(arrays["kf_right"]).any():
-        yield "'kf_right' is not known where depth is, and only there"
+        right_handed = np.linalg.det(rotation) > 0
+    rigid = (off < 1e-6).all() and right_handed.all() and (arrays["kf_pose"][:, 3] == [0, 0, 0, 1]).all()
+    yield rigid, "'kf_pose' holds what is no rigid transformation"
+    right, z = arrays["kf_right"], arrays["kf_z"]
+    where_depth = np.array_equal(np.isnan(right), z == 0) and not np.isinf(right).any()
+    yield where_depth, "'kf_right' is not known where depth is, and only there"
 
 
-def _references(arrays: Arrays) -> Iterator[str]:
-    """Features say which point they observe, and points which features observe them; both have to say the same."""
+def _references(arrays: Arrays) -> Iterator[tuple[Any, str]]:
+    """Features name the point that they observe, and points the features that observe them; both have to agree."""
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
-    if words > MOST_WORDS:
-        yield f"a descriptor has {words} words of 64 bits, at most {MOST_WORDS} are read"
+    yield words <= MAX_WORDS, f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
     count = arrays["kf_count"]
     claimed = len(count) * int(count.max(initial=0)) * (64 + 8 * words)  # as tables, as wide as the longest row
-    if claimed > MAX_TABLE_BYTES:
-        yield f"'kf_count' claims tables of {claimed} bytes, at most {MAX_TABLE_BYTES} are made"
+    yield claimed <= MAX_TABLE_BYTES, f"'kf_count' claims tables of {claimed} bytes, at most {MAX_TABLE_BYTES} are made"
     for name, total in (("kf_count", len(arrays["kf_point"])), ("n_obs", len(arrays["obs_kf"]))):
         counts = arrays[name].astype(np.int64)
-        if (counts > total).any() or int(counts.sum()) != total:
-            yield f"'{name}' does not add up to {total}"
+        yield (counts <= total).all() and int(counts.sum()) == total, f"'{name}' does not add up to {total}"
     keyframe, feature = arrays["obs_kf"], arrays["obs_ft"]
-    if not (feature < arrays["kf_count"][keyframe]).all():
-        yield "'obs_ft' names features that the keyframe does not have"
-    begin = np.cumsum(arrays["kf_count"]) - arrays["kf_count"]
-    seen = begin[keyframe] + feature
-    said = np.repeat(np.arange(len(arrays["id"])), arrays["n_obs"])
-    if len(np.unique(seen)) != len(seen) or not np.array_equal(arrays["kf_point"][seen], said):
-        yield "observations do not agree with 'kf_point'"
-    if len(np.unique(said * len(arrays["kf_id"]) + keyframe)) != len(seen):
-        yield "a keyframe observes a point with two features"
-    if np.count_nonzero(arrays["kf_point"] >= 0) != len(seen):
-        yield "'kf_point' names points that do not know of it"
+    yield (feature < count[keyframe]).all(), "'obs_ft' names features that the keyframe does not have"
+    row = (np.cumsum(count) - count)[keyframe] + feature
+    point = np.repeat(np.arange(len(arrays["id"])), arrays["n_obs"])
+    agree = len(np.unique(row)) == len(row) and np.array_equal(arrays["kf_point"][row], point)
+    yield agree, "observations do not agree with 'kf_point'"
+    once = len(np.unique(point * len(arrays["kf_id"]) + keyframe)) == len(row)
+    yield once, "a keyframe observes a point with two features"
+    matched = np.count_nonzero(arrays["kf_point"] >= 0) == len(row)
+    yield matched, "'kf_point' names points that have no such observation"
 
 
-# A map as files: ``keyframes.csv`` and ``map.ply``.
+# ---------------------------------------------------------------------- keyframes.csv and map.ply
 
 _COLOURS = ("red", "green", "blue")
 _PLY_LAYOUT = np.dtype(
@@ -349,7 +325,7 @@ class Cloud:
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read a map that `write_ply` wrote in binary.
+    """Read a map that `write_ply` wrote.
 
     Raises:
         RunError: It cannot be read, or is no such file.
@@ -357,32 +333,31 @@ def read_ply(path: Path) -> Cloud:
     data = read_bytes(path, limit=TABLE_BYTES, kind=RunError)
     head, _, body = data.partition(b"end_header\n")
     rows = len(body) // _PLY_LAYOUT.itemsize
-    if head + b"end_header\n" != _header(rows, "binary_little_endian") or len(body) != rows * _PLY_LAYOUT.itemsize:
+    if head + b"end_header\n" != _ply_header(rows) or len(body) != rows * _PLY_LAYOUT.itemsize:
         raise RunError(
             f"{path} is no map of this package: expected {_PLY_LAYOUT.itemsize} bytes a point, little-endian"
         )
-    found = np.frombuffer(body, _PLY_LAYOUT)
-    positions = np.stack([found[name] for name in "xyz"], axis=1)
+    points = np.frombuffer(body, _PLY_LAYOUT)
+    positions = np.stack([points[name] for name in "xyz"], axis=1)
     if not np.isfinite(positions).all():
         raise RunError(f"{path} holds points that are not finite")
-    colours = np.stack([found[name] for name in _COLOURS], axis=1)
-    return Cloud(positions, colours, found["n"])
+    colours = np.stack([points[name] for name in _COLOURS], axis=1)
+    return Cloud(positions, colours, points["n"])
 
 
-def _header(rows: int, coding: str) -> bytes:
+def _ply_header(rows: int) -> bytes:
     kinds = {"float": ("x", "y", "z"), "uchar": _COLOURS, "int": ("observations",)}
     properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
-    header = ["ply", f"format {coding} 1.0", f"element vertex {rows}", *properties, "end_header"]
-    return ("\n".join(header) + "\n").encode()
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}", *properties, "end_header"]
+    return ("\n".join(lines) + "\n").encode()
 
 
-def write_ply(path: Path, outputs: MapOutputs, *, binary: bool = True) -> None:
-    """Write the map points as a PLY cloud: float x y z in metres, uchar red green blue, int observations.
+def write_ply(path: Path, outputs: MapOutputs) -> None:
+    """Write the map points as a binary PLY cloud: float x y z in metres, uchar red green blue, int observations.
 
     Args:
         path: The file to write.
         outputs: The map.
-        binary: Little-endian binary, or ASCII.
 
     Raises:
         DynslamError: The folder cannot be written.
@@ -393,14 +368,4 @@ def write_ply(path: Path, outputs: MapOutputs, *, binary: bool = True) -> None:
     for i, name in enumerate(_COLOURS):
         rows[name] = outputs.colours[:, i]
     rows["n"] = outputs.observations
-    head = _header(len(rows), "binary_little_endian" if binary else "ascii")
-    if binary:
-        write_atomic(path, head + rows.tobytes())
-        return
-    body = "".join(f"{r[0]:.6f} {r[1]:.6f} {r[2]:.6f} {r[3]} {r[4]} {r[5]} {r[6]}\n" for r in rows.tolist())
-    write_atomic(path, head + body.encode())
-
-
-# What a map leaves behind: files and the sheet of five panels.
-
-__all__ = ["KeyframeRecord", "MapOutputs", "write_keyframes_csv", "write_ply"]
+    write_atomic(path, _ply_header(len(rows)) + rows.tobytes())

@@ -16,6 +16,11 @@ Slots = NDArray[np.int64]
 Table = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
+MIN_COSINE = 0.5
+"""Smallest cosine between a point's mean viewing direction and the ray to the camera (ORB-SLAM2's number)."""
+WIDEN_RANGE = 1.25
+"""Factor by which the scale range of a point is widened."""
+
 
 @kernel
 def move(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, points: Slots, to: Slots) -> None:
@@ -33,17 +38,17 @@ def link(
     obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, keyframe: int, features: Slots,
     points: Slots,
 ) -> None:  # fmt: skip
-    """Note that the keyframe's features observe the points; a pair that would be a second observation is skipped."""
+    """Add observations of the points by the keyframe's features; a second one by the same keyframe is skipped."""
     for i in range(points.shape[0]):
         p, f = points[i], features[i]
         if kf_point[keyframe, f] >= 0:
             continue
-        seen = False
+        observed = False
         begin, end = obs_at[p], obs_at[p] + n_obs[p]
         for o in range(begin, end):
             if obs_kf[o] == keyframe:
-                seen = True
-        if seen:
+                observed = True
+        if observed:
             continue
         obs_kf[end] = keyframe
         obs_ft[end] = f
@@ -55,7 +60,7 @@ def link(
 def unlink(
     obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, keyframe: int, feature: int
 ) -> None:
-    """Forget one observation; the order of the others is kept."""
+    """Remove one observation; the order of the others is kept."""
     p = kf_point[keyframe, feature]
     if p < 0:
         return
@@ -74,7 +79,7 @@ def unlink(
 def unlink_many(
     obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, keyframes: Slots, features: Slots
 ) -> None:
-    """Forget several observations."""
+    """Remove several observations."""
     for i in range(keyframes.shape[0]):
         unlink(obs_kf, obs_ft, obs_at, n_obs, kf_point, keyframes[i], features[i])
 
@@ -91,16 +96,16 @@ def drop_points(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point
 
 @kernel
 def merge(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Table, old: int, new: int) -> None:
-    """Hand the observations of `old` to `new`; where both are seen in one keyframe, `new`'s stays."""
+    """Move the observations of `old` to `new`; where one keyframe observes both, that of `new` stays."""
     for o in range(obs_at[old], obs_at[old] + n_obs[old]):
         kf, ft = obs_kf[o], obs_ft[o]
         kf_point[kf, ft] = -1
-        seen = False
+        observed = False
         begin, end = obs_at[new], obs_at[new] + n_obs[new]
-        for known in range(begin, end):
-            if obs_kf[known] == kf:
-                seen = True
-        if not seen:
+        for other in range(begin, end):
+            if obs_kf[other] == kf:
+                observed = True
+        if not observed:
             obs_kf[end] = kf
             obs_ft[end] = ft
             n_obs[new] += 1
@@ -152,7 +157,7 @@ def refresh(
         if n == 0:
             continue
         begin, end = obs_at[p], obs_at[p] + n
-        m = min(n, 12)  # the newest observations stand for all
+        m = min(n, 12)  # only the newest observations count
         best = end - 1
         if m > 2:
             best_score = 1 << 40
@@ -165,7 +170,7 @@ def refresh(
         for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
             words[p, w] = kf_words[obs_kf[best], obs_ft[best], w]
         sx, sy, sz = 0.0, 0.0, 0.0
-        reach = 0.0
+        reference_distance = 0.0
         for o in range(begin, end):
             c = kf_centre[obs_kf[o]]
             x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
@@ -174,17 +179,17 @@ def refresh(
             sy += y / d
             sz += z / d
             if o == begin:
-                reach = d * scales[kf_octave[obs_kf[o], obs_ft[o]]]
+                reference_distance = d * scales[kf_octave[obs_kf[o], obs_ft[o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
         normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
-        far[p] = reach
+        far[p] = reference_distance
 
 
 @kernel
 def project(
     pose: Array, candidates: NDArray[np.int64], position: Array, normal: Array, far: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, width: float, height: float, scale_factor: float,
-    levels: int, min_cosine: float, wide: float,
+    levels: int,
 ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:  # fmt: skip
     """The candidate points that the camera should see: in the image, at a fit distance, from a fit side.
 
@@ -216,10 +221,10 @@ def project(
             continue
         dx, dy, dz = x - ox, y - oy, z - oz
         d = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if d > wide * far[p] or d * wide < far[p] / nearest:
+        if d > WIDEN_RANGE * far[p] or d * WIDEN_RANGE < far[p] / nearest:
             continue
         c = (dx * normal[p, 0] + dy * normal[p, 1] + dz * normal[p, 2]) / d
-        if c < min_cosine:
+        if c < MIN_COSINE:
             continue
         level = int(np.ceil(np.log(far[p] / d) * inverse_log - 1e-9))
         index[count] = p

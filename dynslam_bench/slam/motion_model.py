@@ -15,29 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.observation import Observations
 from dynslam_bench.slam.pose_optimisation import apply_twist
-from dynslam_bench.slam.rolling_shutter import CameraVelocity, compensate_rolling_shutter
 from dynslam_bench.slam.settings import MotionModelSettings
-from dynslam_bench.slam.tracking import MapFit, TrackedFrame
+from dynslam_bench.slam.tracking import TrackedFrame
 
 Array = NDArray[np.float64]
 
 CHI2_POSE = 12.592
 """95 % quantile of chi-square with six degrees of freedom."""
+INFLATION = 100.0
+"""Factor on the covariance of a measured pose: pixel errors are not independent of each other."""
+MAX_GAP_S = 0.25
+"""After a longer gap between frames nothing is assumed of the motion."""
+FIRST_INTERVAL_S = 1 / 30
+"""Interval between frames until one was measured."""
+JITTER = 0.1
+"""Share of the last interval by which a stamp may be off and still count as regular: the noise of stamping."""
+INTERVALS = 15
+"""The latest intervals that are kept."""
 _START_SPEED = np.repeat([1.0, 2.0], 3)
 """Standard deviations of velocity (m/s) and angular velocity (rad/s) when nothing is known of them."""
 
 
-def pose_covariance(T_cam_world: Array, information: Array, inflation: float) -> Array:
+def pose_covariance(T_cam_world: Array, information: Array, inflation: float = INFLATION) -> Array:
     """Covariance ``[6, 6]`` of (position in the world, rotation in the camera frame) of a measured pose.
 
     Args:
         T_cam_world: The measured world-to-camera pose.
         information: Gauss-Newton matrix of (translation, rotation) for ``exp(xi) @ T_cam_world``.
-        inflation: Factor on the covariance: pixel errors are not independent of each other.
+        inflation: Factor on the covariance.
     """
     j = np.zeros((6, 6))
     j[:3, :3] = -T_cam_world[:3, :3]
@@ -47,8 +53,8 @@ def pose_covariance(T_cam_world: Array, information: Array, inflation: float) ->
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _process_noise(dt: float, acceleration: float, angular_acceleration: float) -> Array:
-    q = np.repeat([acceleration**2, angular_acceleration**2], 3)
+def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
+    q = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
     noise = np.zeros((12, 12))
     noise[:6, :6] = np.diag(q * dt**4 / 4)
     noise[:6, 6:] = noise[6:, :6] = np.diag(q * dt**3 / 2)
@@ -98,8 +104,8 @@ class MotionState:
     def difference(self, T_cam_world: Array) -> Array:
         """(position, rotation) ``[6]`` that leads from this state's pose to another."""
         r = T_cam_world[:3, :3]
-        turn = Rotation.from_matrix(r @ self.rotation.T).as_rotvec()
-        return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, turn])
+        rotation = Rotation.from_matrix(r @ self.rotation.T).as_rotvec()
+        return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, rotation])
 
     def moved(self, correction: Array, covariance: Array) -> MotionState:
         """The state after a correction ``[12]``."""
@@ -109,12 +115,12 @@ class MotionState:
         rotation = apply_twist(pose, twist)[:3, :3]  # keeps it orthonormal
         return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
-    def carried(self, turn: Array, factor: float) -> MotionState:
-        """The same motion where the world was turned by a rotation ``[3, 3]`` and its lengths were multiplied."""
+    def transformed(self, rotation: Array, scale: float) -> MotionState:
+        """The same motion after the world was rotated by ``[3, 3]`` and its lengths were multiplied."""
         by = np.eye(12)
-        by[:3, :3] = by[6:9, 6:9] = factor * turn
+        by[:3, :3] = by[6:9, 6:9] = scale * rotation
         return MotionState(
-            by[:3, :3] @ self.position, self.rotation @ turn.T, by[6:, 6:] @ self.speed, by @ self.covariance @ by.T
+            by[:3, :3] @ self.position, self.rotation @ rotation.T, by[6:, 6:] @ self.speed, by @ self.covariance @ by.T
         )
 
     def relocated(self, T_cam_world: Array) -> MotionState:
@@ -125,7 +131,7 @@ class MotionState:
     def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
         """The state `dt` seconds later."""
         f = _transition(dt)
-        noise = _process_noise(dt, settings.acceleration, settings.angular_acceleration)
+        noise = _process_noise(dt, settings)
         step = np.concatenate([self.speed * dt, np.zeros(6)])
         return self.moved(step, f @ self.covariance @ f.T + noise)
 
@@ -134,11 +140,11 @@ class MotionState:
 
         Of (position in the world, rotation in the camera frame); where the camera is now plays no part.
         """
-        noise = _process_noise(dt, settings.acceleration, settings.angular_acceleration)
+        noise = _process_noise(dt, settings)
         return np.asarray(dt**2 * self.covariance[6:, 6:] + noise[:6, :6])
 
     def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
-        """The state after a measured pose; a surprising one (chi-square) is believed more than the motion model."""
+        """The state after a measured pose; one beyond the chi-square limit inflates the predicted covariance."""
         p = self.covariance
         innovation = self.difference(T_cam_world)
         s = p[:6, :6] + covariance
@@ -152,7 +158,7 @@ class MotionState:
 
 
 def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: MotionModelSettings) -> Array:
-    """Fixed-interval smoothing of measured poses; gaps longer than `MotionModelSettings.max_gap_s` are not bridged.
+    """Fixed-interval smoothing of measured poses; gaps longer than `MAX_GAP_S` are not bridged.
 
     Args:
         stamps: Seconds ``[N]``, ascending.
@@ -164,7 +170,7 @@ def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: Moti
         Smoothed world-to-camera poses ``[N, 4, 4]``.
     """
     out = np.array(T_cam_world)
-    cuts = np.flatnonzero(np.diff(stamps) > settings.max_gap_s) + 1
+    cuts = np.flatnonzero(np.diff(stamps) > MAX_GAP_S) + 1
     for rows in np.split(np.arange(len(stamps)), cuts):
         if len(rows) > 2:
             out[rows] = _smooth_part(stamps[rows], T_cam_world[rows], covariances[rows], settings)
@@ -193,98 +199,63 @@ def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: Moti
     return out
 
 
-# Where the camera should be now: the motion model's state from frame to frame, and what stamps it believes.
-
-
-FIRST_INTERVAL_S = 1 / 30
-"""Taken for the interval between frames until one was measured."""
-JITTER = 0.1
-"""Share of the last interval by which a stamp may be off and still count as regular: the noise of stamping."""
-
-STAMPING = 0.25
-"""Share of the usual interval by which a stamp may be off that was given after the exposure (TUM's are off by 0.2)."""
-GAPS = 15
-"""So many intervals tell the usual one."""
-
-
 class CameraMotion:
     """The motion model while tracking; it knows nothing at the start and after a lost frame.
 
     Args:
-        readout_s: Seconds that the camera takes to read out a frame: no two are exposed less apart.
+        settings: Accelerations.
 
     Attributes:
-        last_speeds: How the world moved past a rolling shutter in the last tracked frame; None where it is not known.
+        state: Filtered motion of the last tracked frame; None while nothing is known.
+        intervals: The latest intervals between tracked frames, seconds.
     """
 
-    def __init__(self, readout_s: float = 0.0) -> None:
-        self._readout_s = readout_s
-        self._state: MotionState | None = None
+    def __init__(self, settings: MotionModelSettings) -> None:
+        self._settings = settings
         self._interval = FIRST_INTERVAL_S
-        self.last_speeds: CameraVelocity | None = None
-        self._gaps: deque[float] = deque(maxlen=GAPS)
+        self.state: MotionState | None = None
+        self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
     def forget(self) -> None:
         """The camera was lost: nothing is known of its motion."""
-        self._state = self.last_speeds = None
+        self.state = None
 
     def relocated(self, T_cam_world: Array) -> None:
         """The same motion at another pose, as after bundle adjustment."""
-        if self._state is not None:
-            self._state = self._state.relocated(T_cam_world)
+        if self.state is not None:
+            self.state = self.state.relocated(T_cam_world)
 
-    def carried(self, T_cam_before: Array, T_cam_now: Array, factor: float) -> None:
+    def transformed(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
         """The same motion after a loop was closed.
 
         Args:
             T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
             T_cam_now: That pose now.
-            factor: What lengths around it were multiplied by.
+            scale: What lengths around it were multiplied by.
         """
-        if self._state is not None:
-            self._state = self._state.carried(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], factor)
+        if self.state is not None:
+            self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
 
     def regular(self, last: TrackedFrame, timestamp: float) -> float:
         """The stamp, or where it is within `JITTER` of a regular one, the regular one."""
-        due = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval
-        return last.timestamp + self._interval if due else timestamp
+        is_regular = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval
+        return last.timestamp + self._interval if is_regular else timestamp
 
-    def predicted(self, last: TrackedFrame, timestamp: float, settings: MotionModelSettings) -> Array:
+    def predicted(self, last: TrackedFrame, timestamp: float) -> Array:
         """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
-        ahead = self._ahead(last, timestamp, settings)
-        return last.T_cam_world if ahead is None else ahead.T_cam_world
-
-    def speeds(
-        self, last: TrackedFrame, timestamp: float, settings: MotionModelSettings, pose: Array | None = None
-    ) -> CameraVelocity | None:
-        """How the world moves past the camera during a frame; None where nothing is known of it, or need be.
-
-        Not the filter's: that takes the acceleration as constant between frames, and follows a hand by swinging about
-        the true speed from one frame to the next.
-
-        Args:
-            last: The last tracked frame.
-            timestamp: The frame's stamp, seconds.
-            settings: Of the motion model.
-            pose: The frame's world-to-camera pose, if it was found already; else it goes on as it went before.
-        """
         dt = timestamp - last.timestamp
-        if not (self._readout_s and 0 < dt <= settings.max_gap_s):
-            return None
-        return (
-            self.last_speeds
-            if pose is None
-            else CameraVelocity.between(last.T_cam_world, pose, self._exposed_apart(dt))
-        )
+        if self.state is None or not 0 < dt <= MAX_GAP_S:
+            return last.T_cam_world
+        return self.state.predicted(dt, self._settings).T_cam_world
 
-    def covariance(self, last: TrackedFrame, timestamp: float, settings: MotionModelSettings) -> Array | None:
+    def covariance(self, last: TrackedFrame, timestamp: float) -> Array | None:
         """How far the motion since the last frame may be from the predicted one (`MotionState.motion_covariance`)."""
-        dt = self._known_gap(last, timestamp, settings)
-        return None if dt is None or self._state is None else self._state.motion_covariance(dt, settings)
+        dt = timestamp - last.timestamp
+        if self.state is None or not 0 < dt <= MAX_GAP_S:
+            return None
+        return self.state.motion_covariance(dt, self._settings)
 
-    def filtered(
-        self, last: TrackedFrame, timestamp: float, measured: Array, information: Array, settings: MotionModelSettings
-    ) -> Array:
+    def filtered(self, last: TrackedFrame, timestamp: float, measured: Array, information: Array) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.
 
         Args:
@@ -292,85 +263,16 @@ class CameraMotion:
             timestamp: The stamp of the new one, seconds.
             measured: Its world-to-camera pose by the image.
             information: Gauss-Newton matrix of that pose.
-            settings: Of the motion model.
 
         Returns:
-            World-to-camera pose; the measured one where nothing is known of the gap, or the filter is off.
+            World-to-camera pose; the measured one where nothing is known of the gap.
         """
-        covariance = pose_covariance(measured, information, settings.inflation)
-        dt, ahead = self._known_gap(last, timestamp, settings), self._ahead(last, timestamp, settings)
-        if dt is None or ahead is None:
-            self._state = MotionState.at(measured, covariance)
+        covariance = pose_covariance(measured, information)
+        dt = timestamp - last.timestamp
+        if self.state is None or not 0 < dt <= MAX_GAP_S:
+            self.state = MotionState.at(measured, covariance)
             return measured
         self._interval = dt
-        self._gaps.append(dt)
-        self._state = ahead.updated(measured, covariance)
-        return self._state.T_cam_world if settings.filter else measured
-
-    def _exposed_apart(self, dt: float) -> float:
-        """Seconds between two exposures: a camera ticks evenly however its frames were stamped, and reads out each."""
-        tick = float(np.median(self._gaps)) if self._gaps else dt
-        ticks = round(dt / tick) * tick
-        return max(ticks if abs(dt - ticks) <= STAMPING * tick else dt, self._readout_s)
-
-    def _ahead(self, last: TrackedFrame, timestamp: float, settings: MotionModelSettings) -> MotionState | None:
-        dt = self._known_gap(last, timestamp, settings)
-        return None if dt is None or self._state is None else self._state.predicted(dt, settings)
-
-    def _known_gap(self, last: TrackedFrame, timestamp: float, settings: MotionModelSettings) -> float | None:
-        """Seconds since the last frame; None where the motion model says nothing of them."""
-        dt = timestamp - last.timestamp
-        return dt if self._state is not None and 0 < dt <= settings.max_gap_s else None
-
-
-# Frames of a rolling shutter while tracking: straightened by the motion before, then by what their own pose tells.
-
-STILL_AGREE = 0.9
-"""Share of the points that agreed before which must agree with straightened features, too."""
-
-
-class RollingShutterCompensation:
-    """Straightens the features of frames that follow a tracked one.
-
-    Args:
-        world: The map that poses are fitted to.
-        camera: Intrinsics without distortion, and `readout_s`.
-        motion: The motion model; its `last_speeds` is what the frame before told.
-    """
-
-    def __init__(self, world: Map, camera: Camera, motion: CameraMotion) -> None:
-        self._world, self._camera, self._motion = world, camera, motion
-
-    def foreseen(
-        self, seen: Observations, last: TrackedFrame, timestamp: float, settings: MotionModelSettings
-    ) -> Observations:
-        """The features as a global shutter would have shown them, if the camera goes on as in the last frame."""
-        speeds = self._motion.speeds(last, timestamp, settings)
-        return seen if speeds is None else compensate_rolling_shutter(seen, self._camera, speeds)
-
-    def refitted(
-        self, raw: Observations, seen: Observations, fit: MapFit, last: TrackedFrame, timestamp: float,
-        settings: MotionModelSettings, *, anyhow: bool = False,
-    ) -> tuple[Observations, MapFit, CameraVelocity | None]:  # fmt: skip
-        """The features straightened by what the frame's pose tells, the pose fitted to them, and the motion.
-
-        A pose that jumps, as at a cut, tells no motion: where fewer points agree then, all stays as it was.
-
-        Args:
-            raw: The features as they were found.
-            seen: The same as foreseen.
-            fit: The pose so far, fitted to those.
-            last: The last tracked frame.
-            timestamp: The frame's stamp, seconds.
-            settings: Of the motion model.
-            anyhow: Whether points may disagree: before the first frame is straightened they have to.
-        """
-        pose = fit.estimate.T_cam_world
-        speeds = self._motion.speeds(last, timestamp, settings, pose) if np.isfinite(pose).all() else None
-        if speeds is None:
-            return seen, fit, None
-        moved = compensate_rolling_shutter(raw, self._camera, speeds)
-        again = fit.again(self._world, moved)
-        if again.count < STILL_AGREE * fit.count and not anyhow:
-            return seen, fit, None
-        return moved, again, speeds
+        self.intervals.append(dt)
+        self.state = self.state.predicted(dt, self._settings).updated(measured, covariance)
+        return self.state.T_cam_world

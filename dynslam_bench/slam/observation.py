@@ -1,4 +1,4 @@
-"""The kept features of one frame as the back end uses them."""
+"""The static features of one frame as the back end uses them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.features.matching import CellGrid, Words, as_words
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.settings import TrackingSettings
 
 MAX_DEPTH_M = 40.0
 """Depth beyond this is treated as missing."""
+RIGHT_SIGMA_PX = 1.5
+"""Standard deviation of the right coordinate at octave 0, beside the depth sensor's noise."""
+DEPTH_NOISE = 0.0025
+"""Standard deviation of the depth over its square, 1/m (structured-light sensors)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Features of one frame that no filter dropped, one row each, ready for matching.
+    """Features of one frame that no filter removed, one row each, ready for matching.
 
     Attributes:
         keypoints: Raw keypoints (distorted pixels).
@@ -33,7 +36,7 @@ class Observations:
         info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0 without depth.
         grid: Cells of the features.
         rgb: uint8 ``[N, 3]`` colour at the feature.
-        mask: bool ``[H, W]``, the pixels held for dynamic, behind which nothing of the map is seen; None without.
+        mask: bool ``[H, W]``, dynamic pixels, behind which no map point is visible; None without masks.
     """
 
     keypoints: Keypoints
@@ -54,7 +57,7 @@ class Observations:
 
     @property
     def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], Words]:
-        """What `search_in_radius` takes: pixels, right coordinates, octaves, descriptors."""
+        """Input of `search_in_radius`: pixels, right coordinates, octaves, descriptors."""
         return self.xy, self.right, self.octave, self.words
 
 
@@ -64,7 +67,6 @@ def observe(
     weight: NDArray[np.float32],
     camera: Camera,
     scales: NDArray[np.float64],
-    settings: TrackingSettings,
 ) -> Observations:
     """Select and prepare the features of a frame.
 
@@ -77,7 +79,6 @@ def observe(
         weight: float32 ``[N]`` in [0, 1], scales the information of a feature.
         camera: Intrinsics.
         scales: Scale of each octave.
-        settings: Noise of the right coordinate.
     """
     weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)
     finite = np.isfinite(frame.xy).all(axis=1) if len(frame) else np.zeros(0, bool)
@@ -86,33 +87,28 @@ def observe(
     xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
     z = np.nan_to_num(frame.z[index].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
-    has_depth = z > 0
-    bf = camera.fx * camera.baseline_m
-    right = right_of(xy, z, camera)
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
     variance = scales[octave] ** 2
-    info = weight[index] / variance
-    noise = settings.right_sigma_px**2 * variance + (bf * settings.depth_noise) ** 2
-    info_right = np.where(has_depth, weight[index] / noise, 0.0)
+    noise = RIGHT_SIGMA_PX**2 * variance + (camera.fx * camera.baseline_m * DEPTH_NOISE) ** 2
     column = np.clip(np.rint(keypoints.xy[:, 0]).astype(np.int64), 0, frame.rgb.shape[1] - 1)
     row = np.clip(np.rint(keypoints.xy[:, 1]).astype(np.int64), 0, frame.rgb.shape[0] - 1)
     return Observations(
         keypoints,
         xy,
         z,
-        right,
+        right_coordinates(xy, z, camera),
         octave,
         keypoints.angle.astype(np.float64),
         as_words(keypoints.descriptors),
-        info,
-        info_right,
+        weight[index] / variance,
+        np.where(z > 0, weight[index] / noise, 0.0),
         CellGrid.of(xy, camera.width, camera.height),
         frame.rgb[row, column],
         frame.mask,
     )
 
 
-def right_of(xy: NDArray[np.float64], z: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def right_coordinates(xy: NDArray[np.float64], z: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Right coordinates ``[N]`` of pixels ``[N, 2]`` with depths ``[N]`` in metres; NaN where the depth is 0."""
-    known = z > 0
-    return np.where(known, xy[:, 0] - camera.fx * camera.baseline_m / np.where(known, z, 1.0), np.nan)
+    has_depth = z > 0
+    return np.where(has_depth, xy[:, 0] - camera.fx * camera.baseline_m / np.where(has_depth, z, 1.0), np.nan)

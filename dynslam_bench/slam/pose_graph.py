@@ -1,7 +1,7 @@
 """A pose graph: the poses that fit relative poses between them best.
 
-Levenberg-Marquardt on sparse normal equations, which scipy solves. gtsam, the reference in the tests, gives the same
-poses; it is an extra, and loops are to close without it.
+Levenberg-Marquardt on sparse normal equations, which scipy solves. gtsam, an optional package, gives the
+same poses in the tests.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from dynslam_bench.geometry import se3
 Array = NDArray[np.float64]
 
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
-"""Of a tie of weight 1: metres, or units of length without depth, then radians; only their ratio matters."""
+"""Of an edge of weight 1: metres, or units of length without depth, then radians; only treplacement ratio matters."""
 ITERATIONS = 20
-ENOUGH = 1e-9
+MIN_GAIN = 1e-9
 """The search ends when a step lowers the cost by a smaller share."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A tie between two keyframes.
+    """A constraint between two keyframes.
 
     Attributes:
         one: Id of the first.
         other: Id of the second.
         T_other_one: Pose ``[4, 4]`` from the first one's camera frame to the other's.
-        weight: How much more than others its error counts.
+        weight: Information weight.
     """
 
     one: int
@@ -40,55 +40,55 @@ class Edge:
     weight: float = 1.0
 
     def scaled(self, factor: float) -> Edge:
-        """The same tie where lengths are multiplied by a factor."""
+        """The same edge after lengths were multiplied by a factor."""
         pose = self.T_other_one.copy()
         pose[:3, 3] *= factor
         return Edge(self.one, self.other, pose, self.weight)
 
 
-def rescaled(edges: Sequence[Edge], ids: NDArray[np.int64], factors: Array) -> list[Edge]:
-    """The ties as they are where lengths at keyframes were multiplied by factors."""
+def rescaled_edges(edges: Sequence[Edge], ids: NDArray[np.int64], factors: Array) -> list[Edge]:
+    """The edges after lengths at keyframes were multiplied by factors."""
     by_id = dict(zip(ids.tolist(), factors.tolist(), strict=True))
     return [edge.scaled(by_id.get(edge.one, 1.0)) for edge in edges]
 
 
-def inherited(edges: Sequence[Edge], dropped: int, heir: int, T_dropped_heir: Array) -> list[Edge]:
-    """The ties where a keyframe has gone and another stands for it; what would tie that to itself is left out.
+def transferred_edges(edges: Sequence[Edge], culled: int, replacement: int, T_culled_replacement: Array) -> list[Edge]:
+    """The edges after a keyframe was culled, moved to its replacement; an edge from that to itself is left out.
 
     Args:
-        edges: Ties.
-        dropped: Id of the keyframe that has gone.
-        heir: Id of the other.
-        T_dropped_heir: Pose ``[4, 4]`` from the heir's camera frame to that of the one that has gone.
+        edges: The edges.
+        culled: Id of the culled keyframe.
+        replacement: Id of its replacement.
+        T_culled_replacement: Pose ``[4, 4]`` from the replacement's camera frame to that of the culled one.
     """
-    found = []
+    transferred = []
     for edge in edges:
         one, other, pose = edge.one, edge.other, edge.T_other_one
-        if one == dropped:
-            one, pose = heir, pose @ T_dropped_heir
-        if other == dropped:
-            other, pose = heir, se3.inverse(T_dropped_heir) @ pose
+        if one == culled:
+            one, pose = replacement, pose @ T_culled_replacement
+        if other == culled:
+            other, pose = replacement, se3.inverse(T_culled_replacement) @ pose
         if one != other:
-            found.append(Edge(one, other, pose, edge.weight))
-    return found
+            transferred.append(Edge(one, other, pose, edge.weight))
+    return transferred
 
 
-def within(ids: NDArray[np.int64], edges: Sequence[Edge]) -> list[Edge]:
-    """The ties of which both ends are among keyframes."""
+def edges_within(ids: NDArray[np.int64], edges: Sequence[Edge]) -> list[Edge]:
+    """The edges between keyframes of some ids."""
     return [edge for edge in edges if np.isin([edge.one, edge.other], ids).all()]
 
 
-def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale: float) -> Array:
-    """What lengths at each keyframe are to be multiplied by, so that a tie that asks for a scale is content.
+def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], loop_edge: Edge, scale: float) -> Array:
+    """What lengths at each keyframe are to be multiplied by, so that a loop edge's scale is met.
 
-    Logarithms of scales are to be equal at both ends of an edge and to differ by that of `scale` at the tie's; the
-    squares of what is left are least in sum (Strasdat, Montiel and Davison, Scale Drift-Aware Large Scale Monocular
+    Logarithms of scales are to be equal at both ends of an edge and to differ by that of `scale` at the loop edge's;
+    the sum of squared errors is least (Strasdat, Montiel and Davison, Scale Drift-Aware Large Scale Monocular
     SLAM, RSS 2010, solve for scales and poses together).
 
     Args:
         ids: Of the keyframes, ``[N]``, ascending.
-        edges: Ties between them over which scale was kept. Of all that they and the tie connect the oldest stays.
-        tie: From the keyframe that was seen again to the one that sees it.
+        edges: Edges along which scale was kept. The oldest keyframe of each connected component stays.
+        loop_edge: From the keyframe that was recognised to the one that recognises it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
     Returns:
@@ -98,7 +98,7 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
     from scipy.sparse.csgraph import connected_components
     from scipy.sparse.linalg import spsolve
 
-    all_edges = [*edges, tie]
+    all_edges = [*edges, loop_edge]
     one = np.searchsorted(ids, [edge.one for edge in all_edges])
     other = np.searchsorted(ids, [edge.other for edge in all_edges])
     wanted = np.zeros(len(all_edges))
@@ -117,12 +117,12 @@ def spread_scale(ids: NDArray[np.int64], edges: Sequence[Edge], tie: Edge, scale
 
 
 def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) -> Array:
-    """The poses that fit the ties best; the first one stays.
+    """The poses that fit the edges best; the first one stays.
 
     Args:
         ids: Of the poses, ``[N]``, ascending.
         poses: World to camera ``[N, 4, 4]``, where the search starts.
-        edges: Ties between them; the graph must be connected.
+        edges: Edges between them; the graph must be connected.
 
     Returns:
         World to camera ``[N, 4, 4]``.
@@ -135,20 +135,20 @@ def optimise_poses(ids: NDArray[np.int64], poses: Array, edges: Sequence[Edge]) 
     cost, damping = float(np.square(error).sum()), 1e-6
     for _ in range(ITERATIONS):
         trial = se3.exp(_step(poses, one, other, error, sigmas, damping)) @ poses
-        found = _errors(trial, one, other, back, sigmas)
-        lower = float(np.square(found).sum())
+        trial_error = _errors(trial, one, other, back, sigmas)
+        lower = float(np.square(trial_error).sum())
         if not lower < cost:
             damping *= 30.0
             continue
-        done = cost - lower <= ENOUGH * cost
-        poses, error, cost, damping = trial, found, lower, max(damping * 0.2, 1e-12)
+        done = cost - lower <= MIN_GAIN * cost
+        poses, error, cost, damping = trial, trial_error, lower, max(damping * 0.2, 1e-12)
         if done:
             break
     return poses
 
 
 def _errors(poses: Array, one: NDArray[np.int64], other: NDArray[np.int64], back: Array, sigmas: Array) -> Array:
-    """What each tie contradicts ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
+    """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
     return se3.log(poses[other] @ se3.inverse(poses[one]) @ back) / sigmas
 
 
@@ -159,9 +159,9 @@ def _step(
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import spsolve
 
-    bent = _inverse_left_jacobian(error * sigmas)
+    jacobian_log = _inverse_left_jacobian(error * sigmas)
     weight = 1.0 / sigmas[:, :, None]
-    by_other = weight * bent
+    by_other = weight * jacobian_log
     by_one = -by_other @ _adjoint(poses[other] @ se3.inverse(poses[one]))
     row = np.arange(error.size).reshape(-1, 6, 1)
     rows, columns, values = [], [], []

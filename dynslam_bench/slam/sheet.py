@@ -27,7 +27,7 @@ _BLUE = (200, 110, 30)
 _RED = (40, 40, 210)
 _GREEN = (30, 150, 30)
 Legend = tuple[tuple[str, tuple[int, int, int]], ...]
-"""Words and the colours that they stand for, red first."""
+"""Words and their colours, red first."""
 
 
 def draw_sheet(
@@ -72,16 +72,20 @@ def draw_sheet(
     width, height = PANEL
     gap, head = 12, 44
     sheet = np.full((head + 2 * (height + _TITLE + gap) + gap, 3 * (width + gap) + gap, 3), 255, np.uint8)
-    cv2.putText(sheet, title, (gap, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 2, cv2.LINE_AA)
+    _text(sheet, title, (gap, 30), 0.8, 2)
     for i, (label, legend, picture) in enumerate(panels):
         row, column = divmod(i, 3)
         x = gap + column * (width + gap) + (row * (width + gap) // 2)
         y = head + row * (height + _TITLE + gap)
-        cv2.putText(sheet, label, (x, y + 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _INK, 1, cv2.LINE_AA)
+        _text(sheet, label, (x, y + 20), 0.55)
         _draw_legend(sheet, legend, x + width, y + 20)
         sheet[y + _TITLE : y + _TITLE + height, x : x + width] = picture
         cv2.rectangle(sheet, (x - 1, y + _TITLE - 1), (x + width, y + _TITLE + height), _GREY, 1)
     return sheet
+
+
+def _text(image: Image, text: str, at: tuple[int, int], size: float, width: int = 1) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, width, cv2.LINE_AA)
 
 
 def _draw_legend(sheet: Image, legend: Legend, right: int, baseline: int) -> None:
@@ -89,7 +93,7 @@ def _draw_legend(sheet: Image, legend: Legend, right: int, baseline: int) -> Non
     for words, colour in reversed(legend):
         (width, _), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)
         right -= width
-        cv2.putText(sheet, words, (right, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
+        _text(sheet, words, (right, baseline), 0.42)
         cv2.circle(sheet, (right - 9, baseline - 5), 5, colour, -1, cv2.LINE_AA)
         right -= 26
 
@@ -136,7 +140,7 @@ def _mosaic(images: Sequence[Image]) -> Image:
 
 
 def _main_plane(points: Array, track: Array) -> Array:
-    """Two axes ``[3, 2]`` that look down on what is drawn: the directions in which the points spread most."""
+    """Two axes ``[3, 2]`` of the plane in which the points spread most."""
     cloud = points if len(points) >= 3 else track
     if len(cloud) < 3:
         return np.eye(3)[:, [0, 2]]
@@ -153,16 +157,15 @@ class _Canvas:
     """Maps plane coordinates in metres to the pixels of a panel.
 
     Args:
-        whole: Points ``[N, 2]`` that are all to be in view.
-        bulk: Points ``[M, 2]`` of which stray ones may be cut off.
+        visible: Points ``[N, 2]`` that are all to be in view.
+        cloud: Points ``[M, 2]`` of which outliers may be cut off.
     """
 
-    def __init__(self, whole: Array, bulk: Array | None = None) -> None:
+    def __init__(self, visible: Array, cloud: Array | None = None) -> None:
         self.image = np.full((PANEL[1], PANEL[0], 3), 255, np.uint8)
-        ends = [whole] if len(whole) else []
-        if bulk is not None and len(bulk):
-            ends.append(np.quantile(bulk, [0.01, 0.99], axis=0))
-        corners = np.concatenate(ends) if ends else np.array([[0.0, 0.0], [1.0, 1.0]])
+        bulk = np.zeros((0, 2)) if cloud is None or not len(cloud) else np.quantile(cloud, [0.01, 0.99], axis=0)
+        corners = np.concatenate([visible, bulk])
+        corners = corners if len(corners) else np.array([[0.0, 0.0], [1.0, 1.0]])
         low, high = corners.min(axis=0), corners.max(axis=0)
         self._centre = (low + high) / 2
         size = np.maximum(high - low, 1e-3)
@@ -178,12 +181,9 @@ class _Canvas:
 
     def scale_bar(self) -> None:
         length = 10.0 ** np.floor(np.log10(0.4 * PANEL[0] / self._scale))
-        pixels = int(length * self._scale)
-        y = PANEL[1] - 14
+        pixels, y = int(length * self._scale), PANEL[1] - 14
         cv2.line(self.image, (12, y), (12 + pixels, y), _INK, 2)
-        cv2.putText(
-            self.image, f"{length:g} m", (18 + pixels, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA
-        )
+        _text(self.image, f"{length:g} m", (18 + pixels, y + 4), 0.4)
 
 
 def _draw_map(outputs: MapOutputs, plane: Array) -> Image:

@@ -1,4 +1,4 @@
-"""How long each stage of a frame took."""
+"""Stages of the frame pipeline: their clock, the flow to the previous image, and the verdicts of the filters."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class StageClock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Time what happens inside as part of a stage."""
+        """Time the body as part of a stage."""
         cached = self._cached.get(stage)
         if cached is not None:
             cached.hit, cached.saved_s = False, 0.0
@@ -54,20 +54,16 @@ class StageClock:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
 
 
-# What the filters of a frame decided together.
-
-
 @dataclass(frozen=True, eq=False)
 class CullingResult:
-    """Which keypoints are left to be tracked.
+    """Which keypoints are static, by all filters.
 
     Attributes:
         keep: bool ``[N]``; False rows enter neither tracking nor map.
         weight: float32 ``[N]`` in [0, 1], confidence that a keypoint is static.
-        mask: bool ``[H, W]``, pixels held for dynamic; None where no filter has an opinion on pixels.
-        undone: How many of the last filters the guard set aside because they would have starved tracking.
+        mask: bool ``[H, W]``, dynamic pixels; None where no filter gives a mask.
+        undone: How many of the last filters the guard set aside because too few keypoints would be left.
         stats: Every filter's stats, each name with the filter's before it.
-        flow: Flow to the previous image, None where none was found.
         image: This frame's image as the flow prepared it; None if no flow ran.
     """
 
@@ -76,22 +72,21 @@ class CullingResult:
     mask: NDArray[np.bool_] | None
     undone: int
     stats: Mapping[str, float]
-    flow: FlowResult | None
     image: Any
 
 
 def combine_verdicts(
-    state: FilterState, verdicts: Sequence[tuple[str, FilterResult]], image: Any, guard: GuardSettings
+    verdicts: Sequence[tuple[str, FilterResult]], count: int, image: Any, guard: GuardSettings
 ) -> CullingResult:
     """The verdicts taken together, as far as the guard lets them.
 
     Args:
-        state: What the filters were told, with the flow.
         verdicts: Name of each filter and its verdict, in order.
+        count: Number of keypoints.
         image: This frame's image as the flow prepared it, or None.
         guard: What must be left.
     """
-    keep, undone, weight = state.keep, 0, np.ones(len(state.keep), np.float32)
+    keep, undone, weight = np.ones(count, bool), 0, np.ones(count, np.float32)
     if verdicts:
         keep, undone = restore_starved([verdict.keep for _, verdict in verdicts], guard)
     used = [verdict for _, verdict in verdicts[: len(verdicts) - undone]]
@@ -99,10 +94,7 @@ def combine_verdicts(
         weight = np.prod([verdict.weight for verdict in used], axis=0, dtype=np.float32)
     masks = [verdict.mask for verdict in used if verdict.mask is not None]
     stats = {f"{name}_{key}": value for name, verdict in verdicts for key, value in verdict.stats.items()}
-    return CullingResult(keep, weight, np.logical_or.reduce(masks) if masks else None, undone, stats, state.flow, image)
-
-
-# Flow of the keypoints that are left to the previous image, started where the motion model expects them.
+    return CullingResult(keep, weight, np.logical_or.reduce(masks) if masks else None, undone, stats, image)
 
 
 def flow_to_previous(
@@ -117,34 +109,34 @@ def flow_to_previous(
         frame: This frame.
         state: With the keypoints that are left and both poses.
     """
-    chosen = np.flatnonzero(state.keep)
-    guess = predicted_flow(frame, state)[chosen]
-    found = flow.track(image, previous, frame.keypoints.xy[chosen], guess=guess, seed=state.seed)
+    kept = np.flatnonzero(state.keep)
+    guess = predicted_flow(frame, state)[kept]
+    result = flow.track(image, previous, frame.keypoints.xy[kept], guess=guess, seed=state.seed)
     xy = np.full((len(frame), 2), np.nan, np.float32)
     valid = np.zeros(len(frame), bool)
     cost = np.full(len(frame), np.inf, np.float32)
-    xy[chosen], valid[chosen], cost[chosen] = found.xy, found.valid, found.cost
-    return FlowResult(xy, valid, cost, found.stats)
+    xy[kept], valid[kept], cost[kept] = result.xy, result.valid, result.cost
+    return FlowResult(xy, valid, cost, result.stats)
 
 
-def predicted_flow(bundle: FrameBundle, state: FilterState) -> NDArray[np.float32]:
+def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32]:
     """Where the motion model expects this frame's keypoints in the previous image.
 
     Args:
-        bundle: The current frame.
+        frame: The current frame.
         state: With the previous pose and the predicted one.
 
     Returns:
         Raw pixels float32 ``[N, 2]``; NaN where depth or a prediction is missing.
     """
-    guess = np.full((len(bundle), 2), np.nan, np.float32)
-    known = bundle.z > 0
-    if state.T_world_prev is None or state.T_world_pred is None or not known.any():
+    guess = np.full((len(frame), 2), np.nan, np.float32)
+    has_depth = frame.z > 0
+    if state.T_world_prev is None or state.T_world_pred is None or not has_depth.any():
         return guess
     T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-    points = se3.transform(T_prev_cur, state.camera.unproject(bundle.xy[known], bundle.z[known]))
+    points = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[has_depth], frame.z[has_depth]))
     ahead = points[:, 2] > 0.05
     pixels = np.full((len(points), 2), np.nan)
     pixels[ahead] = state.camera.distort_points(state.camera.project(points[ahead]))
-    guess[known] = pixels
+    guess[has_depth] = pixels
     return guess

@@ -1,6 +1,6 @@
 """Conformance checks for the authors of plug-ins.
 
-Each ``check_*`` raises a `ConformanceError` that names what was found and its likely cause; each ``*_report`` runs the
+Each ``check_*`` raises a `ConformanceError` that names the fault and its likely cause; each ``*_report`` runs the
 same checks and returns the outcome of every one. `pytest_plugin` makes tests of them.
 """
 

@@ -125,7 +125,7 @@ def main() -> None:
     maps = timed(lambda: build_flow(FlowSettings()).prepare(second), repeats)
     print(f"\norientation maps alone, 1 thread: {maps[0]:.1f} / {maps[1]:.1f} ms (processor {maps[2]:.1f})")
     for threads in (1, 2):
-        dense = DenseDaisyFlow(FlowSettings(), threads=threads)
+        dense = DenseDaisyFlow(threads=threads)
         took = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)
         print(
             f"dense 640x480 both ways, {threads} thread(s): {took[0]:.0f} / {took[1]:.0f} ms (processor {took[2]:.0f})"

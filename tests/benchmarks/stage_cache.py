@@ -31,7 +31,7 @@ def study(sequence: str, segmenter: str, trials: int, cache: bool, results: Path
     from dynslam_bench.tuning import SpaceSpec, StudySpec, run_study
 
     spec = StudySpec(
-        name="epipolar", tune=(sequence,), seeds=(0,), trials=trials, sampler="random", race="none",
+        name="epipolar", tune=(sequence,), seeds=(0,), trials=trials, sampler="random", pruner="none",
         min_coverage=None, cache=cache,
         space=SpaceSpec(include=("epipolar.threshold_px",), fixed={"segmentation.source": segmenter}),
     )  # fmt: skip

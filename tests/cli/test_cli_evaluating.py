@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from cli_errors import one_line
+from cli_helpers import one_line
 
 from dynslam_bench.evaluation import evaluate_files
 from dynslam_bench.geometry import se3

@@ -138,7 +138,7 @@ def test_the_neutral_action_changes_nothing() -> None:
 
 
 def test_our_own_tracker_can_be_steered(real_data: str) -> None:
-    env = SlamEnv("tum/fr1/xyz", "emfoa-oft-no-masks", control=["flow.budget"], data_root=real_data, frames=(0, 4))
+    env = SlamEnv("tum/fr1/xyz", "emfoa-oft?masks=none", control=["flow.budget"], data_root=real_data, frames=(0, 4))
     env.reset(seed=0)
     spent = [env.step(np.array([action]))[4]["stats"]["flow_evaluations"] for action in (-1.0, 1.0, -1.0)]
     assert spent[1] > 2 * spent[0] and spent[1] > 2 * spent[2]

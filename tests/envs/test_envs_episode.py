@@ -254,7 +254,7 @@ def test_reset_options() -> None:
 
 def test_a_tracker_that_cannot_be_steered(toy_folder: str) -> None:
     env = SlamEnv(toy_folder, TARGET.replace(":SPEC", ":FIXED"), control=["noise.clip"])
-    with pytest.raises(TrackerError, match="toy-fixed' cannot be steered in mid-episode"):
+    with pytest.raises(TrackerError, match="toy-fixed' cannot change its settings in mid-episode"):
         env.reset()
 
 
@@ -307,7 +307,7 @@ def test_asking_for_the_final_trajectory_changes_nothing_of_what_filters_see(mon
 
 def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path) -> None:
     (damaged := tmp_path / "damaged.npz").write_bytes(b"no map")
-    env = SlamEnv(ToySequence(12), "emfoa-oft-no-masks")
+    env = SlamEnv(ToySequence(12), "emfoa-oft?masks=none")
     env.reset(seed=0)
     settings, sequence = env.settings, env.sequence
     for options, words in (
@@ -323,7 +323,7 @@ def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path)
         with pytest.raises(DynslamError, match="before reset"):
             env.step(env.neutral_action)
     with pytest.raises(SettingsError, match="needs a map"):
-        SlamEnv(ToySequence(12), "emfoa-oft-no-masks", settings=_only_localising(settings))
+        SlamEnv(ToySequence(12), "emfoa-oft?masks=none", settings=_only_localising(settings))
     env.reset(seed=0)
     env.step(env.neutral_action)
 

@@ -19,7 +19,7 @@ from dynslam_bench.envs.rendering import (
     PLANES,
     STRIP,
     TRUTH,
-    beside_truth,
+    align_to_truth,
     main_plane,
 )
 from dynslam_bench.evaluation.online import OnlineError
@@ -87,7 +87,7 @@ def test_the_error_in_the_picture_is_the_protocols() -> None:
         env.render()
         pose = OnlineError(env.sequence.ground_truth).truth_at(float(env.sequence.timestamps[index]))
         truth |= {} if pose is None else {index: pose}
-        shown.append(beside_truth(env.episode, truth).ate_m)
+        shown.append(align_to_truth(env.episode, truth).ate_m)
     assert all(value is None for value in shown[: ALIGN_FROM - 1]) and shown[-1] is not None
     assert shown[-1] == pytest.approx(env.episode_metrics()["ate_rmse_m"], rel=1e-6)
 

@@ -61,10 +61,8 @@ TARGETS = [
         "table of poses",
         lambda data, folder: reading.read_trajectory(at(folder, "data.csv", data)),
         lambda: [EUROC, VSLAM_LAB],
-        (pose_tables.read_pose_table, pose_tables.is_pose_table),
     ),
-    Target("COLMAP images", _read_colmap, lambda: [IMAGES, IMAGES + b"\n"], (colmap.read_colmap, colmap._stamp)),
-    Target("map of points", lambda data, folder: map_files.read_ply(at(folder, "map.ply", data)), _maps,
-           (map_files.read_ply,)),
-    Target("provenance of an export", _read_provenance, _provenances, (provenance.stated_provenance,)),
-]  # fmt: skip
+    Target("COLMAP images", _read_colmap, lambda: [IMAGES, IMAGES + b"\n"]),
+    Target("map of points", lambda data, folder: map_files.read_ply(at(folder, "map.ply", data)), _maps),
+    Target("provenance of an export", _read_provenance, _provenances),
+]

@@ -10,11 +10,9 @@ import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam import atlas as map_store
-from dynslam_bench.slam import map_files as saved_map
-from dynslam_bench.slam import map_files as saved_map_faults
 from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 
-from .records import rezipped
+from .mutate import mutate_zip
 from .target import Target, at
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
@@ -22,7 +20,7 @@ FEATURES = MapFeatures(extractor="orb", levels=8, scale_factor=1.2)
 
 
 def _sound() -> dict[str, Any]:
-    """Two keyframes of three and two features, two points that both see, an island."""
+    """Two keyframes of three and two features, two points that both see, a submap."""
     header = MapHeader(
         sensors="rgbd", camera=described(CAMERA), features=FEATURES, next_keyframe=4, next_point=9, made_by="nobody"
     )
@@ -39,7 +37,7 @@ def _sound() -> dict[str, Any]:
         "visible": np.ones(2, np.int32), "found": np.ones(2, np.int32), "born": np.array([0, 1]),
         "n_obs": np.array([2, 2], np.int32), "obs_kf": np.array([0, 1, 0, 1], np.int32),
         "obs_ft": np.array([2, 0, 0, 1], np.int32), "submap_start": np.zeros((1, 3)),
-        "submap_anchor": np.zeros((1, 3)), "submap_reach": np.array([np.inf]),
+        "submap_anchor": np.zeros((1, 3)), "submap_bound": np.array([np.inf]),
     }  # fmt: skip
 
 
@@ -65,21 +63,14 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 def _read(data: bytes | None, folder: Path) -> None:
     """What is read is worked on as a run does, whose compiled loops check no index."""
-    world, submaps = map_store.begin_map(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    atlas = open_atlas(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    world = atlas.world
     world.refresh(world.points)
     for slot in world.keyframes.tolist():
         world.covisible(slot)
         world.project(world.kf_pose[slot], world.points)
-    map_store.packed(world, submaps)
+    packed(atlas)
     world.remove_keyframe(int(world.keyframes[0]))
 
 
-TARGETS = [
-    Target(
-        "map of a run",
-        _read,
-        _seeds,
-        (saved_map.read_map, saved_map_faults, map_store.restored, map_store._table, map_store._submaps),
-        rezipped,
-    )
-]
+TARGETS = [Target("map of a run", _read, _seeds, mutate_zip)]

@@ -109,19 +109,6 @@ def test_evo_reads_the_mcap_file(store: RunStore, run: RunRecord) -> None:
     assert np.abs(found.timestamps - STAMPS).max() < TOLERANCE
 
 
-def test_the_reader_of_mcap_itself_reads_it(store: RunStore, run: RunRecord) -> None:
-    reader = pytest.importorskip("mcap_ros2.reader", reason="mcap-ros2-support is not installed")
-    path = export_run(run, "mcap", results=store).folder / "trajectory.mcap"
-    messages = list(reader.read_ros2_messages(str(path), topics=["/estimate/pose"]))
-    (whole,) = reader.read_ros2_messages(str(path), topics=["/estimate/path"])
-    assert len(whole.ros_msg.poses) == len(messages) == len(STAMPS)
-    found = np.array([[m.ros_msg.pose.position.x, m.ros_msg.pose.orientation.w] for m in messages])
-    position, quaternion = se3.to_quaternion(stored(store, run).T_world_cam)
-    assert np.abs(found - np.stack([position[:, 0], quaternion[:, 3]], axis=1)).max() < TOLERANCE
-    stamps = [m.ros_msg.header.stamp.sec + m.ros_msg.header.stamp.nanosec / 1e9 for m in messages]
-    assert np.abs(np.array(stamps) - STAMPS).max() < TOLERANCE
-
-
 @pytest.mark.parametrize(
     ("distortion", "model"),
     [((0.0,) * 5, "PINHOLE"), ((0.1, -0.2, 0.01, 0.02, 0), "OPENCV"), ((0.1, -0.2, 0.01, 0.02, 0.3), "FULL_OPENCV")],
@@ -216,15 +203,6 @@ def test_damaged_tables(tmp_path: Path, text: str, complaint: str) -> None:
     (tmp_path / "data.csv").write_text(text)
     with pytest.raises(DynslamError, match=complaint):
         read_trajectory(tmp_path / "data.csv")
-
-
-def test_a_damaged_map_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "map.ply"
-    write_ply(path, points())
-    assert read_ply(path).observations.tolist() == [0, 1, 2, 3, 4]
-    path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(RunError, match="is no map of this package"):
-        read_ply(path)
 
 
 def test_folders_that_hold_no_trajectory(store: RunStore, run: RunRecord, tmp_path: Path) -> None:

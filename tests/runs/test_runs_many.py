@@ -43,12 +43,6 @@ def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
     assert all(score(store, record).metrics["ate_rmse_m"] > 0 for record in second)
 
 
-def test_equal_specs_are_made_once(store: RunStore, toy_folder: str) -> None:
-    events: list = []
-    records = run_many([*specs(toy_folder, range(1)), *specs(toy_folder, range(1))], results=store, **follow(events))
-    assert kinds(events) == {"finished": 1, "started": 1} and records[0] == records[1]
-
-
 def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(store: RunStore, toy_folder: str) -> None:
     (made,) = run_many(specs(toy_folder, range(1), study="mine"), results=store)
     assert made.study == "mine"
@@ -77,12 +71,6 @@ def test_a_wrong_name_is_refused_before_anything_runs(store: RunStore, toy_folde
     assert store.ids() == []
     with pytest.raises(RunError, match="jobs is 0"):
         run_many(specs(toy_folder, range(1)), results=store, jobs=0)
-
-
-def test_a_damaged_record_is_made_again(store: RunStore, toy_folder: str) -> None:
-    record = run_many(specs(toy_folder, range(1)), results=store)[0]
-    (store.folder(record.run_id) / "run.json").write_text("{")
-    assert run_many(specs(toy_folder, range(1)), results=store)[0].status == "ok"
 
 
 def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:

@@ -101,16 +101,13 @@ def test_maps_that_never_met_are_said(tmp_path: Path) -> None:
     keyframes = tuple(KeyframeRecord(i, i, i / 30, np.eye(4), 9, 9, number) for i, number in enumerate(numbers))
     none = np.zeros(0, np.int64)
     outputs = MapOutputs(keyframes, none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none)
-    apart = keep_map(
-        SimpleNamespace(map_outputs=lambda: outputs, exact_stamps={}), tmp_path, RunSpec(tracker="a", sequence="b")
-    )
-    assert apart.counts["maps"] == 3
-    assert apart.notes[0].startswith("3 maps that never met: 4 of 6 keyframes lie in others than the first")
+    spec = RunSpec(tracker="a", sequence="b")
+    _, counts, notes = keep_map(SimpleNamespace(map_outputs=lambda: outputs, exact_stamps={}), tmp_path, spec)
+    assert counts["maps"] == 3
+    assert notes[0].startswith("3 maps that never met: 4 of 6 keyframes lie in others than the first")
     one = MapOutputs(keyframes[:2], none, outputs.positions, outputs.colours, none)
-    met = keep_map(
-        SimpleNamespace(map_outputs=lambda: one, exact_stamps={}), tmp_path, RunSpec(tracker="a", sequence="b")
-    )
-    assert met.counts["maps"] == 1 and met.notes == ()
+    _, counts, notes = keep_map(SimpleNamespace(map_outputs=lambda: one, exact_stamps={}), tmp_path, spec)
+    assert counts["maps"] == 1 and notes == []
 
 
 def test_features_of_another_kind_begin_in_no_map() -> None:

@@ -14,10 +14,6 @@ from dynslam_bench.suites import load_suite, suite_names
 from dynslam_bench.trackers.registry import TRACKERS
 
 
-def test_the_suites_that_are_promised_are_there() -> None:
-    assert {"smoke", "demo", "dynamic", "dynamic-full", "objects", "real", "robustness"} <= set(suite_names())
-
-
 @pytest.mark.parametrize("name", suite_names())
 def test_every_suite_names_only_what_exists(name: str) -> None:
     suite = load_suite(name)

@@ -239,11 +239,6 @@ def test_without_truth_depth_or_motion_it_is_a_note(sound):
     assert ids(apart) == [("fault", "truth-other-sequence")]
 
 
-def test_no_pairs_are_no_fault(sound):
-    (finding,) = truth_findings(sound.timestamps, sound.ground_truth, CAMERA, [])
-    assert (finding.severity, finding.id) == ("note", "motion-unmeasured")
-
-
 def test_damaged_folders_never_raise(tmp_path):
     assert [f.id for f in diagnose(tmp_path / "nothing").findings] == ["unreadable"]
     folder, _, depth = make_folder(tmp_path / "one")

@@ -7,7 +7,7 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.sequences.synthetic import REPLICA_IDS, SyntheticId, parse_synthetic_id
 
 
-def test_the_eight_twins_exist() -> None:
+def test_the_eight_replicas_exist() -> None:
     assert len(REPLICA_IDS) == 8
     for name in REPLICA_IDS:
         parsed = parse_synthetic_id(name)

@@ -1,4 +1,4 @@
-"""Stored runs as files of other tools."""
+"""Stored runs as files of other tools, with ``provenance.json`` beside them, which an import reads."""
 
 from __future__ import annotations
 
@@ -191,8 +191,6 @@ FORMATS: dict[str, Callable[[_Job, Path], list[str]]] = {
 """Formats by name; each writes its files into a folder and gives notes."""
 
 
-# Where an exported trajectory came from: ``provenance.json`` beside it, which an import takes up again.
-
 PROVENANCE_FILE = "provenance.json"
 PROVENANCE_SCHEMA = 1
 
@@ -287,15 +285,11 @@ def digest_of(path: Path) -> str:
     Raises:
         OSError: One cannot be read.
     """
-    found = sha256()
-    for each in sorted(part for part in path.iterdir() if part.is_file()) if path.is_dir() else [path]:
-        with each.open("rb") as file:
-            while block := file.read(1 << 20):
-                found.update(block)
-    return found.hexdigest()
-
-
-# The sequence that a stored run saw, opened again, and only if it is still the same.
+    files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+    whole = sha256()
+    for file in files:
+        whole.update(file.read_bytes())
+    return whole.hexdigest()
 
 
 def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: str | Path | None = None) -> Sequence:

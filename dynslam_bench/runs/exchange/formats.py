@@ -1,4 +1,4 @@
-"""Trajectories in any of the formats: which one it is shows in the file."""
+"""Trajectories in the formats of others: EuRoC, VSLAM-LAB, COLMAP and bags of ROS 2 (MCAP); the file shows which."""
 
 from __future__ import annotations
 
@@ -62,8 +62,6 @@ def _stamps_by_name(path: Path) -> dict[str, float]:
         zip(images.files, stamps, strict=True)
     )
 
-
-# Poses as tables in CSV with stamps in nanoseconds: EuRoC's ``data.csv`` and VSLAM-LAB's trajectories.
 
 EUROC_HEADING = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 _EUROC_ORDER = [1, 2, 3, 5, 6, 7, 4]
@@ -131,8 +129,6 @@ def _write(path: Path, heading: str, trajectory: Trajectory, rows: list[list[flo
     ]
     write_atomic(path, "\n".join([heading, *lines]) + "\n")
 
-
-# COLMAP's text format: ``cameras.txt``, ``images.txt`` and ``points3D.txt`` in a folder.
 
 IMAGES = "images.txt"
 _HALF = 0.5
@@ -227,8 +223,6 @@ def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
         )
     return float(stem)
 
-
-# Trajectories as a bag of ROS 2 (an MCAP file), as Foxglove and ``ros2 bag`` read them; bags of others as poses.
 
 POSE_MESSAGE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
 BAG = "trajectory"

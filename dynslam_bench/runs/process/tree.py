@@ -1,8 +1,7 @@
-"""A process and everything it started: finding the members, their memory, ending them, and those who slipped away.
+"""Process trees: their members, their memory, and how they are ended.
 
-A tracker may start processes, put them into sessions of their own and forget them. On Linux the process that started a
-run adopts what the run leaves behind (it is a *subreaper*), so that nothing outlives its run; elsewhere only the run's
-own process group is ended.
+A tracker may start processes, put them into sessions of their own and forget them. On Linux the fork server and each
+run are subreapers (``prctl(2)``): they become the parents of the orphans below them, so that the tree stays complete.
 """
 
 from __future__ import annotations
@@ -11,149 +10,101 @@ import contextlib
 import ctypes
 import os
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
-_PROC = Path("/proc")
+import psutil
+
 _SET_PARENT_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36
-_SWEEP_S = 5.0
-
-
-def die_with_parent(by: int = signal.SIGKILL) -> None:
-    """Ask Linux for that signal when the one that forked this process ends; elsewhere the closing connection has to do.
-
-    For Linux the parent is the thread that forked.
-    """
-    _prctl(_SET_PARENT_DEATH_SIGNAL, by)
-
-
-def adopt_orphans() -> bool:
-    """Become the parent of every descendant whose own parent ends; False where the system cannot do that."""
-    return _prctl(_SET_CHILD_SUBREAPER, 1)
-
-
-def children(pid: int) -> list[int]:
-    """The direct children of a process, by the kernel's lists; empty where there are none to read."""
-    found: list[int] = []
-    for listing in (_PROC / str(pid) / "task").glob("*/children"):
-        with contextlib.suppress(OSError, ValueError):
-            found += [int(text) for text in listing.read_text().split()]
-    return found
-
-
-def family(pid: int) -> list[int]:
-    """The process and all its descendants."""
-    members, fresh = [pid], [pid]
-    while fresh:
-        found = [child for child in children(fresh.pop()) if child not in members]
-        members += found
-        fresh += found
-    return members
-
-
-def end_family(pid: int) -> None:
-    """Kill a process with its group and all its descendants, wherever these have put themselves."""
-    members = family(pid) if _PROC.is_dir() else [pid]
-    _signal(os.killpg, pid)
-    for member in members:
-        _signal(os.kill, member)
-
-
-def end_descendants(keep: Collection[int] = ()) -> int:
-    """Kill and bury all children of this process but those in `keep`, and theirs, until there are none.
-
-    With `adopt_orphans` in force this reaches everything that was ever started below this process.
-
-    Returns:
-        How many there were.
-    """
-    own = os.getpid()
-    ended: set[int] = set()
-    deadline = time.monotonic() + _SWEEP_S
-    while time.monotonic() < deadline:
-        strangers = [child for child in children(own) if child not in keep]
-        if not strangers:
-            break
-        for stranger in strangers:
-            for member in family(stranger):
-                ended.add(member)
-                _signal(os.kill, member)
-        buried = [stranger for stranger in strangers if _bury(stranger)]
-        if not buried:
-            time.sleep(0.002)
-    return len(ended)
-
-
-def memory_mb(pid: int) -> float:
-    """Memory in MB of a process with its descendants, each page counted once; 0 if it is gone.
-
-    For one process its resident memory. Of several the larger of two values, both of which are at most the truth: the
-    resident memory of the first, and the sum of the proportional ones (a page that n processes share counts 1/n each).
-    Where the system states no proportional memory, resident memory is added up instead.
-    """
-    if not _PROC.is_dir():
-        result = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False)
-        return sum(float(line) for line in result.stdout.split()) * 1024 / 1e6
-    first, *others = family(pid)
-    resident = _resident_mb(first)
-    if not others:
-        return resident
-    return max(resident, sum(map(_proportional_mb, (first, *others))))
-
-
-def _resident_mb(pid: int) -> float:
-    try:
-        pages = int((_PROC / str(pid) / "statm").read_text().split()[1])
-    except (OSError, IndexError, ValueError):
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def _proportional_mb(pid: int) -> float:
-    try:
-        lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()
-    except OSError:
-        return _resident_mb(pid)
-    for line in lines:
-        if line.startswith("Pss:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return 0.0
-
-
-def _bury(pid: int) -> bool:
-    try:
-        return os.waitpid(pid, os.WNOHANG)[0] != 0
-    except ChildProcessError:
-        return True
-
-
-def _signal(send: Callable[[int, int], None], target: int) -> None:
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        send(target, signal.SIGKILL)
-
-
-def _prctl(option: int, value: int) -> bool:
-    if sys.platform != "linux":
-        return False
-    try:
-        return bool(ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0) == 0)
-    except (OSError, AttributeError):
-        return False
-
-
-# How much memory a run may take where nobody said.
-
+_END_S = 5.0
 DEFAULT_SHARE = 0.8
-"""Of the machine's memory, for all runs at a time together."""
+"""Share of the machine's memory that all runs at a time may take together where no limit was given."""
 _CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+
+
+def die_with_parent() -> None:
+    """Ask Linux to kill this process when the thread that forked it ends; elsewhere the closed connection has to do."""
+    _prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of every descendant whose own parent ends, on Linux."""
+    _prctl(_SET_CHILD_SUBREAPER, 1)
+
+
+def _prctl(option: int, value: int) -> None:
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+
+
+def process_tree(pid: int) -> list[psutil.Process]:
+    """A process, first, and all its descendants; empty if it has ended."""
+    try:
+        top = psutil.Process(pid)
+        return [top, *top.children(recursive=True)]
+    except psutil.Error:
+        return []
+
+
+def end_processes(processes: Iterable[psutil.Process]) -> None:
+    """Kill those that still run; a process that has taken the number of one that ended is left alone."""
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+
+
+def end_tree(pid: int) -> None:
+    """Kill a process with its process group and all its descendants, whatever their groups."""
+    members = process_tree(pid)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, signal.SIGKILL)
+    end_processes(members)
+
+
+def end_children(keep: Collection[int] = ()) -> None:
+    """Kill and reap all descendants of this process but the children in `keep` and their descendants."""
+    deadline = time.monotonic() + _END_S
+    while time.monotonic() < deadline:
+        ending = [child for child in psutil.Process().children() if child.pid not in keep]
+        if not ending:
+            return
+        for child in ending:
+            end_processes(process_tree(child.pid))
+        psutil.wait_procs(ending, timeout=0.1)
+
+
+def memory_mb(members: list[psutil.Process]) -> float:
+    """Memory in MB of a process tree, each page counted once.
+
+    Of one process this is its resident memory. Of several it is the larger of two lower bounds: the resident memory of
+    the first, and the sum of the proportional memories (a page that n processes share counts 1/n in each). Where the
+    system states no proportional memory, resident memory is summed.
+    """
+    if len(members) < 2:
+        return sum(_resident_mb(process) for process in members)
+    return max(_resident_mb(members[0]), sum(_proportional_mb(process) for process in members))
+
+
+def _resident_mb(process: psutil.Process) -> float:
+    try:
+        return float(process.memory_info().rss / 1e6)
+    except psutil.Error:
+        return 0.0
+
+
+def _proportional_mb(process: psutil.Process) -> float:
+    try:
+        return float(process.memory_full_info().pss / 1e6)
+    except (psutil.Error, AttributeError):
+        return _resident_mb(process)
 
 
 def machine_memory_mb() -> float:
     """Main memory in MB: the machine's, or the container's if that is less."""
-    amounts = [float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")]
+    amounts = [float(psutil.virtual_memory().total)]
     for file in _CGROUP_LIMITS:
         with contextlib.suppress(OSError, ValueError):  # there is none, or it says "max"
             amounts.append(float(file.read_text()))
@@ -171,8 +122,8 @@ def memory_limit(asked_mb: float | None, at_a_time: int = 1) -> tuple[float | No
         None and "" without a limit.
     """
     if asked_mb is not None:
-        return (asked_mb, "") if asked_mb else (None, "")
-    whole = machine_memory_mb()
+        return (asked_mb or None), ""
+    machine_mb = machine_memory_mb()
     shared = f", shared by {at_a_time} runs at a time" if at_a_time > 1 else ""
-    source = f"by default {100 * DEFAULT_SHARE:.0f} % of this machine's {whole:.0f} MB{shared}"
-    return DEFAULT_SHARE * whole / at_a_time, source
+    source = f"by default {100 * DEFAULT_SHARE:.0f} % of this machine's {machine_mb:.0f} MB{shared}"
+    return DEFAULT_SHARE * machine_mb / at_a_time, source

@@ -1,4 +1,8 @@
-"""The shape of a Mask R-CNN: everything that must be known before its weights can be loaded."""
+"""Shape, residual trunk and feature pyramids of a Mask R-CNN; state-dict keys as torchvision's.
+
+Trunk: He et al. 2016, with the stride in the 3x3 convolution of a bottleneck (v1.5). FPN: Lin et al. 2017. CFPN: the
+paper's section on semantic segmentation; see `CFPN`.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ COCO_CLASSES: tuple[str, ...] = tuple(COCO_IDS.get(number, "") for number in ran
 """Names of classes 1..90 as torchvision's COCO models number them; unused numbers are empty."""
 
 Count = Annotated[int, Field(ge=1, le=4096)]
-"""Of channels, layers or pixels; a file's shape may not ask for more than any such network has."""
+"""Of channels, layers or pixels; the upper bound refuses files with an absurd shape."""
 Blocks = Annotated[int, Field(ge=1, le=64)]
 Side = Annotated[float, Field(gt=0, le=1e5)]
 
@@ -99,26 +103,20 @@ def resnet18_config(classes: tuple[str, ...] = ("person",), *, cfpn: bool = True
     return NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, cfpn=cfpn, classes=classes, norm="batch")
 
 
-# First weights of layers that begin at random.
-
-
 def normal(weight: Tensor, std: float) -> None:
-    """Normally distributed weights of a standard deviation; nothing where the tensor holds no numbers.
+    """Initialise weights with a normal distribution; nothing on torch's ``meta`` device.
 
-    A network that is only compared with a file lies on torch's ``meta`` device. Drawing numbers there makes none, but
-    loads torch's compiler, which takes longer (1.6 s of processor, once a process) than building the network.
+    A network whose shapes are only compared with a file lies on the ``meta`` device. Drawing numbers there has no
+    effect, but loads torch's compiler (1.6 s of processor, once a process).
     """
     if not weight.is_meta:
         nn.init.normal_(weight, std=std)
 
 
 def kaiming_normal(weight: Tensor) -> None:
-    """He et al. 2015 for a ReLU, by the outputs; nothing where the tensor holds no numbers, see `normal`."""
+    """Initialise as He et al. 2015 for a ReLU, by the outputs; nothing on the ``meta`` device, see `normal`."""
     if not weight.is_meta:
         nn.init.kaiming_normal_(weight, mode="fan_out", nonlinearity="relu")
-
-
-# Residual trunk, feature pyramid (FPN) and cross-layer feature pyramid (CFPN); state-dict keys as torchvision's.
 
 
 class FrozenBatchNorm2d(nn.Module):
@@ -230,10 +228,9 @@ class FPN(nn.Module):
         super().__init__()
         self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages)
         self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_uniform_(module.weight, a=1)
-                _zero_bias(module)
+        for block in (*self.inner_blocks, *self.layer_blocks):
+            nn.init.kaiming_uniform_(block[0].weight, a=1)
+            nn.init.zeros_(block[0].bias)
 
     def forward(self, stages: list[Tensor]) -> list[Tensor]:
         """C2..C5 to P2..P6."""
@@ -259,11 +256,9 @@ class CFPN(nn.Module):
         self.reduce = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in stages)
         self.smooth = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in stages)
         for reduce, smooth in zip(self.reduce, self.smooth, strict=True):
-            assert isinstance(reduce, nn.Conv2d) and isinstance(smooth, nn.Conv2d)
             nn.init.kaiming_uniform_(reduce.weight, a=1)
-            nn.init.zeros_(smooth.weight)
-            _zero_bias(reduce)
-            _zero_bias(smooth)
+            for zero in (reduce.bias, smooth.weight, smooth.bias):
+                nn.init.zeros_(zero)
 
     def forward(self, stages: list[Tensor], levels: list[Tensor]) -> list[Tensor]:
         """C2..C5 and P2..P5 (a longer list is cut) to the mask branch's m2..m5."""
@@ -294,8 +289,3 @@ class Backbone(nn.Module):
         stages = self.body(x)
         levels = self.fpn(stages)
         return levels, levels[:4] if self.cfpn is None else self.cfpn(stages, levels)
-
-
-def _zero_bias(module: nn.Conv2d) -> None:
-    assert module.bias is not None
-    nn.init.zeros_(module.bias)

@@ -1,4 +1,7 @@
-"""Boxes in torch: overlap, coding against anchors, non-maximum suppression. Boxes are x0, y0, x1, y1 in pixels."""
+"""Boxes in torch: overlap, coding against anchors, non-maximum suppression, assignment to objects for training.
+
+Boxes are x0, y0, x1, y1 in pixels.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 MAX_LOG_RATIO = math.log(1000.0 / 16)
 """Decoded boxes grow by at most this (log), so that exp() cannot overflow."""
 RPN_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
 BOX_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
+NEGATIVE, IGNORED = -1, -2
+"""Values of `match` for boxes without an object."""
 
 
 def area(boxes: Tensor) -> Tensor:
@@ -98,11 +102,6 @@ def _size_centre(boxes: Tensor) -> tuple[Tensor, Tensor]:
     return size, boxes[:, :2] + 0.5 * size
 
 
-# Assign anchors or proposals to ground-truth boxes and draw a balanced sample of them, for training.
-
-NEGATIVE, IGNORED = -1, -2
-
-
 @dataclass(frozen=True)
 class Sampled:
     """Indices of the boxes that enter a loss."""
@@ -112,14 +111,14 @@ class Sampled:
 
 
 def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: bool) -> Tensor:
-    """Index of the truth that each box stands for, or `NEGATIVE`, or `IGNORED` for overlaps in between.
+    """Index of the object that each box is assigned to, or `NEGATIVE`, or `IGNORED` for overlaps in between.
 
     Args:
         boxes: ``[N, 4]``.
         truth: ``[G, 4]``.
         high: IoU from which a box is positive.
         low: IoU below which it is negative.
-        keep_best: Also make positive whatever overlaps a truth best, however little.
+        keep_best: Also make positive the boxes that overlap an object most, however little.
     """
     if not len(truth):
         return torch.full((len(boxes),), NEGATIVE, device=boxes.device)
@@ -142,11 +141,6 @@ def sample(matched: Tensor, *, count: int, positive_share: float, generator: tor
     positives = min(len(positive), int(count * positive_share))
     negatives = min(len(negative), count - positives)
     return Sampled(_draw(positive, positives, generator), _draw(negative, negatives, generator))
-
-
-def smooth_l1(values: Tensor, wanted: Tensor, *, beta: float) -> Tensor:
-    """Summed smooth L1 loss; zero (with a gradient path) for no rows."""
-    return functional.smooth_l1_loss(values, wanted, beta=beta, reduction="sum")
 
 
 def _draw(index: Tensor, count: int, generator: torch.Generator) -> Tensor:

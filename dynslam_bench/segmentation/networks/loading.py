@@ -1,4 +1,7 @@
-"""Load Mask R-CNN checkpoints: torchvision's in every published key layout, and our own; strictly, never unpickling."""
+"""Mask R-CNN checkpoints: torchvision's in every published key layout, and this project's format.
+
+Loading is strict and never unpickles.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +29,10 @@ _RENAMES = (
 )
 _MASK_FCN = re.compile(r"^roi_heads\.mask_head\.mask_fcn([1-9][0-9]?)\.(weight|bias)$")
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
-MOST_GROWTH = 4
-"""Most bytes that a byte of a checkpoint may unpack to; torch stores weights as they are."""
-NAMED = 4
-"""So many keys are named in an error before the rest is only counted."""
+MAX_EXPANSION = 4
+"""Largest ratio of a checkpoint's unpacked size to its file size; torch stores weights uncompressed."""
+KEYS_SHOWN = 4
+"""Keys that an error names; the rest is counted."""
 
 
 def load_network(path: Path) -> MaskRCNN:
@@ -37,19 +40,17 @@ def load_network(path: Path) -> MaskRCNN:
 
     Three layouts of torchvision's keys are understood: 307 keys (frozen batch norm), 360 (with
     ``num_batches_tracked``, which is dropped) and 307 with the names of the file published in 2019 (renamed). The
-    network's shape is read off the weights; a file of our own carries it. A plain Mask R-CNN gets a CFPN that starts at
-    zero, so that it gives exactly its own output.
+    network's shape is inferred from the weights; this project's files carry it. A plain Mask R-CNN gets a CFPN that
+    starts at zero, so that its output does not change.
 
     Raises:
         SegmentationError: The file cannot be read, is truncated, or does not fit: says which keys are missing or
             unknown and which shapes differ.
     """
-    content = read_checkpoint(path)
-    state, config = split(content, str(path))
+    state, config = split(read_checkpoint(path), str(path))
     state = canonical_names(state)
-    if config is None:
-        config = infer_config(state, str(path))
-    with torch.device("meta"):  # compares the shapes before any memory is taken for what the file claims
+    config = config or infer_config(state, str(path))
+    with torch.device("meta"):  # compares the shapes before memory is allocated for them
         _check_fit(MaskRCNN(config), state, str(path))
     network = MaskRCNN(config)
     load_strictly(network, state, str(path))
@@ -69,29 +70,25 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     except OSError as error:
         raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
     try:
-        _check_size(path, size)
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                unpacked = sum(entry.file_size for entry in archive.infolist())
+            if unpacked > MAX_EXPANSION * size:
+                raise ValueError(f"it claims to unpack to {unpacked} bytes")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file makes torch's reader raise whatever it likes
-        reason = str(error).strip().splitlines()[0][:160] if str(error).strip() else type(error).__name__
+    except Exception as error:  # torch raises many types for a damaged file
+        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
         raise SegmentationError(
-            f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}", "it is truncated or foreign"
+            f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}",
+            "it is truncated or of another format",
         ) from error
     if not isinstance(content, Mapping):
         raise SegmentationError(f"{path} holds a {type(content).__name__}, not a table of weights")
     return content
 
 
-def _check_size(path: Path, size: int) -> None:
-    """Raise ValueError where the file would unpack to far more than it is."""
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > MOST_GROWTH * size:
-            raise ValueError(f"it claims to unpack to {unpacked} bytes")
-
-
 def split(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], NetworkConfig | None]:
-    """Weights and, for a file of our own, the network's shape.
+    """Weights and, for a file of this project, the network's shape.
 
     Raises:
         SegmentationError: The file holds no weights, or a shape that is not understood.
@@ -104,16 +101,13 @@ def split(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], Ne
             config = NetworkConfig.model_validate_json(str(content["config"]))
         except ValidationError as error:
             raise _not_understood(error, where) from error
-    for key in _WRAPPERS:
-        if isinstance(content.get(key), Mapping):
-            content = content[key]
-            break
+    content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)), content)
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
         raise SegmentationError(f"{where} holds no weights; its keys: {_some(map(str, content))}")
-    odd = next((key for key, value in state.items() if not _is_plain(value)), None)
-    if odd is not None:
-        raise SegmentationError(f"{where}: {odd[:100]!r} is no plain array of numbers")
+    for key, value in state.items():
+        if not _is_plain(value):
+            raise SegmentationError(f"{where}: {key[:100]!r} is no plain array of numbers")
     return state, config
 
 
@@ -123,7 +117,7 @@ def _not_understood(error: ValidationError, where: str) -> SegmentationError:
 
 
 def _is_plain(value: Tensor) -> bool:
-    """Whether a tensor holds the numbers that its shape claims: no view that repeats a few, nothing sparse."""
+    """Whether a tensor stores all numbers of its shape: it is no expanded view and not sparse."""
     if value.layout != torch.strided or value.is_quantized or value.is_meta or value.is_complex():
         return False
     return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
@@ -139,14 +133,14 @@ def canonical_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             continue
         for pattern, replacement in _RENAMES:
             name = pattern.sub(replacement, name)
-        if found := _MASK_FCN.match(name):
-            name = f"roi_heads.mask_head.{int(found[1]) - 1}.0.{found[2]}"
+        if match := _MASK_FCN.match(name):
+            name = f"roi_heads.mask_head.{int(match[1]) - 1}.0.{match[2]}"
         result[name] = value.float() if value.is_floating_point() else value
     return result
 
 
 def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
-    """The network's shape, read off the weights of a torchvision model.
+    """The network's shape, inferred from the weights of a torchvision model.
 
     Raises:
         SegmentationError: Weights that give the shape are missing, or the classes have no names.
@@ -170,13 +164,11 @@ def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
         for stage in range(1, 5)
     )
     classes = int(state["roi_heads.box_predictor.cls_score.weight"].shape[0]) - 1
-    if classes == len(COCO_CLASSES):
-        names = COCO_CLASSES
-    elif classes == 1:
-        names = ("person",)
-    else:
+    names = {len(COCO_CLASSES): COCO_CLASSES, 1: ("person",)}.get(classes)
+    if names is None:
         raise SegmentationError(
-            f"{where} has {classes} classes without names", "90 (COCO) and 1 (person) are known; others need our format"
+            f"{where} has {classes} classes without names",
+            "90 (COCO) and 1 (person) are known; others need this project's format",
         )
     ratios = int(state["rpn.head.cls_logits.weight"].shape[0])
     if ratios != 3:
@@ -198,7 +190,7 @@ def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
 
 
 def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> None:
-    """Copy weights into a network; only a CFPN may be missing, as a whole, and then adds nothing.
+    """Copy weights into a network; only the whole CFPN may be missing, and then it adds nothing.
 
     Raises:
         SegmentationError: Keys are missing or unknown, shapes differ, or a weight is not finite.
@@ -211,7 +203,7 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) ->
 
 
 def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> None:
-    own = {key: value for key, value in network.state_dict().items() if not key.endswith("num_batches_tracked")}
+    own = _weights(network)
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
     unknown = [key for key in state if key not in own]
@@ -220,28 +212,33 @@ def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> No
         for key in own
         if key in state and state[key].shape != own[key].shape
     ]
-    found = (("keys are missing", missing), ("keys are unknown", unknown), ("shapes differ", shapes))
-    faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in found if keys]
+    checks = (("keys are missing", missing), ("keys are unknown", unknown), ("shapes differ", shapes))
+    faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in checks if keys]
     if faults:
         raise SegmentationError(f"{where} does not fit the network: " + "; ".join(faults))
 
 
+def _weights(network: MaskRCNN) -> dict[str, Tensor]:
+    return {key: value for key, value in network.state_dict().items() if not key.endswith("num_batches_tracked")}
+
+
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
-    """Write a network with its shape, in our format; `half` stores float16."""
-    state: dict[str, Tensor] = {}
-    for key, value in network.state_dict().items():
-        if not key.endswith("num_batches_tracked"):
-            stored = value.detach().cpu()
-            state[key] = stored.half() if half and stored.is_floating_point() else stored
+    """Write a network with its shape; `half` stores float16."""
+    state = {key: value.detach().cpu() for key, value in _weights(network).items()}
+    if half:
+        state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
     content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}
-    with replacing(path) as temporary, temporary.open("wb") as file:  # a file of no name: the bytes hold none either
+    with (
+        replacing(path) as temporary,
+        temporary.open("wb") as file,
+    ):  # an open file: torch.save writes no file name into it
         torch.save(content, file)
 
 
 def _some(keys: Iterable[str]) -> str:
     listed = list(keys)
-    more = f", and {len(listed) - NAMED} more" if len(listed) > NAMED else ""
-    return ", ".join(listed[:NAMED]) + more
+    more = f", and {len(listed) - KEYS_SHOWN} more" if len(listed) > KEYS_SHOWN else ""
+    return ", ".join(listed[:KEYS_SHOWN]) + more
 
 
 def _shape(value: Tensor) -> str:

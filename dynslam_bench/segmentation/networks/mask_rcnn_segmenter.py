@@ -17,8 +17,8 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.postprocess import as_rgb
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.postprocess import pick
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
 
 
 class MaskRCNNSegmenter:
@@ -42,10 +42,7 @@ class MaskRCNNSegmenter:
         floor: float = 0.1,
     ) -> None:
         self.network = network.eval().fuse().to(device)
-        self.settings = settings
-        self.device = device
-        self.threads = threads
-        self.floor = floor
+        self.settings, self.device, self.threads, self.floor = settings, device, threads, floor
 
     @classmethod
     def from_file(
@@ -59,11 +56,11 @@ class MaskRCNNSegmenter:
         if device.startswith("cuda") and not torch.cuda.is_available():
             raise SegmentationError(f"device '{device}' is not available: torch {torch.__version__} sees no GPU")
         network = load_network(path)
-        known = set(network.config.classes)
-        if not known & settings.class_names():
+        classes = set(network.config.classes)
+        if not classes & settings.class_names():
             raise SegmentationError(
                 f"{path} knows none of the classes {', '.join(sorted(settings.class_names()))}",
-                "it knows " + ", ".join(sorted(filter(None, known))),
+                "it knows " + ", ".join(sorted(filter(None, classes))),
             )
         if settings.network_side > 0:
             network.set_input(settings.network_side)
@@ -71,38 +68,21 @@ class MaskRCNNSegmenter:
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame; none is an empty result."""
-        rgb = as_rgb(frame.rgb)
-        height, width = rgb.shape[:2]
+        height, width = frame.rgb.shape[:2]
         with torch_threads(self.threads):
-            image = torch.from_numpy(rgb).to(self.device).permute(2, 0, 1).float() / 255
-            found = self.network.detect(image, score=self.floor, iou=self.settings.nms_iou)
-            boxes, scores = found.boxes.cpu().numpy(), found.scores.cpu().numpy()
-            labels, planes = found.labels.cpu().numpy(), found.masks.cpu().numpy()
-        names = [self.network.config.classes[label - 1] for label in labels]
-        wanted = self.settings.class_names()
-        masks, kept = [], []
-        for index, name in enumerate(names):
-            if name not in wanted:
-                continue
-            mask = paste(
-                planes[index],
-                boxes[index],
-                height,
-                width,
-                self.settings.mask_threshold,
-                exact=self.network.config.exact_paste,
+            image = torch.from_numpy(np.ascontiguousarray(frame.rgb)).to(self.device).permute(2, 0, 1).float() / 255
+            detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
+            boxes, scores = detections.boxes.cpu().numpy(), detections.scores.cpu().numpy()
+            labels, planes = detections.labels.cpu().numpy(), detections.masks.cpu().numpy()
+        config, wanted = self.network.config, self.settings.class_names()
+        names = [config.classes[label - 1] for label in labels]
+        masks = np.zeros((len(names), height, width), bool)
+        for index in (index for index, name in enumerate(names) if name in wanted):
+            masks[index] = paste(
+                planes[index], boxes[index], height, width, self.settings.mask_threshold, exact=config.exact_paste
             )
-            if mask.any():
-                masks.append(mask)
-                kept.append(index)
-        if not kept:
-            return Instances.empty(height, width)
-        return Instances(
-            np.stack(masks),
-            boxes[kept].astype(np.float32),
-            tuple(names[i] for i in kept),
-            scores[kept].astype(np.float32),
-        )
+        instances = Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32))
+        return pick(instances, masks.any(axis=(1, 2)))
 
 
 def paste(
@@ -167,9 +147,6 @@ def _paste_exactly(
 def torch_threads(threads: int) -> Iterator[None]:
     """Pin torch's thread count while the block runs (it is one number for the whole process)."""
     before = torch.get_num_threads()
-    if before == threads:
-        yield
-        return
     torch.set_num_threads(threads)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Our networks as ONNX files: with fixed shapes and plain operators, so that light runtimes can serve them."""
+"""Export of a Mask R-CNN to ONNX, with fixed shapes and plain operators that light runtimes understand."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.segmentation.networks.boxes import BOX_WEIGHTS, RPN_WEIGHTS, clip, decode
-from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
+from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.networks.roi_heads import BOX_POOL, MIN_BOX_PX, _scale, levels_of
+from dynslam_bench.segmentation.networks.roi_heads import BOX_POOL, MIN_BOX_PX, level_scale, levels_of
 from dynslam_bench.segmentation.networks.rpn import MIN_BOX_PX as MIN_PROPOSAL_PX
 from dynslam_bench.segmentation.networks.rpn import anchors_of
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -34,6 +34,14 @@ FLOOR = 0.1
 SMALLEST, LARGEST = 32, 4096
 """Sides of an image in pixels."""
 OUTPUTS = ("boxes", "labels", "scores", "masks")
+ROUNDS = 24
+"""Rounds of suppression: the longest chain of boxes that suppress each other."""
+CANDIDATES = 400
+"""Classified boxes that enter the last suppression, the best first."""
+CHUNK = 100
+"""Boxes whose features are gathered at a time, which bounds the memory."""
+SAMPLES = 2
+"""Sampling points a side of a bin, as in `roi_align`."""
 
 
 @dataclass(frozen=True)
@@ -97,16 +105,14 @@ def weights_of(source: str, side: int | None = None) -> Weights:
         SegmentationError: There is no such checkpoint, or it cannot be fetched.
     """
     kind, _, argument = source.partition(":")
-    if kind == "embedded" and not argument:
-        path = embedded_weights()
-        if path is None:
-            raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
-        return Weights(path, side or 0)
-    if kind == "coco" and not argument:
-        return Weights(fetch_checkpoint(COCO), SegmentationSettings().network_side if side is None else side)
+    if source == "embedded":
+        return Weights(require_embedded_weights(), side or 0)
+    side = SegmentationSettings().network_side if side is None else side
+    if source == "coco":
+        return Weights(fetch_checkpoint(COCO), side)
     if kind == "weights" and argument:
-        return Weights(Path(argument).expanduser(), SegmentationSettings().network_side if side is None else side)
-    raise SegmentationError(f"'{source}' is no network of ours", "export embedded, coco or weights:PATH")
+        return Weights(Path(argument).expanduser(), side)
+    raise SegmentationError(f"'{source}' is no network of this project", "export embedded, coco or weights:PATH")
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -115,8 +121,8 @@ def parse_size(text: str) -> tuple[int, int]:
     Raises:
         SegmentationError: It is no such text, or a side is outside 32 to 4096 pixels.
     """
-    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
-    width, height = (int(found[1]), int(found[2])) if found else (0, 0)
+    match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    width, height = map(int, match.groups()) if match else (0, 0)
     if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
         raise SegmentationError(
             f"'{text}' is no size of an image", f"for example 640x480; sides from {SMALLEST} to {LARGEST} pixels"
@@ -163,9 +169,8 @@ def _export(static: StaticMaskRCNN, image: torch.Tensor, path: Path) -> None:
                 verbose=False,
             )
     except (torch.onnx.errors.OnnxExporterError, TypeError) as error:  # TypeError: options of a newer torch
-        words = " ".join(str(error).split())[:200]
         raise SegmentationError(
-            f"torch {torch.__version__} cannot export the network: {words}", "torch >= 2.6"
+            f"torch {torch.__version__} cannot export the network: {' '.join(str(error).split())[:200]}", "torch >= 2.6"
         ) from error
 
 
@@ -181,19 +186,8 @@ def _library() -> Any:
     return onnx
 
 
-# The network without any shape that depends on the image: what other runtimes can take.
-
-ROUNDS = 24
-"""Of suppression's fixed-point iteration: as long as the longest chain of boxes that suppress each other may be."""
-CANDIDATES = 400
-"""Most classified boxes that reach the last suppression; where more have the least score, the best do."""
-CHUNK = 100
-"""Boxes whose features are gathered at a time, for the memory's sake."""
-SAMPLES = 2
-
-
 class StaticMaskRCNN(nn.Module):
-    """A `MaskRCNN` for images of one size.
+    """A `MaskRCNN` for images of one size, without shapes that depend on the image.
 
     Args:
         network: In inference mode; it is not changed.
@@ -215,7 +209,7 @@ class StaticMaskRCNN(nn.Module):
             self.register_buffer(f"anchors{level}", anchors)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Objects, best first, filled up with objects of score 0 to the network's ``max_detections``.
+        """Objects, best first, padded with objects of score 0 to the network's ``max_detections``.
 
         Args:
             image: float ``[1, 3, H, W]`` in [0, 1].
@@ -224,10 +218,8 @@ class StaticMaskRCNN(nn.Module):
             Boxes ``[K, 4]`` in pixels of the image, labels ``[K]`` from 1, scores ``[K]`` and masks ``[K, 1, H, W]``,
             probabilities in the whole image.
         """
-        x, _ = self.network.prepare(image[0])
-        levels, mask_levels = self.network.backbone(x)
-        proposals, valid = self._proposals(levels)
-        boxes, labels, scores = self._classified(levels[:4], proposals, valid)
+        levels, mask_levels = self.network.backbone(self.network.prepare(image[0])[0])
+        boxes, labels, scores = self._classified(levels[:4], *self._proposals(levels))
         config = self.network.config
         pooled = self._pooled(mask_levels, boxes, config.mask_pool, config.mask_canonical)
         heads = self.network.roi_heads
@@ -272,24 +264,22 @@ class StaticMaskRCNN(nn.Module):
 
     def _pooled(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         """RoIAlign ``[K, C, size, size]`` of one image's boxes; see `roi_align`."""
-        few = [boxes[start : start + CHUNK] for start in range(0, len(boxes), CHUNK)]
-        return torch.cat([self._pooled_few(levels, each, size, canonical) for each in few])
+        return torch.cat([self._pooled_chunk(levels, chunk, size, canonical) for chunk in boxes.split(CHUNK)])
 
-    def _pooled_few(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
+    def _pooled_chunk(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         count, channels = len(boxes), levels[0].shape[1]
-        side = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)  # what is no object may be empty
+        side = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)  # padding may be empty
         level = levels_of(torch.cat([boxes[:, :2], boxes[:, :2] + side], dim=1), canonical, len(levels))
         pooled: list[Tensor] = []
         for index, features in enumerate(levels):
             rows, columns = int(features.shape[2]), int(features.shape[3])
-            scaled = boxes * _scale(rows, self.padded[0])
+            scaled = boxes * level_scale(rows, self.padded[0])
             mine = (level == index).to(boxes.dtype)[:, None, None]
             y = _bins(scaled[:, 1], scaled[:, 3], rows, size) * mine
             x = _bins(scaled[:, 0], scaled[:, 2], columns, size)
             table = features[0].permute(1, 0, 2).reshape(rows, channels * columns)
             by_row = (y.reshape(count * size, rows) @ table).reshape(count, size * channels, columns)
-            found = (by_row @ x.transpose(1, 2)).reshape(count, size, channels, size)
-            pooled.append(found.permute(0, 2, 1, 3))
+            pooled.append((by_row @ x.transpose(1, 2)).reshape(count, size, channels, size).permute(0, 2, 1, 3))
         return torch.stack(pooled).sum(dim=0)
 
     def _pasted(self, planes: Tensor, boxes: Tensor) -> Tensor:
@@ -302,11 +292,11 @@ class StaticMaskRCNN(nn.Module):
 
 
 def unsuppressed(over: Tensor, valid: Tensor) -> Tensor:
-    """Which boxes stay, 1 or 0, of boxes in order of falling scores: greedy suppression in `ROUNDS` rounds.
+    """Greedy suppression of boxes in order of falling scores, in `ROUNDS` rounds: 1 or 0 for each box.
 
     Args:
         over: Bool ``[N, N]``, which overlap too much.
-        valid: ``[N]``: 0 for boxes that are none, which stay away and suppress nothing.
+        valid: ``[N]``: 0 for padding, which suppresses nothing.
     """
     before = torch.ones(len(valid), len(valid)).tril(diagonal=-1)
     better = over.to(valid.dtype) * before

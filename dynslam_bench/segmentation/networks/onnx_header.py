@@ -1,4 +1,4 @@
-"""Read what an ONNX file says of itself: inputs, outputs, metadata. No dependency, no execution.
+"""The header of an ONNX file: inputs, outputs, metadata. No dependency, no execution.
 
 An ONNX file is one protocol-buffer message. Only the few fields below are decoded (field numbers from the public
 ``onnx.proto``): ``ModelProto.graph`` = 7, ``.metadata_props`` = 14; ``GraphProto.initializer`` = 5 (names only),
@@ -17,7 +17,7 @@ from dynslam_bench.core.errors import SegmentationError
 
 @dataclass(frozen=True)
 class TensorInfo:
-    """Name and shape of an input or output; a dimension that the file leaves open is None."""
+    """Name and shape of an input or output; an open dimension is None."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -28,7 +28,7 @@ class TensorInfo:
 
 @dataclass(frozen=True)
 class OnnxHeader:
-    """What the file declares."""
+    """Inputs, outputs and metadata that a file declares."""
 
     inputs: tuple[TensorInfo, ...]
     outputs: tuple[TensorInfo, ...]
@@ -49,56 +49,29 @@ def read_header(path: Path) -> OnnxHeader:
         ) from error
     try:
         header = _decode(memoryview(data))
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        if not header.inputs or not header.outputs:
+            raise ValueError(f"it declares {len(header.inputs)} inputs and {len(header.outputs)} outputs")
+    except (ValueError, IndexError) as error:
         raise SegmentationError(
             f"{path} is not an ONNX model ({len(data)} bytes): {error}", "the file is truncated or of another format"
         ) from error
-    if not header.inputs or not header.outputs:
-        raise SegmentationError(
-            f"{path} is not an ONNX model ({len(data)} bytes): it declares "
-            f"{len(header.inputs)} inputs and {len(header.outputs)} outputs",
-            "the file is truncated or of another format",
-        )
     return header
 
 
 def _decode(data: memoryview) -> OnnxHeader:
-    graph = memoryview(b"")
-    metadata: dict[str, str] = {}
-    for number, value in _fields(data):
-        if number == 7 and isinstance(value, memoryview):
-            graph = value
-        elif number == 14 and isinstance(value, memoryview):
-            pair = {field: bytes(text).decode() for field, text in _fields(value) if isinstance(text, memoryview)}
-            metadata[pair.get(1, "")] = pair.get(2, "")
-    initialised: set[str] = set()
-    inputs: list[TensorInfo] = []
-    outputs: list[TensorInfo] = []
-    for number, value in _fields(graph):
-        if not isinstance(value, memoryview):
-            continue
-        if number == 5:
-            initialised.update(
-                bytes(v).decode() for field, v in _fields(value) if field == 8 and isinstance(v, memoryview)
-            )
-        elif number == 11:
-            inputs.append(_tensor(value))
-        elif number == 12:
-            outputs.append(_tensor(value))
-    return OnnxHeader(tuple(i for i in inputs if i.name not in initialised), tuple(outputs), metadata)
+    graph = _first(data, 7)
+    initialised = {_text(tensor, 8) for tensor in _messages(graph, 5)}
+    inputs = [_tensor(value) for value in _messages(graph, 11)]
+    return OnnxHeader(
+        tuple(tensor for tensor in inputs if tensor.name not in initialised),
+        tuple(_tensor(value) for value in _messages(graph, 12)),
+        {_text(entry, 1): _text(entry, 2) for entry in _messages(data, 14)},
+    )
 
 
 def _tensor(data: memoryview) -> TensorInfo:
-    name, shape = "", memoryview(b"")
-    for number, value in _fields(data):
-        if number == 1 and isinstance(value, memoryview):
-            name = bytes(value).decode()
-        elif number == 2 and isinstance(value, memoryview):
-            shape = _only(_only(value, 1), 2)
-    return TensorInfo(
-        name,
-        tuple(_dimension(value) for number, value in _fields(shape) if number == 1 and isinstance(value, memoryview)),
-    )
+    shape = _first(_first(_first(data, 2), 1), 2)
+    return TensorInfo(_text(data, 1), tuple(_dimension(value) for value in _messages(shape, 1)))
 
 
 def _dimension(data: memoryview) -> int | None:
@@ -106,11 +79,17 @@ def _dimension(data: memoryview) -> int | None:
     return sizes[-1] if sizes and 0 < sizes[-1] < 1 << 62 else None
 
 
-def _only(data: memoryview, wanted: int) -> memoryview:
-    for number, value in _fields(data):
-        if number == wanted and isinstance(value, memoryview):
-            return value
-    return memoryview(b"")
+def _messages(data: memoryview, wanted: int) -> list[memoryview]:
+    """The length-delimited values of a field number: messages and texts."""
+    return [value for number, value in _fields(data) if number == wanted and isinstance(value, memoryview)]
+
+
+def _first(data: memoryview, wanted: int) -> memoryview:
+    return next(iter(_messages(data, wanted)), memoryview(b""))
+
+
+def _text(data: memoryview, wanted: int) -> str:
+    return bytes(_first(data, wanted)).decode()
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:

@@ -1,4 +1,4 @@
-"""Recognise a segmentation network by the names and shapes of its outputs.
+"""Outputs of segmentation networks: their layout, recognised by names and shapes, and their decoding.
 
 Three layouts are known:
 
@@ -14,7 +14,7 @@ import ast
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -23,10 +23,17 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo
-from dynslam_bench.segmentation.postprocess import boxes_of
-from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, VOC_NAMES, SegmentationSettings
+from dynslam_bench.segmentation.postprocess import boxes_of, pick
+from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, NMS_IOU, VOC_NAMES, SegmentationSettings
 
+Float: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 Kind = Literal["yolo", "semantic", "instances"]
+MIN_COMPONENT_PX = 64
+"""Smaller connected parts of a semantic map are noise and become no object."""
+MAX_OBJECTS = 100
+"""Objects an image, as torchvision's models have it."""
+MAX_CANDIDATES = 1000
+"""Detections of a YOLO network that enter the suppression."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ def detect_layout(
         where: The file, for the error.
 
     Raises:
-        SegmentationError: No known layout fits, or the class names cannot be told; lists the outputs.
+        SegmentationError: No known layout fits, or the class names are not known; lists the outputs.
     """
     names = _metadata_names(metadata, where)
     by_name = {output.name.lower(): output for output in outputs}
@@ -72,9 +79,9 @@ def detect_layout(
     rank3 = [output for output in outputs if len(output.shape) == 3 and _known(output.shape)]
     rank4 = [output for output in outputs if len(output.shape) == 4 and _known(output.shape[1:])]
     if rank3 and rank4:
-        found = _yolo(rank3, rank4, names)
-        if found is not None:
-            return found
+        yolo = _yolo(rank3, rank4, names)
+        if yolo is not None:
+            return yolo
     if rank4 and not rank3:
         full = max(rank4, key=lambda output: (output is rank4[0], math.prod(s or 1 for s in output.shape[1:])))
         classes = int(full.shape[1] or 0)
@@ -94,12 +101,9 @@ def _yolo(rank3: list[TensorInfo], rank4: list[TensorInfo], names: dict[int, str
             continue  # there are far more candidates than channels
         for objectness in (0, 1):
             classes = channels - 4 - objectness - coefficients
-            labels = names if names is not None and len(names) == classes else None
-            if labels is None and names is None and classes == len(COCO_NAMES):
-                labels = dict(enumerate(COCO_NAMES))
-            if labels is None and names is None and classes == 1:
-                labels = {0: "person"}
-            if labels is not None:
+            usual = {len(COCO_NAMES): dict(enumerate(COCO_NAMES)), 1: {0: "person"}}
+            labels = usual.get(classes) if names is None else names
+            if labels is not None and len(labels) == classes:
                 return Layout("yolo", (detections.name, prototypes.name), labels, channels_first, objectness)
     return None
 
@@ -115,13 +119,13 @@ def _aligned(cells: Sequence[int | None], size: tuple[int, int]) -> bool:
 
 
 def _semantic_names(classes: int) -> dict[int, str] | None:
-    if classes == len(VOC_NAMES):
-        return dict(enumerate(VOC_NAMES))
-    if classes == len(COCO_NAMES) + 1:
-        return {0: "background", **{number + 1: name for number, name in enumerate(COCO_NAMES)}}
-    if classes == 91:
-        return {0: "background", **COCO_IDS}
-    return {0: "background", 1: "person"} if classes == 2 else None
+    usual = {
+        len(VOC_NAMES): dict(enumerate(VOC_NAMES)),
+        len(COCO_NAMES) + 1: dict(enumerate(("background", *COCO_NAMES))),
+        91: {0: "background", **COCO_IDS},
+        2: {0: "background", 1: "person"},
+    }
+    return usual.get(classes)
 
 
 def _metadata_names(metadata: Mapping[str, str], where: str) -> dict[int, str] | None:
@@ -138,17 +142,11 @@ def _metadata_names(metadata: Mapping[str, str], where: str) -> dict[int, str] |
 
 
 def _unknown(outputs: Sequence[TensorInfo], where: str, reason: str) -> SegmentationError:
-    found = "; ".join(map(str, outputs)) or "none"
     return SegmentationError(
-        f"{where}: the network's outputs are not understood ({reason}): {found}",
+        f"{where}: the network's outputs are not understood ({reason}): {'; '.join(map(str, outputs)) or 'none'}",
         "known: YOLO-seg [1, 4+C+M, N] with [1, M, h, w], semantic logits [1, C, h, w], "
         "or boxes, labels, scores, masks as torchvision exports them",
     )
-
-
-# Where the frame lies in a network's input, and masks and boxes brought from there into the frame.
-
-Float: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 
 
 @dataclass(frozen=True)
@@ -163,17 +161,13 @@ class Placement:
     input_height: int
 
 
-def _frame_box(corner: Float, place: Placement, width: int, height: int) -> tuple[int, int, int, int]:
-    x0 = (float(corner[0]) - place.offset_x) / place.scale_x
-    y0 = (float(corner[1]) - place.offset_y) / place.scale_y
-    x1 = (float(corner[2]) - place.offset_x) / place.scale_x
-    y1 = (float(corner[3]) - place.offset_y) / place.scale_y
-    return (max(0, math.floor(x0)), max(0, math.floor(y0)), min(width, math.ceil(x1)), min(height, math.ceil(y1)))
-
-
 def paste_plane(mask: NDArray[np.bool_], plane: Float, corner: Float, place: Placement, level: float) -> None:
     """Sample a prototype mask (a plane over the whole input) at the frame's pixels inside the box."""
-    x0, y0, x1, y1 = _frame_box(corner, place, mask.shape[1], mask.shape[0])
+    left, top, right, bottom = (float(value) for value in corner)
+    x0 = max(0, math.floor((left - place.offset_x) / place.scale_x))
+    y0 = max(0, math.floor((top - place.offset_y) / place.scale_y))
+    x1 = min(mask.shape[1], math.ceil((right - place.offset_x) / place.scale_x))
+    y1 = min(mask.shape[0], math.ceil((bottom - place.offset_y) / place.scale_y))
     if x1 <= x0 or y1 <= y0:
         return
     ratio_x, ratio_y = plane.shape[1] / place.input_width, plane.shape[0] / place.input_height
@@ -187,31 +181,13 @@ def paste_plane(mask: NDArray[np.bool_], plane: Float, corner: Float, place: Pla
 
 
 def assemble(masks: NDArray[np.bool_], corners: Float, names: list[str], scores: Float, place: Placement) -> Instances:
-    """Instances in frame coordinates, without the objects whose mask came out empty."""
-    full = np.asarray(masks.any(axis=(1, 2)))
+    """Instances in frame coordinates, without objects of an empty mask."""
+    visible = np.asarray(masks.any(axis=(1, 2)))
     shift = np.array([place.offset_x, place.offset_y] * 2, np.float32)
     scale = np.array([place.scale_x, place.scale_y] * 2, np.float32)
     boxes = np.clip((corners - shift) / scale, 0, np.array([masks.shape[2], masks.shape[1]] * 2)).astype(np.float32)
-    kept = tuple(name for name, there in zip(names, full.tolist(), strict=True) if there)
-    return Instances(masks[full], boxes[full], kept, scores[full].astype(np.float32))
-
-
-# Decode the outputs of segmentation networks. Pure functions on arrays; nothing here runs a network.
-
-MIN_COMPONENT_PX = 64
-"""Smaller connected parts of a semantic map are noise and become no object."""
-MAX_OBJECTS = 100
-
-
-class _Asked(NamedTuple):
-    """What is wanted of the outputs; see `decode`."""
-
-    layout: Layout
-    place: Placement
-    height: int
-    width: int
-    settings: SegmentationSettings
-    floor: float
+    instances = Instances(masks, boxes, tuple(names), scores.astype(np.float32))
+    return pick(instances, visible)
 
 
 def decode(
@@ -241,11 +217,18 @@ def decode(
         if not np.isfinite(value).all():
             raise SegmentationError(f"the network's output '{name}' holds NaN or infinite values")
     decoder = {"yolo": _decode_yolo, "semantic": _decode_semantic, "instances": _decode_instances}[layout.kind]
-    return decoder(values, _Asked(layout, place, height, width, settings, floor))
+    return decoder(values, layout, place, height, width, settings, floor)
 
 
-def _decode_yolo(values: Sequence[Float], asked: _Asked) -> Instances:
-    layout, place, height, width, settings, floor = asked
+def _decode_yolo(
+    values: Sequence[Float],
+    layout: Layout,
+    place: Placement,
+    height: int,
+    width: int,
+    settings: SegmentationSettings,
+    floor: float,
+) -> Instances:
     rows = values[0].reshape(values[0].shape[-2:])
     rows = rows.T if layout.channels_first else rows
     prototypes = values[1].reshape(values[1].shape[-3:])
@@ -259,10 +242,10 @@ def _decode_yolo(values: Sequence[Float], asked: _Asked) -> Instances:
     label, best = scores.argmax(axis=1), scores.max(axis=1)
     wanted = _wanted(layout.names, settings.class_names())
     keep = np.flatnonzero((best >= floor) & np.isin(label, list(wanted)))
-    keep = keep[np.argsort(-best[keep], kind="stable")][:1000]
+    keep = keep[np.argsort(-best[keep], kind="stable")][:MAX_CANDIDATES]
     centre, size = rows[keep, 0:2], rows[keep, 2:4]
     corners = np.concatenate([centre - size / 2, centre + size / 2], axis=1)
-    chosen = _nms(corners, best[keep], label[keep], settings.nms_iou)[:MAX_OBJECTS]
+    chosen = _nms(corners, best[keep], label[keep])[:MAX_OBJECTS]
     keep, corners = keep[chosen], corners[chosen]
     if not keep.size:
         return Instances.empty(height, width)
@@ -274,8 +257,15 @@ def _decode_yolo(values: Sequence[Float], asked: _Asked) -> Instances:
     return assemble(masks, corners, [layout.names[int(k)] for k in label[keep]], best[keep], place)
 
 
-def _decode_semantic(values: Sequence[Float], asked: _Asked) -> Instances:
-    layout, place, height, width, settings, floor = asked
+def _decode_semantic(
+    values: Sequence[Float],
+    layout: Layout,
+    place: Placement,
+    height: int,
+    width: int,
+    settings: SegmentationSettings,
+    floor: float,
+) -> Instances:
     logits = values[0].reshape(values[0].shape[-3:])
     if logits.shape[0] < len(layout.names):
         raise SegmentationError(f"the network gives {logits.shape[0]} classes, its layout says {len(layout.names)}")
@@ -305,16 +295,25 @@ def _decode_semantic(values: Sequence[Float], asked: _Asked) -> Instances:
     return Instances(stack, boxes_of(stack), tuple(names), np.array(scores, np.float32))
 
 
-def _decode_instances(values: Sequence[Float], asked: _Asked) -> Instances:
-    layout, place, height, width, settings, floor = asked
+def _decode_instances(
+    values: Sequence[Float],
+    layout: Layout,
+    place: Placement,
+    height: int,
+    width: int,
+    settings: SegmentationSettings,
+    floor: float,
+) -> Instances:
     boxes = values[0].reshape(-1, 4)
     labels, scores = np.rint(values[1].reshape(-1)).astype(int), values[2].reshape(-1)
     nothing = np.zeros((0, height, width), np.float32)
     planes = values[3].reshape(-1, *values[3].shape[-2:]) if values[3].size else nothing
     counts = {len(boxes), len(labels), len(scores), len(planes)}
     if len(counts) != 1:
-        found = f"{len(boxes)} boxes, {len(labels)} labels, {len(scores)} scores, {len(planes)} masks"
-        raise SegmentationError(f"the network's outputs disagree: {found}")
+        raise SegmentationError(
+            f"the network's outputs disagree: {len(boxes)} boxes, {len(labels)} labels, {len(scores)} scores, "
+            f"{len(planes)} masks"
+        )
     if len(planes) and planes.shape[1:] != (place.input_height, place.input_width):
         raise SegmentationError(
             f"the network's masks are {planes.shape[2]}x{planes.shape[1]}, its input {place.input_width}x"
@@ -323,7 +322,7 @@ def _decode_instances(values: Sequence[Float], asked: _Asked) -> Instances:
         )
     wanted = _wanted(layout.names, settings.class_names())
     keep = np.flatnonzero((scores >= floor) & np.isin(labels, list(wanted)))
-    keep = keep[_nms(boxes[keep], scores[keep], labels[keep], settings.nms_iou)][:MAX_OBJECTS]
+    keep = keep[_nms(boxes[keep], scores[keep], labels[keep])][:MAX_OBJECTS]
     if not keep.size:
         return Instances.empty(height, width)
     masks = np.zeros((len(keep), height, width), bool)
@@ -345,14 +344,14 @@ def _interpolation(cells: int, length: int, scale: float, offset: float, count: 
     return matrix
 
 
-def _nms(corners: Float, scores: Float, labels: NDArray[np.intp], iou: float) -> NDArray[np.intp]:
+def _nms(corners: Float, scores: Float, labels: NDArray[np.intp]) -> NDArray[np.intp]:
     """Indices kept by non-maximum suppression within each class, best first."""
     if not len(corners):
         return np.zeros(0, np.intp)
     extent = float(corners.max() - min(float(corners.min()), 0.0)) + 1.0
     shifted = corners + labels[:, None].astype(np.float32) * extent  # classes do not overlap any more
     boxes = np.concatenate([shifted[:, :2], shifted[:, 2:] - shifted[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(boxes.astype(float).tolist(), scores.astype(float).tolist(), 0.0, iou)
+    kept = cv2.dnn.NMSBoxes(boxes.astype(float).tolist(), scores.astype(float).tolist(), 0.0, NMS_IOU)
     return np.asarray(kept, np.intp).reshape(-1)
 
 

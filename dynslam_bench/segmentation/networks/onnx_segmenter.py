@@ -16,7 +16,6 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.onnx_header import OnnxHeader, TensorInfo, read_header
 from dynslam_bench.segmentation.networks.onnx_outputs import Layout, Placement, decode, detect_layout
-from dynslam_bench.segmentation.postprocess import as_rgb
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 Scaling = Literal["unit", "symmetric", "imagenet"]
@@ -28,7 +27,7 @@ _SCALINGS: dict[Scaling, tuple[tuple[float, float, float], tuple[float, float, f
 """Mean and divisor of the RGB channels of a 0..255 image."""
 PAD = 114
 STRIDE = 32
-"""An open input size is filled up to a multiple of this."""
+"""An open input size is padded to a multiple of this."""
 
 
 class OnnxSegmenter:
@@ -59,12 +58,7 @@ class OnnxSegmenter:
                 "export it with static shapes and plain operators",
             ) from error
         self._input = header.inputs[0].name
-        self._layout = self._find_layout(header)
-
-    @property
-    def layout(self) -> Layout:
-        """How the outputs are read."""
-        return self._layout
+        self.layout = self._find_layout(header)
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame.
@@ -72,13 +66,11 @@ class OnnxSegmenter:
         Raises:
             SegmentationError: The network cannot run on this image, or gives outputs that do not fit its layout.
         """
-        rgb = as_rgb(frame.rgb)
-        height, width = rgb.shape[:2]
+        height, width = frame.rgb.shape[:2]
         size = self._size or (_ceil(height), _ceil(width))
-        letterbox = self._layout.kind != "semantic"
-        image, place = fit(rgb, size, keep_aspect=letterbox)
-        values = self._forward(image, list(self._layout.outputs))
-        return decode(self._layout, values, place, height, width, self.settings, self.floor)
+        image, place = fit(frame.rgb, size, keep_aspect=self.layout.kind != "semantic")
+        values = self._forward(image, list(self.layout.outputs))
+        return decode(self.layout, values, place, height, width, self.settings, self.floor)
 
     def _find_layout(self, header: OnnxHeader) -> Layout:
         size = self._size or (480, 640)
@@ -89,16 +81,14 @@ class OnnxSegmenter:
         if not set(names) <= available:  # older OpenCV names outputs by their layers
             names = sorted(available)
         grey = np.full((*size, 3), PAD, np.uint8)
-        self._layout = Layout("semantic", tuple(names), {})
+        self.layout = Layout("semantic", tuple(names), {})  # only for the scaling of this image
         shapes = [value.shape for value in self._forward(grey, names)]
-        seen = tuple(TensorInfo(name, tuple(shape)) for name, shape in zip(names, shapes, strict=True))
-        return detect_layout(seen, header.metadata, size, str(self.path))
+        outputs = tuple(TensorInfo(name, tuple(shape)) for name, shape in zip(names, shapes, strict=True))
+        return detect_layout(outputs, header.metadata, size, str(self.path))
 
     def _forward(self, image: NDArray[np.uint8], names: list[str]) -> list[NDArray[np.float32]]:
         mean, divisor = _SCALINGS[self._scaling()]
-        scaled = image.astype(np.float32)
-        scaled -= np.array(mean, np.float32)
-        scaled /= np.array(divisor, np.float32)
+        scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(divisor, np.float32)
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
         with opencv_threads(self.threads):
             try:
@@ -115,9 +105,9 @@ class OnnxSegmenter:
         chosen = self.settings.onnx_normalisation
         if chosen != "auto":
             return chosen
-        if self._layout.kind != "semantic":
-            return "unit"  # YOLO as it is; torchvision's export normalises inside
-        return "symmetric" if self._layout.aligned else "imagenet"  # TensorFlow's DeepLab; torchvision's models
+        if self.layout.kind != "semantic":
+            return "unit"  # YOLO as it is; torchvision's export normalises by itself
+        return "symmetric" if self.layout.aligned else "imagenet"  # TensorFlow's DeepLab; torchvision's models
 
 
 def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> tuple[NDArray[np.uint8], Placement]:
@@ -148,9 +138,6 @@ def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> 
 def opencv_threads(threads: int) -> Iterator[None]:
     """Pin OpenCV's thread count while the block runs (it is one number for the whole process)."""
     before = cv2.getNumThreads()
-    if before == threads:
-        yield
-        return
     cv2.setNumThreads(threads)
     try:
         yield

@@ -1,7 +1,8 @@
-"""RoIAlign over a feature pyramid (He et al. 2017), as one weighted gather.
+"""RoIAlign, box head and mask head of a Mask R-CNN (He et al. 2017).
 
-Every output bin is a weighted sum of 4 x S^2 feature vectors (S^2 bilinear samples of four corners each). Written as an
-embedding bag over the rows of all levels' feature maps, it is one vectorised call for all boxes, levels and channels.
+RoIAlign over a feature pyramid is one weighted gather. Every output bin is a weighted sum of 4 x S^2 feature vectors
+(S^2 bilinear samples of four corners each). An embedding bag over the rows of all levels' feature maps computes it in
+one vectorised call for all boxes, levels and channels.
 """
 
 from __future__ import annotations
@@ -21,8 +22,12 @@ from dynslam_bench.segmentation.networks.boxes import (
     grouped_nms,
     match,
     sample,
-    smooth_l1,
 )
+
+BOX_POOL = 7
+MIN_BOX_PX = 1e-2
+PROPOSALS_PER_IMAGE = 512
+POSITIVE_SHARE = 0.25
 
 
 def levels_of(boxes: Tensor, canonical: float, count: int) -> Tensor:
@@ -67,7 +72,7 @@ def roi_align(
     for feature in features:
         starts.append(starts[-1] + batch * feature.shape[2] * feature.shape[3])
     base = torch.tensor(starts[:-1], device=device)[level] + image * heights * widths
-    scales = torch.tensor([_scale(f.shape[2], image_height) for f in features], device=device)[level]
+    scales = torch.tensor([level_scale(f.shape[2], image_height) for f in features], device=device)[level]
     scaled = rois.to(torch.float32) * scales[:, None]
     rows, row_weights = _axis(scaled[:, 1], scaled[:, 3], heights, size, samples)
     columns, column_weights = _axis(scaled[:, 0], scaled[:, 2], widths, size, samples)
@@ -80,7 +85,7 @@ def roi_align(
     return bags.reshape(len(rois), size, size, channels).permute(0, 3, 1, 2)
 
 
-def _scale(level_height: int, image_height: int) -> float:
+def level_scale(level_height: int, image_height: int) -> float:
     """The power of two nearest to the level's height over the image's."""
     return float(2.0 ** torch.tensor(level_height / image_height).log2().round().item())
 
@@ -102,14 +107,6 @@ def _axis(low: Tensor, high: Tensor, length: Tensor, size: int, samples: int) ->
     weights = torch.stack([(1 - fraction) * scale, fraction * scale], dim=2)
     count = len(low)
     return cells.reshape(count, size, 2 * samples), weights.reshape(count, size, 2 * samples)
-
-
-# Box and mask heads (He et al. 2017): classify proposals, refine their boxes, predict a mask in each.
-
-BOX_POOL = 7
-MIN_BOX_PX = 1e-2
-PROPOSALS_PER_IMAGE = 512
-POSITIVE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -139,9 +136,7 @@ class TwoMLPHead(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``[K, C, 7, 7]`` to ``[K, hidden]``."""
-        hidden = functional.relu(self.fc6(x.flatten(1)))
-        result: Tensor = functional.relu(self.fc7(hidden))
-        return result
+        return functional.relu(self.fc7(functional.relu(self.fc6(x.flatten(1)))))
 
 
 class BoxPredictor(nn.Module):
@@ -224,12 +219,12 @@ class RoIHeads(nn.Module):
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *size)[:, 1:]
         labels = torch.arange(1, scores.shape[1] + 1, device=scores.device).expand_as(scores)
         keep = (scores > score) & ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
-        box, found, label = boxes[keep], scores[keep], labels[keep]
-        chosen = grouped_nms(box, found, label, iou)[: self.config.max_detections]
-        box, found, label = box[chosen], found[chosen], label[chosen]
+        box, best, label = boxes[keep], scores[keep], labels[keep]
+        chosen = grouped_nms(box, best, label, iou)[: self.config.max_detections]
+        box, best, label = box[chosen], best[chosen], label[chosen]
         mask_logits = self.masks(mask_levels, [box], image_height)
         masks = mask_logits[torch.arange(len(label), device=label.device), label].sigmoid()
-        return Detections(box, label, found, masks)
+        return Detections(box, label, best, masks)
 
     def masks(self, mask_levels: list[Tensor], boxes: list[Tensor], image_height: int) -> Tensor:
         """Mask logits ``[sum K, n + 1, 2m, 2m]`` inside boxes."""
@@ -264,8 +259,8 @@ class RoIHeads(nn.Module):
             per_image: How many proposals an image enter the losses.
         """
         rois, classes, codes, positives, targets = [], [], [], [], []
-        for found, truth, label, mask in zip(proposals, truths, labels, masks, strict=True):
-            candidates = torch.cat([found, truth])
+        for proposal, truth, label, mask in zip(proposals, truths, labels, masks, strict=True):
+            candidates = torch.cat([proposal, truth])
             matched = match(candidates, truth, high=0.5, low=0.5, keep_best=False)
             chosen = sample(matched, count=per_image, positive_share=POSITIVE_SHARE, generator=generator)
             index = torch.cat([chosen.positive, chosen.negative])
@@ -283,7 +278,7 @@ class RoIHeads(nn.Module):
         own = predicted.reshape(len(predicted), -1, 4)[foreground, wanted[foreground]]
         losses = {
             "class": functional.cross_entropy(logits, wanted),
-            "box": smooth_l1(own, torch.cat(codes), beta=1 / 9) / max(len(wanted), 1),
+            "box": functional.smooth_l1_loss(own, torch.cat(codes), beta=1 / 9, reduction="sum") / max(len(wanted), 1),
         }
         target = torch.cat(targets)
         if len(target):
@@ -296,7 +291,7 @@ class RoIHeads(nn.Module):
 
 
 def crop_masks(masks: Tensor, boxes: Tensor, size: int) -> Tensor:
-    """What the mask branch should say: bool ``[K, H, W]`` masks inside their boxes as ``[K, size, size]`` in [0, 1]."""
+    """Targets of the mask branch: bool ``[K, H, W]`` masks inside their boxes as ``[K, size, size]`` in [0, 1]."""
     if not len(masks):
         return torch.zeros((0, size, size), device=masks.device)
     height, width = masks.shape[1:]

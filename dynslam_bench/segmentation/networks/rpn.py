@@ -16,7 +16,6 @@ from dynslam_bench.segmentation.networks.boxes import (
     grouped_nms,
     match,
     sample,
-    smooth_l1,
 )
 
 MIN_BOX_PX = 1e-3
@@ -55,11 +54,9 @@ class RPNHead(nn.Module):
         self.conv = nn.Sequential(nn.Sequential(nn.Conv2d(config.channels, config.channels, 3, padding=1), nn.ReLU()))
         self.cls_logits = nn.Conv2d(config.channels, count, 1)
         self.bbox_pred = nn.Conv2d(config.channels, 4 * count, 1)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                normal(module.weight, std=0.01)
-                assert module.bias is not None
-                nn.init.zeros_(module.bias)
+        for layer in (self.conv[0][0], self.cls_logits, self.bbox_pred):
+            normal(layer.weight, std=0.01)
+            nn.init.zeros_(layer.bias)
 
     def forward(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Objectness logits ``[B, H W A]`` and codes ``[B, H W A, 4]`` of each level, in the anchors' order."""
@@ -143,6 +140,6 @@ def rpn_loss(
         objectness.append(functional.binary_cross_entropy_with_logits(all_logits[image, index], label, reduction="sum"))
         positive = chosen.positive
         wanted = encode(truth[matched[positive]], every[positive], RPN_WEIGHTS) if len(positive) else every[:0]
-        regression.append(smooth_l1(all_codes[image, positive], wanted, beta=1 / 9))
+        regression.append(functional.smooth_l1_loss(all_codes[image, positive], wanted, beta=1 / 9, reduction="sum"))
         total += len(index)
     return torch.stack(objectness).sum() / max(total, 1), torch.stack(regression).sum() / max(total, 1)

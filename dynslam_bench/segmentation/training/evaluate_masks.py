@@ -1,4 +1,4 @@
-"""How good masks are: average precision, intersection over union, recall. Pure functions on one or many images."""
+"""``segmenter evaluate``: average precision, intersection over union and recall of masks on labelled images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from dynslam_bench.contracts.segmenter import Instances, Segmenter
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
@@ -84,12 +84,12 @@ class MaskQuality:
 
 
 class MaskTally:
-    """Gathers images one at a time.
+    """Mask quality, gathered image by image.
 
     Args:
-        classes: The classes to judge.
+        classes: The classes to measure.
         confidence: Least score of detections that count for IoU and recall; AP takes them all.
-        min_area: Objects with fewer pixels are neither asked for nor, if found, counted against the segmenter.
+        min_area: Objects with fewer pixels are ignored, and detections of them are no errors.
     """
 
     def __init__(self, classes: Collection[str], *, confidence: float = 0.5, min_area: int = 0) -> None:
@@ -98,19 +98,21 @@ class MaskTally:
         self._tallies = {name: _ClassTally() for name in sorted(classes)}
         self._images = 0
 
-    def add(self, truth: LabelledImage, found: Instances) -> None:
-        """Compare the objects found in an image with those that are there.
+    def add(self, truth: LabelledImage, detections: Instances) -> None:
+        """Compare the detections in an image with its labels.
 
         Raises:
             SegmentationError: The masks differ in size.
         """
-        if truth.masks.shape[1:] != found.masks.shape[1:]:
-            raise SegmentationError(f"masks of {found.masks.shape[1:]} cannot be compared with {truth.masks.shape[1:]}")
+        if truth.masks.shape[1:] != detections.masks.shape[1:]:
+            raise SegmentationError(
+                f"masks of {detections.masks.shape[1:]} cannot be compared with {truth.masks.shape[1:]}"
+            )
         self._images += 1
         for name, tally in self._tallies.items():
             true = truth.masks[[kind == name for kind in truth.class_names]]
-            member = np.array([kind == name for kind in found.class_names], dtype=bool)
-            self._add_class(tally, true, found.masks[member], found.scores[member])
+            guess = detections.of_classes([name])
+            self._add_class(tally, true, guess.masks, guess.scores)
 
     def _add_class(
         self, tally: _ClassTally, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]
@@ -133,7 +135,7 @@ class MaskTally:
         tally.ignored.extend(ignored)
 
     def quality(self) -> MaskQuality:
-        """What was gathered so far."""
+        """The quality over the images so far."""
         return MaskQuality(self._images, {name: _summary(tally) for name, tally in self._tallies.items()})
 
 
@@ -161,8 +163,7 @@ def assign(
         For each detection, bool ``[10]`` at each of `THRESHOLDS`: whether it hits, and whether it is ignored.
     """
     count, objects = overlap.shape
-    hits = [np.zeros(len(THRESHOLDS), bool) for _ in range(count)]
-    ignored = [np.zeros(len(THRESHOLDS), bool) for _ in range(count)]
+    hits, ignored = np.zeros((2, count, len(THRESHOLDS)), bool)
     for level, threshold in enumerate(THRESHOLDS):
         free = np.ones(objects, bool)
         for row in range(count):
@@ -171,12 +172,12 @@ def assign(
                 if candidates.size:
                     best = candidates[np.argmax(overlap[row, candidates])]
                     free[best] = not counted[best]
-                    hits[row][level] = counted[best]
-                    ignored[row][level] = not counted[best]
+                    hits[row, level] = counted[best]
+                    ignored[row, level] = not counted[best]
                     break
             else:
-                ignored[row][level] = small[row]
-    return hits, ignored
+                ignored[row, level] = small[row]
+    return list(hits), list(ignored)
 
 
 def average_precision(scores: NDArray[np.float64], hits: NDArray[np.bool_], truths: int) -> float:
@@ -208,13 +209,8 @@ def _summary(tally: _ClassTally) -> ClassQuality:
     )  # fmt: skip
 
 
-# ``segmenter evaluate``: how good a segmenter's masks are on labelled images.
-
-Progress = Callable[[int, int], None]
-
-
 class SegmenterScore(Record):
-    """What `evaluate_segmenter` measured.
+    """The result of `evaluate_segmenter`.
 
     Attributes:
         segmenter: The resolved source.
@@ -255,12 +251,12 @@ def evaluate_segmenter(
     threads: int = 1,
     min_area: int = 0,
     limit: int | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> SegmenterScore:
     """Run a segmenter over labelled images and measure its masks.
 
     Args:
-        settings: The segmenter and its thresholds; no dilation, no repair: the network's own masks are judged.
+        settings: The segmenter and its thresholds; the network's own masks are measured, without dilation and repair.
         data: A set or the text that names one (`open_labelled`).
         output: A JSON file for the result.
         device: ``cpu`` or ``cuda:N``.
@@ -273,37 +269,10 @@ def evaluate_segmenter(
         SegmentationError: The segmenter or the data are not available.
     """
     images = open_labelled(data) if isinstance(data, str) else data
-    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP wants weak detections too
+    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP takes weak detections as well
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
-    quality, seconds = measure(segmenter, images, settings, min_area=min_area, limit=limit, progress=progress)
-    classes = {
-        name: {key: _finite(value) for key, value in asdict(one).items()}
-        for name, one in quality.classes.items()
-        if one.truths or one.detections
-    }
-    score = SegmenterScore(
-        segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
-        data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,
-        mean_ap=_finite(quality.mean_ap), mean_iou=_finite(quality.mean_iou), classes=classes,
-        median_ms=1000 * seconds, threads=threads,
-    )  # fmt: skip
-    if output is not None:
-        write_atomic(output, score.to_json())
-    return score
-
-
-def measure(
-    segmenter: Segmenter,
-    images: LabelledImages,
-    settings: SegmentationSettings,
-    *,
-    min_area: int = 0,
-    limit: int | None = None,
-    progress: Progress | None = None,
-) -> tuple[MaskQuality, float]:
-    """Mask quality and the median seconds an image."""
     count = len(images) if limit is None else min(limit, len(images))
     chosen = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
     tally = MaskTally(settings.class_names(), confidence=settings.confidence, min_area=min_area)
@@ -312,12 +281,26 @@ def measure(
         image = images[index]
         frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
         start = time.perf_counter()
-        found = segmenter.segment(frame)
+        detections = segmenter.segment(frame)
         times.append(time.perf_counter() - start)
-        tally.add(image, found)
+        tally.add(image, detections)
         if progress is not None:
             progress(done, len(chosen))
-    return tally.quality(), float(np.median(times)) if times else float("nan")
+    quality = tally.quality()
+    classes = {
+        name: {key: _finite(value) for key, value in asdict(scores).items()}
+        for name, scores in quality.classes.items()
+        if scores.truths or scores.detections
+    }
+    score = SegmenterScore(
+        segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
+        data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,
+        mean_ap=_finite(quality.mean_ap), mean_iou=_finite(quality.mean_iou), classes=classes,
+        median_ms=1000 * float(np.median(times)) if times else float("nan"), threads=threads,
+    )  # fmt: skip
+    if output is not None:
+        write_atomic(output, score.to_json())
+    return score
 
 
 def _finite(value: float) -> float | None:

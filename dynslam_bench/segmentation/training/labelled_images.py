@@ -1,8 +1,9 @@
-"""Labelled images for training and evaluation: what they are."""
+"""Labelled images for training and evaluation: COCO and YOLO files, sequences with masks, rendered sequences."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +26,12 @@ from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, parse
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION
 
+FINER = 4
+"""Polygons are filled at this many times the image's resolution."""
+FARTHEST_PX = 1e6
+"""Corners of polygons farther away than any image is wide are refused: OpenCV counts in 32 bits."""
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
+
 
 @dataclass(frozen=True, eq=False)
 class LabelledImage:
@@ -42,11 +49,11 @@ class LabelledImage:
 
 
 class LabelledImages(Protocol):
-    """A set of labelled images, decoded or rendered when asked for."""
+    """A set of labelled images, decoded or rendered on access."""
 
     @property
     def name(self) -> str:
-        """Says what the images are, for records."""
+        """Name of the set, for records."""
         ...
 
     @property
@@ -57,21 +64,6 @@ class LabelledImages(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> LabelledImage: ...
-
-
-# Labelled images from files: COCO annotation files and YOLO polygon labels.
-
-FINER = 4
-"""Polygons are filled at this many times the image's resolution."""
-FARTHEST_PX = 1e6
-"""Corners of polygons farther away than any image is wide are refused: OpenCV counts in 32 bits."""
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
-
-
-@dataclass(frozen=True)
-class _Entry:
-    image: Path
-    shapes: tuple[tuple[str, Any], ...]
 
 
 class CocoImages:
@@ -106,28 +98,24 @@ class CocoImages:
         if not images_named:
             raise SegmentationError(f"{self.path} lists no images")
         self._entries = [
-            _Entry(inside(folder, name, where=str(self.path), kind=SegmentationError), tuple(shapes[number]))
+            (inside(folder, name, where=str(self.path), kind=SegmentationError), shapes[number])
             for name, number in images_named
         ]
-
-    @property
-    def name(self) -> str:
-        """The annotation file."""
-        return f"coco:{self.path.name}"
+        self.name = f"coco:{self.path.name}"
 
     @property
     def version(self) -> str:
         """Digest of the files' names and sizes."""
-        return _files_digest([self.path, *(entry.image for entry in self._entries)])
+        return _files_digest([self.path, *(image for image, _ in self._entries)])
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __getitem__(self, index: int) -> LabelledImage:
-        entry = self._entries[index]
-        rgb = _read(entry.image)
-        masks = [_coco_mask(shape, rgb.shape[:2], entry.image) for _, shape in entry.shapes]
-        return _labelled(rgb, masks, [name for name, _ in entry.shapes])
+        path, shapes = self._entries[index]
+        rgb = _read(path)
+        masks = [_coco_mask(shape, rgb.shape[:2], path) for _, shape in shapes]
+        return _labelled(rgb, masks, [name for name, _ in shapes])
 
 
 class YoloImages:
@@ -145,15 +133,11 @@ class YoloImages:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.expanduser()
+        self.name = f"yolo:{self.folder.name}"
         root = self.folder / "images"
         self._images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
         if not self._images:
             raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
-
-    @property
-    def name(self) -> str:
-        """The folder."""
-        return f"yolo:{self.folder.name}"
 
     @property
     def version(self) -> str:
@@ -173,10 +157,9 @@ class YoloImages:
                 continue
             try:
                 kind, *points = line.split()
-                name = COCO_NAMES[_positive(kind)]
-                polygon = np.array(points, np.float64).reshape(-1, 2) * [rgb.shape[1], rgb.shape[0]]
-                _check_polygon(polygon)
-            except (ValueError, IndexError, OverflowError) as error:
+                name = dict(enumerate(COCO_NAMES))[int(kind)]
+                polygon = _polygon(points) * [rgb.shape[1], rgb.shape[0]]
+            except (ValueError, LookupError, OverflowError) as error:
                 raise SegmentationError(
                     f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
                 ) from error
@@ -197,16 +180,17 @@ def _read(path: Path) -> NDArray[np.uint8]:
 def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]) -> LabelledImage:
     stack = np.stack(masks) if masks else np.zeros((0, *rgb.shape[:2]), bool)
     visible = np.asarray(stack.any(axis=(1, 2)))
-    kept = tuple(name for name, seen in zip(names, visible.tolist(), strict=True) if seen)
-    return LabelledImage(rgb, stack[visible], kept)
+    return LabelledImage(rgb, stack[visible], tuple(np.array(names, object)[visible]))
 
 
 def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Pixels at least half covered by the union of polygons (x, y in pixels, the image's corner is 0, 0)."""
     mask = np.zeros(shape, bool)
     for polygon in polygons:
-        low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int) if len(polygon) >= 3 else np.zeros(2, int)
-        high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int) if len(polygon) >= 3 else low
+        if len(polygon) < 3:
+            continue
+        low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int)
+        high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int)
         if (high <= low).any():
             continue
         size = (high - low) * FINER  # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
@@ -217,26 +201,18 @@ def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArra
     return mask
 
 
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 0:
-        raise ValueError(f"{number} is no class")
-    return number
-
-
-def _check_polygon(polygon: NDArray[np.float64]) -> None:
-    """Raise ValueError where a corner is no number or far outside of any image."""
+def _polygon(points: Any) -> NDArray[np.float64]:
+    """Corners ``[N, 2]``; raises ValueError where one is no number or far outside of any image."""
+    polygon = np.array(points, np.float64).reshape(-1, 2)
     if not (np.abs(polygon) < FARTHEST_PX).all():  # also catches NaN
         raise ValueError(f"a corner is not finite, or more than {FARTHEST_PX:g} pixels away")
+    return polygon
 
 
 def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
     try:
         if isinstance(segmentation, list):
-            polygons = [np.array(points, np.float64).reshape(-1, 2) for points in segmentation]
-            for polygon in polygons:
-                _check_polygon(polygon)
-            return _fill(polygons, shape)
+            return _fill([_polygon(points) for points in segmentation], shape)
         if isinstance(segmentation, dict) and "counts" in segmentation and "size" in segmentation:
             return _from_runs(segmentation["counts"], segmentation["size"], shape)
     except (ValueError, TypeError, LookupError, OverflowError) as error:
@@ -280,8 +256,6 @@ def decode_runs(text: str) -> list[int]:
     return runs
 
 
-# Labelled images from sequences with exact masks.
-
 VARIANTS: tuple[dict[str, object], ...] = (
     {"lighting_change": True},
     {"glare": True},
@@ -293,28 +267,21 @@ VARIANTS: tuple[dict[str, object], ...] = (
 """Renderer options that a share of the training frames is rendered with."""
 
 
-@dataclass(frozen=True)
 class SequenceFrames:
-    """Every frame of a sequence that has masks."""
+    """Every frame of a sequence that has masks.
 
-    sequence: Sequence
+    Args:
+        sequence_id: Id or folder of the sequence.
 
-    @classmethod
-    def open(cls, sequence_id: str) -> SequenceFrames:
-        """Open a sequence by id or folder.
+    Raises:
+        SegmentationError: It has no masks.
+    """
 
-        Raises:
-            SegmentationError: It has no masks.
-        """
-        sequence = open_sequence(sequence_id)
-        if sequence.masks is None:
-            raise SegmentationError(f"sequence '{sequence.id}' has no masks to train on or compare with")
-        return cls(sequence)
-
-    @property
-    def name(self) -> str:
-        """The sequence's id."""
-        return self.sequence.id
+    def __init__(self, sequence_id: str) -> None:
+        self.sequence = open_sequence(sequence_id)
+        self.name = self.sequence.id
+        if self.sequence.masks is None:
+            raise SegmentationError(f"sequence '{self.name}' has no masks to train on or compare with")
 
     @property
     def version(self) -> str:
@@ -328,97 +295,69 @@ class SequenceFrames:
         return labelled_frame(self.sequence, index)
 
 
-@dataclass(frozen=True)
 class RenderedFrames:
     """Frames drawn at random from rendered sequences.
 
-    Attributes:
-        instances: Which instances (0-99 are for training, 100-199 held out).
-        frames: Frames drawn from each of an instance's eight sequences.
-        length: Frames of a sequence that are drawn from.
-        options: Share of the frames rendered with one of `VARIANTS`.
-        seed: Decides which frames.
+    Args:
+        text: ``scenes=0-99,frames=4,length=600,options=0.3,seed=0``, where what is left out keeps its default: scenes
+            (0-99 are for training, 100-199 held out), frames drawn from each of a scene's eight sequences, frames of a
+            sequence that are drawn from, share of the frames rendered with one of `VARIANTS`, seed of the draws.
+
+    Raises:
+        SegmentationError: Unknown option, or a value that does not fit.
     """
 
-    instances: range
-    frames: int = 2
-    length: int = 600
-    options: float = 0.0
-    seed: int = 0
-    _cache: dict[str, SyntheticSequence] = field(default_factory=dict, repr=False, compare=False)
+    version = f"renderer {RENDERER_VERSION}"
 
-    @classmethod
-    def parse(cls, text: str) -> RenderedFrames:
-        """From ``instances=0-99,frames=4,length=600,options=0.3,seed=0``; what is left out keeps its default.
-
-        Raises:
-            SegmentationError: Unknown option, or a value that does not fit.
-        """
-        values = {"instances": "0-99", "frames": "2", "length": "600", "options": "0", "seed": "0"}
+    def __init__(self, text: str = "") -> None:
+        values = {"scenes": "0-99", "frames": "2", "length": "600", "options": "0", "seed": "0"}
         for part in filter(None, text.split(",")):
             key, separator, value = part.partition("=")
             if key not in values or not separator:
                 raise SegmentationError(f"synthetic: unknown option '{part}'", "known: " + ", ".join(values))
             values[key] = value
         try:
-            first, _, last = values["instances"].partition("-")
-            chosen = range(int(first), int(last or first) + 1)
-            result = cls(
-                chosen, int(values["frames"]), int(values["length"]), float(values["options"]), int(values["seed"])
-            )
+            first, _, last = values["scenes"].partition("-")
+            self.scenes = range(int(first), int(last or first) + 1)
+            self.frames, self.length, self.seed = (int(values[key]) for key in ("frames", "length", "seed"))
+            self.options = float(values["options"])
         except ValueError as error:
             raise SegmentationError(f"synthetic: '{text}' is not understood: {error}") from error
-        if not chosen or chosen[0] < 0 or chosen[-1] > 199 or result.frames < 1 or result.length < result.frames:
+        if not self.scenes or self.scenes[0] < 0 or self.scenes[-1] > 199 or not 1 <= self.frames <= self.length:
             raise SegmentationError(
-                f"synthetic: '{text}' asks for instances or frames that do not exist",
-                "instances 0-199, at least one frame",
+                f"synthetic: '{text}' asks for scenes or frames that do not exist", "scenes 0-199, at least one frame"
             )
-        return result
-
-    @property
-    def name(self) -> str:
-        """The text that names this set."""
-        return (
-            f"synthetic:instances={self.instances.start}-{self.instances.stop - 1},frames={self.frames},"
+        self.name = (
+            f"synthetic:scenes={self.scenes.start}-{self.scenes.stop - 1},frames={self.frames},"
             f"length={self.length},options={self.options:g},seed={self.seed}"
         )
 
-    @property
-    def version(self) -> str:
-        """The renderer's version."""
-        return f"renderer {RENDERER_VERSION}"
-
     def __len__(self) -> int:
-        return len(self.instances) * len(REPLICA_IDS) * self.frames
+        return len(self.scenes) * len(REPLICA_IDS) * self.frames
 
     def __getitem__(self, index: int) -> LabelledImage:
         order, draw = divmod(range(len(self))[index], self.frames)
-        instance, motion = divmod(order, len(REPLICA_IDS))
-        sequence_id = f"{REPLICA_IDS[motion]}@{self.instances[instance]}?frames={self.length}"
+        scene, motion = divmod(order, len(REPLICA_IDS))
+        sequence_id = f"{REPLICA_IDS[motion]}@{self.scenes[scene]}?frames={self.length}"
         rng = stream(self.seed, "frames", sequence_id)
         frame = int(rng.choice(self.length, self.frames, replace=False)[draw])
-        variant = stream(self.seed, "variant", sequence_id, draw)
-        overrides = VARIANTS[int(variant.integers(len(VARIANTS)))] if variant.random() < self.options else {}
-        return labelled_frame(self._open(sequence_id, overrides), frame)
+        rng = stream(self.seed, "variant", sequence_id, draw)
+        variant = int(rng.integers(len(VARIANTS))) if rng.random() < self.options else None
+        return labelled_frame(_rendered(sequence_id, variant), frame)
 
-    def _open(self, sequence_id: str, overrides: dict[str, object]) -> SyntheticSequence:
-        key = f"{sequence_id} {sorted(overrides.items())}"
-        if key not in self._cache:
-            self._cache.clear()  # neighbours in the order share a sequence; nothing older is needed again
-            settings = apply_overrides(RenderSettings(), overrides)
-            self._cache[key] = SyntheticSequence(parse_synthetic_id(sequence_id), None, settings, threads=1)
-        return self._cache[key]
+
+@lru_cache(maxsize=1)  # neighbours in the order share a sequence
+def _rendered(sequence_id: str, variant: int | None) -> SyntheticSequence:
+    settings = apply_overrides(RenderSettings(), {} if variant is None else VARIANTS[variant])
+    return SyntheticSequence(parse_synthetic_id(sequence_id), None, settings, threads=1)
 
 
 def labelled_frame(sequence: Sequence, index: int) -> LabelledImage:
     """A frame and its exact masks."""
     assert sequence.masks is not None
-    frame = sequence[index]
-    found = instances_of(sequence.masks[index], where=f"{sequence.id} frame {index}")
-    return LabelledImage(np.ascontiguousarray(frame.rgb), found.masks, found.class_names)
+    instances = instances_of(sequence.masks[index], where=f"{sequence.id} frame {index}")
+    return LabelledImage(np.ascontiguousarray(sequence[index].rgb), instances.masks, instances.class_names)
 
-
-# The text that names a set of labelled images, and the set.
 
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
 
@@ -426,18 +365,18 @@ FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:
 def open_labelled(text: str) -> LabelledImages:
     """The set that a text names.
 
-    ``synthetic:instances=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`RenderedFrames`),
+    ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`RenderedFrames`),
     ``sequence:ID`` every frame of one sequence that has masks, ``coco:FILE[:IMAGES]`` a COCO annotation file,
     ``yolo:DIR`` a folder with ``images/`` and ``labels/``.
 
     Raises:
-        SegmentationError: Another form, or the set is not there.
+        SegmentationError: Another form, or the set does not exist.
     """
     kind, _, rest = text.partition(":")
     if kind == "synthetic":
-        return RenderedFrames.parse(rest)
+        return RenderedFrames(rest)
     if kind == "sequence" and rest:
-        return SequenceFrames.open(rest)
+        return SequenceFrames(rest)
     if kind == "coco" and rest:
         annotations, _, images = rest.partition(":")
         return CocoImages(Path(annotations), Path(images) if images else None)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from dynslam_bench.segmentation.training.labelled_images import LabelledImage, L
 from dynslam_bench.segmentation.training.settings import TrainSettings
 
 MIN_VISIBLE_PX = 16
-"""Objects with fewer pixels at the network's input size are not taught."""
+"""Objects with fewer pixels at the network's input size are not learned."""
 
 _AGAIN = "delete the folder, they are prepared again"
 Progress = Callable[[int, int], None]
@@ -62,7 +62,7 @@ class PreparedImages:
         try:
             self.images: NDArray[np.uint8] = np.load(folder / "images.npy", mmap_mode="r", allow_pickle=False)
             self.labels: NDArray[np.uint8] = np.load(folder / "labels.npy", mmap_mode="r", allow_pickle=False)
-        except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
+        except Exception as error:  # numpy raises many types for a damaged header
             raise SegmentationError(f"the prepared images in {folder} are damaged: {error}", _AGAIN) from error
         self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
         if not len(self.images) == len(self.labels) == len(self.names):
@@ -83,14 +83,13 @@ class PreparedImages:
     def _example(self, rgb: NDArray[np.uint8], labels: NDArray[np.uint8], names: list[str]) -> Example:
         numbers = [k + 1 for k, name in enumerate(names) if name in self.classes]
         masks = labels[None] == np.array(numbers, np.uint8).reshape(-1, 1, 1)
-        seen = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
-        kept = [number for number, there in zip(numbers, seen.tolist(), strict=True) if there]
-        classes = np.array([self.classes.index(names[number - 1]) + 1 for number in kept], np.int64)
-        return Example(rgb, masks[seen], boxes_of(masks[seen]), classes)
+        visible = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
+        classes = np.array([self.classes.index(names[number - 1]) + 1 for number in numbers], np.int64)
+        return Example(rgb, masks[visible], boxes_of(masks[visible]), classes[visible])
 
 
 def prepare(source: LabelledImages, folder: Path, height: int, width: int, progress: Progress | None = None) -> Path:
-    """Write a set at one size; a set that is already there is not written again.
+    """Write a set at one size; an existing set is not written again.
 
     Args:
         source: The images.
@@ -192,30 +191,20 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
     return np.asarray(np.rint(np.clip(value, 0, 1) * 255), np.uint8)
 
 
-# Which images a training step learns from.
-
-_ORDER: dict[tuple[int, int, int], np.ndarray[Any, np.dtype[np.int64]]] = {}
-
-
 def batch_of(sets: list[PreparedImages], settings: TrainSettings, step: int) -> list[Example]:
     """The step's images: sets in proportion to their size, every image once an epoch, in random order."""
-    sizes = [len(one) for one in sets]
-    total = sum(sizes)
+    ends = np.cumsum([len(images) for images in sets])
+    total = int(ends[-1])
     examples = []
     for position in range(step * settings.batch, (step + 1) * settings.batch):
         epoch, place = divmod(position, total)
-        number = _permuted(place, total, settings.seed, epoch)
-        chosen = 0
-        while number >= sizes[chosen]:
-            number -= sizes[chosen]
-            chosen += 1
+        number = int(_permutation(total, settings.seed, epoch)[place])
+        chosen = int(np.searchsorted(ends, number, side="right"))
+        number -= int(ends[chosen]) - len(sets[chosen])
         examples.append(sets[chosen].varied(number, stream(settings.seed, "vary", position)))
     return examples
 
 
-def _permuted(place: int, total: int, seed: int, epoch: int) -> int:
-    key = (total, seed, epoch)
-    if key not in _ORDER:
-        _ORDER.clear()
-        _ORDER[key] = stream(seed, "order", epoch).permutation(total)
-    return int(_ORDER[key][place])
+@lru_cache(maxsize=1)
+def _permutation(total: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    return np.asarray(stream(seed, "order", epoch).permutation(total))

@@ -1,4 +1,4 @@
-"""Settings of ``segmenter train``; light."""
+"""Settings, progress and result of ``segmenter train``; imports no torch."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class TrainSettings(Settings):
     classes: str = Field("person", description="classes to learn: comma-separated COCO names or presets")
     cfpn: bool = Field(True, description="cross-layer feature pyramid in the mask branch; false is plain Mask R-CNN")
     data: tuple[str, ...] = Field(
-        ("synthetic:instances=0-89,frames=2,options=0.3,seed=1",), description="sets of labelled images to learn from"
+        ("synthetic:scenes=0-89,frames=2,options=0.3,seed=1",), description="sets of labelled images to learn from"
     )
     validation: str = Field(
-        "synthetic:instances=90-99,frames=1,seed=2", description="set that chooses the best checkpoint"
+        "synthetic:scenes=90-99,frames=1,seed=2", description="set that chooses the best checkpoint"
     )
     init: str = Field("", description="checkpoint to start from: of the same shape, or a file of torchvision's")
     iterations: int = Field(4000, ge=1, description="training steps")
@@ -40,12 +40,9 @@ class TrainSettings(Settings):
     seed: int = Field(0, ge=0, description="of weights, order and augmentation")
 
 
-# What a training run tells while it runs, and at its end.
-
-
 @dataclass(frozen=True)
 class TrainProgress:
-    """Where a training run is.
+    """Progress of a training run.
 
     Attributes:
         stage: ``data`` (images being prepared), ``train`` or ``validation``.
@@ -62,10 +59,10 @@ class TrainProgress:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What came of a training run.
+    """Result of a training run.
 
     Attributes:
-        best: The averaged weights with the best validation score, in our checkpoint format.
+        best: The averaged weights with the best validation score, in this project's checkpoint format.
         step: Step at which they were reached.
         iou: Their mean IoU over the objects of the validation set.
         stopped: Why the run ended: ``finished`` or ``no gain``.

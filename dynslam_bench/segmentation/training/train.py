@@ -1,23 +1,20 @@
-"""``segmenter train``: teach a Mask R-CNN, resumably."""
+"""``segmenter train``: train a Mask R-CNN, resumably."""
 
 from __future__ import annotations
 
 import copy
-import csv
-import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+import pandas as pd
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
-from dynslam_bench.core.errors import DynslamError, SegmentationError
+from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing, write_atomic
 from dynslam_bench.core.reading import read_json
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
@@ -38,6 +35,11 @@ from dynslam_bench.segmentation.training.settings import TrainProgress, TrainRes
 
 __all__ = ["TrainProgress", "TrainResult", "input_size", "network_config", "train"]
 
+LOSSES = ("objectness", "anchor", "class", "box", "mask")
+SCORES = ("iou", "pixel_iou", "recall")
+CONFIDENCE = 0.5
+"""Least score of a detection in the validation."""
+
 
 def train(
     settings: TrainSettings,
@@ -51,9 +53,9 @@ def train(
 ) -> TrainResult:
     """Train a network.
 
-    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging), ``last.pt``
-    (everything needed to go on), ``csv``, ``png`` and ``settings.json``. A run that is started again with
-    the same settings goes on where it stopped.
+    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging), ``last.pt`` (the
+    whole state of the run), ``curve.csv``, ``curve.html`` and ``settings.json``. A run that is started again with the
+    same settings continues from ``last.pt``.
 
     Args:
         settings: Network, data and schedule.
@@ -61,22 +63,24 @@ def train(
         data_cache: Folder of images at the network's size; None means ``output / "data"``.
         device: ``cpu`` or ``cuda:N``.
         threads: Threads torch may use.
-        resume: False starts anew.
-        progress: Told after each prepared image, step and evaluation.
+        resume: False starts a new run.
+        progress: Called after each prepared image, step and evaluation.
 
     Raises:
         SegmentationError: The data or the initial weights do not fit, or `output` holds a run with other settings.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     config = network_config(settings)
     output.mkdir(parents=True, exist_ok=True)
-    fresh = _check_settings(settings, output, resume)
-    sets, validation = _open_data(settings, config, data_cache or output / "data", tell)
+    if resume:
+        _check_settings(settings, output / "settings.json")
+    write_atomic(output / "settings.json", settings.model_dump_json(indent=2) + "\n")
+    sets, validation = _open_data(settings, config, data_cache or output / "data", report)
     with torch_threads(threads):
         run = TrainingRun(settings, config, output, device)
-        if not fresh and (output / "last.pt").is_file():
+        if resume and (output / "last.pt").is_file():
             run.restore()
-        return run.go(sets, validation, tell)
+        return run.run(sets, validation, report)
 
 
 def network_config(settings: TrainSettings) -> NetworkConfig:
@@ -86,10 +90,10 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
         SegmentationError: A class name is unknown or named twice.
     """
     names: list[str] = []
-    for part in (part.strip() for part in settings.classes.split(",")):
-        names.extend(PRESETS.get(part, (part,)))
+    for part in settings.classes.split(","):
+        names.extend(PRESETS.get(part.strip(), (part.strip(),)))
     unknown = [name for name in names if name not in COCO_NAMES]
-    if unknown or len(set(names)) != len(names) or not names:
+    if unknown or len(set(names)) != len(names):
         reason = f"'{unknown[0]}' is no COCO class" if unknown else "one is named twice"
         raise SegmentationError(f"the classes '{settings.classes}' cannot be learned: {reason}")
     if settings.network == "embedded":
@@ -105,34 +109,26 @@ def input_size(config: NetworkConfig) -> tuple[int, int]:
     return config.min_side, round(config.min_side * 4 / 3)
 
 
-def _check_settings(settings: TrainSettings, output: Path, resume: bool) -> bool:
-    """Write down the settings of a new run; True if this is one."""
-    path = output / "settings.json"
-    if resume and path.is_file():
-        before = read_json(path, kind=SegmentationError)
-        if not isinstance(before, dict):
-            raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
-        now = json.loads(settings.model_dump_json())
-        changed = sorted(key for key in now if before.get(key) != now[key] and key not in ("iterations", "patience"))
-        if changed:
-            values = f"{before.get(changed[0])!r}, now {now[changed[0]]!r}"
+def _check_settings(settings: TrainSettings, path: Path) -> None:
+    """Raise where the folder's run has other settings than its length."""
+    before = read_json(path, kind=SegmentationError) if path.is_file() else {}
+    if not isinstance(before, dict):
+        raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
+    for key, value in json.loads(settings.model_dump_json()).items():
+        if before.get(key, value) != value and key not in ("iterations", "patience"):
             raise SegmentationError(
-                f"{output} holds a training run with another {changed[0]}: {values}",
+                f"{path.parent} holds a training run with another {key}: {before[key]!r}, now {value!r}",
                 "name another folder, or do not resume",
             )
-        write_atomic(path, settings.model_dump_json(indent=2) + "\n")
-        return False
-    write_atomic(path, settings.model_dump_json(indent=2) + "\n")
-    return True
 
 
 def _open_data(
-    settings: TrainSettings, config: NetworkConfig, cache: Path, tell: Callable[[TrainProgress], None]
+    settings: TrainSettings, config: NetworkConfig, cache: Path, report: Callable[[TrainProgress], None]
 ) -> tuple[list[PreparedImages], PreparedImages]:
     height, width = input_size(config)
 
     def prepared(done: int, total: int) -> None:
-        tell(TrainProgress("data", done, total, {}))
+        report(TrainProgress("data", done, total, {}))
 
     def load(text: str) -> PreparedImages:
         return PreparedImages(prepare(open_labelled(text), cache, height, width, prepared), config.classes)
@@ -140,60 +136,52 @@ def _open_data(
     return [load(text) for text in settings.data], load(settings.validation)
 
 
-# The state of a training run: network, average, optimiser, scores; a step, and what is needed to go on.
-
-LOSSES = ("objectness", "anchor", "class", "box", "mask")
-
-
 class TrainingRun:
-    """The state of a training run."""
+    """The state of a training run: network, averaged weights, optimiser and scores.
+
+    Args:
+        settings: Network, data and schedule.
+        config: The network's shape.
+        output: Folder of the run.
+        device: ``cpu`` or ``cuda:N``.
+    """
 
     def __init__(self, settings: TrainSettings, config: NetworkConfig, output: Path, device: str) -> None:
         torch.manual_seed(settings.seed)
-        self.settings = settings
-        self.output = output
-        self.device = device
+        self.settings, self.output, self.device = settings, output, device
         self.network = MaskRCNN(config)
         if settings.init:
             _initialise(self.network, Path(settings.init))
         self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval()
-        decay: list[nn.Parameter] = []
-        plain: list[nn.Parameter] = []
-        for parameter in self.network.parameters():
-            (decay if parameter.dim() > 1 else plain).append(parameter)
-        groups: list[dict[str, Any]] = [{"params": decay}, {"params": plain, "weight_decay": 0.0}]
-        rate, weight_decay = settings.learning_rate, settings.weight_decay
-        self.optimiser = torch.optim.AdamW(groups, lr=rate, weight_decay=weight_decay)
+        parameters = list(self.network.parameters())
+        groups: list[dict[str, Any]] = [
+            {"params": [parameter for parameter in parameters if parameter.dim() > 1]},
+            {"params": [parameter for parameter in parameters if parameter.dim() <= 1], "weight_decay": 0.0},
+        ]
+        self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
         self.step = 0
         self.rows: list[dict[str, float]] = []
         self.best = {"iou": -1.0, "step": 0.0}
         self.recent: dict[str, list[float]] = {name: [] for name in LOSSES}
 
-    def go(
-        self, sets: list[PreparedImages], validation: PreparedImages, tell: Callable[[TrainProgress], None]
+    def run(
+        self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], None]
     ) -> TrainResult:
-        """Learn until the last step, or until validation gains nothing any more."""
-        settings = self.settings
-        total = sum(len(one) for one in sets)
-        if not total or not len(validation):
+        """Learn until the last step, or until the validation score stops improving."""
+        settings, total = self.settings, self.settings.iterations
+        if not sum(map(len, sets)) or not len(validation):
             raise SegmentationError("there are no images to learn from or to validate on")
         stopped = "finished"
-        while self.step < settings.iterations:
+        while self.step < total:
             losses = self._learn(batch_of(sets, settings, self.step))
             self.step += 1
             for name, value in losses.items():
                 self.recent[name].append(value)
-            tell(TrainProgress("train", self.step, settings.iterations, losses))
-            evaluate = self.step % settings.evaluate_every == 0 or self.step == settings.iterations
+            report(TrainProgress("train", self.step, total, losses))
+            evaluate = self.step % settings.evaluate_every == 0 or self.step == total
             if evaluate:
-                row = {"step": float(self.step)}
-                row.update({name: float(np.mean(values)) for name, values in self.recent.items() if values})
-                row["loss"] = sum(row[name] for name in LOSSES if name in row)
-                row.update(validate(self.average, validation, self.device))
-                self._record(row)
-                self.recent = {name: [] for name in LOSSES}
-                tell(TrainProgress("validation", self.step, settings.iterations, row))
+                report(TrainProgress("validation", self.step, total, self._evaluate(validation)))
             if evaluate or self.step % settings.checkpoint_every == 0:
                 self.save()
             waited = (self.step - self.best["step"]) / settings.evaluate_every
@@ -205,15 +193,18 @@ class TrainingRun:
     def _learn(self, batch: list[Example]) -> dict[str, float]:
         settings = self.settings
         self.network.train()
-        _freeze_statistics(self.network, self.step, settings)
-        rate = _rate(self.step, settings)
+        if self.step >= 0.8 * settings.iterations:  # the weights settle to fixed batch statistics
+            for module in self.network.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.eval()
         for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        images = torch.from_numpy(np.stack([one.rgb for one in batch])).to(self.device)
+            group["lr"] = _rate(self.step, settings)
+        images = torch.from_numpy(np.stack([example.rgb for example in batch])).to(self.device)
         images = images.permute(0, 3, 1, 2).float() / 255
-        boxes = [torch.from_numpy(one.boxes).to(self.device) for one in batch]
-        labels = [torch.from_numpy(one.labels).to(self.device) for one in batch]
-        masks = [torch.from_numpy(one.masks).to(self.device) for one in batch]
+        boxes, labels, masks = (
+            [torch.from_numpy(getattr(example, name)).to(self.device) for example in batch]
+            for name in ("boxes", "labels", "masks")
+        )
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
         with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=settings.precision == "bfloat16"):
             losses = self.network.losses(images, boxes, labels, masks, generator, settings.proposals)
@@ -231,41 +222,48 @@ class TrainingRun:
     @torch.no_grad()
     def _update_average(self) -> None:
         decay = min(self.settings.average, (self.step + 1) / (self.step + 10))
-        own = self.network.state_dict()
+        weights = self.network.state_dict()
         for key, value in self.average.state_dict().items():
             if value.is_floating_point():
-                value.lerp_(own[key], 1 - decay)
+                value.lerp_(weights[key], 1 - decay)
             else:
-                value.copy_(own[key])
+                value.copy_(weights[key])
 
-    def _record(self, row: dict[str, float]) -> None:
+    def _evaluate(self, validation: PreparedImages) -> dict[str, float]:
+        """Score the averaged weights, keep them if they are the best, and write the learning curve."""
+        row = {"step": float(self.step)}
+        row.update({name: float(np.mean(values)) for name, values in self.recent.items() if values})
+        row["loss"] = sum(row[name] for name in LOSSES if name in row)
+        row.update(validate(self.average, validation, self.device))
+        self.recent = {name: [] for name in LOSSES}
         self.rows.append(row)
         if row["iou"] > self.best["iou"]:
             self.best = {"iou": row["iou"], "step": float(self.step)}
             save_network(self.average, self.output / "best.pt")
             save_network(self.average, self.output / "best-half.pt", half=True)
-        write_csv(self.rows, self.output / "csv")
+        table = pd.DataFrame(self.rows)
+        write_atomic(self.output / "curve.csv", table.to_csv(index=False, float_format="%.6g"))
         title = f"{self.settings.network}, {'CFPN' if self.settings.cfpn else 'FPN'}: losses and validation scores"
-        drawn, scores = ("loss", *LOSSES), ("iou", "pixel_iou", "recall")
-        draw(self.rows, self.output / "png", title=title, losses=drawn, scores=scores)
+        draw_curve(table, self.output / "curve.html", title)
+        return row
 
     def save(self) -> None:
-        """Write everything needed to go on."""
+        """Write the whole state of the run to ``last.pt``."""
         content = {
             "format": "dynslam-bench/training/1",
             "step": self.step,
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "rows": json.dumps(self.rows),
-            "best": json.dumps(self.best),
-            "recent": json.dumps(self.recent),
+            "rows": self.rows,
+            "best": self.best,
+            "recent": self.recent,
         }
         with replacing(self.output / "last.pt") as temporary, temporary.open("wb") as file:
             torch.save(content, file)
 
     def restore(self) -> None:
-        """Go on from ``last.pt``.
+        """Continue from ``last.pt``.
 
         Raises:
             SegmentationError: The file does not fit.
@@ -275,11 +273,29 @@ class TrainingRun:
             self.network.load_state_dict(content["network"])
             self.average.load_state_dict(content["average"])
             self.optimiser.load_state_dict(content["optimiser"])
-            self.step, self.rows = int(content["step"]), json.loads(content["rows"])
-            self.best, self.recent = json.loads(content["best"]), json.loads(content["recent"])
+            self.step, self.rows = int(content["step"]), list(content["rows"])
+            self.best, self.recent = dict(content["best"]), dict(content["recent"])
         except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise SegmentationError(f"{self.output / 'last.pt'} does not fit these settings: {reason}") from error
+
+
+def draw_curve(table: pd.DataFrame, path: Path, title: str) -> None:
+    """Draw losses (log scale) and scores over the step as a page.
+
+    Args:
+        table: Columns ``step`` and some of the curves.
+        path: The page; plotly's script lies beside it.
+        title: Above it.
+    """
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(cols=2, subplot_titles=("losses", "validation scores"))
+    for column, names in enumerate((("loss", *LOSSES), SCORES), start=1):
+        for name in table.columns.intersection(list(names)):
+            figure.add_scatter(x=table["step"], y=table[name], name=name, row=1, col=column)
+    figure.update_layout(title=title, yaxis_type="log", yaxis2_range=[0, 1])
+    figure.write_html(path, include_plotlyjs="directory")
 
 
 def _rate(step: int, settings: TrainSettings) -> float:
@@ -290,29 +306,14 @@ def _rate(step: int, settings: TrainSettings) -> float:
     return settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(share, 1.0))))
 
 
-def _freeze_statistics(network: MaskRCNN, step: int, settings: TrainSettings) -> None:
-    """Keep batch statistics fixed in the last fifth of the run, so that the weights settle to them."""
-    if step >= 0.8 * settings.iterations:
-        for module in network.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
-
-
 def _initialise(network: MaskRCNN, path: Path) -> None:
     """Start from a checkpoint; heads whose class count differs keep their random start."""
-    state: dict[str, Tensor] = canonical_names(split(read_checkpoint(path), str(path))[0])
-    own = network.state_dict()
+    state = canonical_names(split(read_checkpoint(path), str(path))[0])
     per_class = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.")
-    for key in [
-        key for key in state if key.startswith(per_class) and key in own and state[key].shape != own[key].shape
-    ]:
-        state[key] = own[key]
+    for key, value in network.state_dict().items():
+        if key.startswith(per_class) and key in state and state[key].shape != value.shape:
+            state[key] = value
     load_strictly(network, state, str(path))
-
-
-# Scores of a network on prepared images, as training asks for them now and then.
-
-CONFIDENCE = 0.5
 
 
 @torch.no_grad()
@@ -330,13 +331,13 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
         example = images[index]
         height, width = example.rgb.shape[:2]
         image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255
-        found = network.detect(image, score=CONFIDENCE)
-        boxes, planes = found.boxes.cpu().numpy(), found.masks.float().cpu().numpy()
-        labels = found.labels.cpu().numpy()
+        detections = network.detect(image, score=CONFIDENCE)
+        boxes, planes = detections.boxes.cpu().numpy(), detections.masks.float().cpu().numpy()
+        labels = detections.labels.cpu().numpy()
         masks = [paste(plane, box, height, width, 0.5, exact=True) for plane, box in zip(planes, boxes, strict=True)]
         for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
-            alike = [mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]
-            best.append(max((compare_masks(mask, truth).iou or 0.0 for mask in alike), default=0.0))
+            same_class = [mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]
+            best.append(max((compare_masks(mask, truth).iou or 0.0 for mask in same_class), default=0.0))
         union = np.any(masks, axis=0) if masks else np.zeros((height, width), bool)
         counts = counts + compare_masks(union, np.asarray(example.masks.any(axis=0)))
     return {
@@ -344,80 +345,3 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
         "pixel_iou": counts.iou or 0.0,
         "recall": float(np.mean(np.array(best) >= 0.5)) if best else 0.0,
     }
-
-
-# The learning curve of a training run: a CSV file and a picture.
-
-COLOURS = ((180, 119, 31), (14, 127, 255), (44, 160, 44), (40, 39, 214), (189, 103, 148), (75, 86, 140))
-"""BGR."""
-
-
-def write_csv(rows: Sequence[Mapping[str, float]], path: Path) -> None:
-    """Write one row a step; columns are the union of the rows' keys in order of appearance."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({key: f"{value:.6g}" for key, value in row.items()})
-    write_atomic(path, text.getvalue())
-
-
-def draw(
-    rows: Sequence[Mapping[str, float]], path: Path, *, title: str, losses: Sequence[str], scores: Sequence[str]
-) -> None:
-    """Draw losses (log scale, left) and scores (0 to 1, right) over the step as a PNG.
-
-    Args:
-        rows: Each with ``step`` and some of the curves.
-        path: The picture.
-        title: Above it.
-        losses: Names of the curves of the left half.
-        scores: Names of the curves of the right half.
-    """
-    canvas = np.full((420, 1120, 3), 255, np.uint8)
-    cv2.putText(canvas, title, (20, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
-    _panel(canvas, 70, rows, losses, logarithmic=True)
-    _panel(canvas, 630, rows, scores, logarithmic=False)
-    done, data = cv2.imencode(".png", canvas)
-    if not done:
-        raise DynslamError(f"cannot encode the learning curve {path}")
-    write_atomic(path, data.tobytes())
-
-
-def _panel(
-    canvas: NDArray[np.uint8],
-    left: int,
-    rows: Sequence[Mapping[str, float]],
-    names: Sequence[str],
-    *,
-    logarithmic: bool,
-) -> None:
-    top, width, height = 50, 440, 320
-    last = max((row["step"] for row in rows), default=1.0) or 1.0
-    values = [row[name] for row in rows for name in names if name in row and row[name] > 0]
-    low, high = (np.log10([min(values), max(values)]) if values else (-1.0, 0.0)) if logarithmic else (0.0, 1.0)
-    low, high = (np.floor(low * 2) / 2, np.ceil(high * 2) / 2) if logarithmic else (low, high)
-    high = max(high, low + 0.5)
-
-    def place(step: float, value: float) -> tuple[int, int]:
-        y = np.log10(max(value, 1e-9)) if logarithmic else value
-        share = float(np.clip((y - low) / (high - low), 0, 1))
-        return left + round(width * step / last), top + height - round(height * share)
-
-    cv2.rectangle(canvas, (left, top), (left + width, top + height), (160, 160, 160), 1)
-    for k in range(5):
-        tick = low + (high - low) * k / 4
-        y = top + height - height * k // 4
-        cv2.line(canvas, (left, y), (left + width, y), (225, 225, 225), 1)
-        label = f"{10**tick:.3g}" if logarithmic else f"{tick:.2f}"
-        cv2.putText(canvas, label, (left - 58, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (60, 60, 60), 1, cv2.LINE_AA)
-        step, at = f"{last * k / 4:.0f}", (left + width * k // 4 - 12, top + height + 18)
-        cv2.putText(canvas, step, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (60, 60, 60), 1, cv2.LINE_AA)
-    for number, name in enumerate(names):
-        points = [place(row["step"], row[name]) for row in rows if name in row]
-        colour = COLOURS[number % len(COLOURS)]
-        if points:
-            cv2.polylines(canvas, [np.array(points, np.int32)], False, colour, 1, cv2.LINE_AA)
-        at = (left + 8 + 85 * number, top + height + 38)
-        cv2.putText(canvas, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""Read ``rgb.txt`` and ``depth.txt``: stamps and file names, with a count of every line that was not used."""
+"""What a folder of images holds: stamped lists of files, their pairs, and counts of all that was not used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.image_header import image_size
+from dynslam_bench.core.images import image_size
 from dynslam_bench.core.reading import MEGABYTE, read_bytes, read_lines
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.stamps import format_ns, ns_of, parse_ns, refuse_close, to_seconds
@@ -67,29 +67,20 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
         SequenceError: The file is missing or no text, a line does not have these four parts, or two stamps differ by
             less than 1 us.
     """
-    colour: dict[int | None, tuple[str, int | None, str]] = {}
-    rows = read_stamped_lines(path)
-    for number, (stamp, rest) in enumerate(rows):
+    rows: list[tuple[int | None, str]] = []
+    pairs: dict[int | None, tuple[int, str]] = {}
+    for number, (stamp, rest) in enumerate(read_stamped_lines(path), start=1):
         if len(rest) != 3:
             raise SequenceError(
-                f"entry {number + 1} of {path} has {len(rest) + 1} parts, expected 4: timestamp colour timestamp depth"
+                f"entry {number} of {path} has {len(rest) + 1} parts, expected 4: timestamp colour timestamp depth"
             )
-        colour[stamp] = (rest[0], _number(rest[1], path), rest[2])
-    good = {
-        stamp: (row[0], row[1], row[2]) for stamp, row in colour.items() if stamp is not None and row[1] is not None
-    }
-    if not good:
-        raise SequenceError(f"{path} lists no pair of images ({len(rows)} lines, {len(colour)} with a stamp)")
-    order = sorted(good)
-    counts = {
-        "bad_stamps": len(colour) - len(good),
-        "duplicate_stamps": len(rows) - len(colour),
-        "unsorted": _count_unsorted([stamp for stamp, _ in rows]),
-    }
-    first = ImageList(np.array(order, dtype=np.int64), tuple(good[stamp][0] for stamp in order), **counts)
-    refuse_close(first.stamps_ns, str(path), SequenceError, lambda stamp: _line_of(path, stamp))
-    depth_stamps = np.array([good[stamp][1] for stamp in order], dtype=np.int64)
-    return first, ImageList(depth_stamps, tuple(good[stamp][2] for stamp in order))
+        depth_stamp = _number(rest[1], path)
+        rows.append((None if depth_stamp is None else stamp, rest[0]))
+        if depth_stamp is not None:
+            pairs[stamp] = depth_stamp, rest[2]
+    colour = make_image_list(rows, described=str(path))
+    depth = [pairs[stamp] for stamp in colour.stamps_ns.tolist()]
+    return colour, ImageList(np.array([stamp for stamp, _ in depth], np.int64), tuple(file for _, file in depth))
 
 
 def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
@@ -172,20 +163,20 @@ def _number(text: str, where: object) -> int | None:
 
 def _line_of(path: Path, ns: int) -> int | None:
     """The last line of a list that begins with a stamp; None where `path` is no file."""
-    found = None
+    line_number = None
     for number, line in enumerate(read_lines(path, kind=SequenceError) if path.is_file() else (), start=1):
         parts = line.replace(",", " ").split()
         if parts and not parts[0].startswith("#") and _number(parts[0], path) == ns:
-            found = number
-    return found
+            line_number = number
+    return line_number
 
 
 def _count_unsorted(stamps: list[int | None]) -> int:
-    known = [stamp for stamp in stamps if stamp is not None]
-    return sum(later < earlier for earlier, later in pairwise(known))
+    finite = [stamp for stamp in stamps if stamp is not None]
+    return sum(later < earlier for earlier, later in pairwise(finite))
 
 
-# What a reader of recorded sequences finds in a folder; all readers give this, one class makes a sequence of it.
+# The result of every reader, from which `RecordedSequence` is made.
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +206,7 @@ class Contents:
     furthest_m: float | None = None
 
 
-# What was dropped on the way from list files to frames, and why.
+# Entries of list files that did not become frames, and why.
 
 
 @dataclass(frozen=True)
@@ -309,10 +300,10 @@ def find_names(folder: Path, pattern: str) -> list[str]:
     Raises:
         SequenceError: There is none.
     """
-    found = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
-    if not found or len(found) > MOST_LINES:
-        raise SequenceError(f"{folder} holds {len(found)} files {pattern}", "is it the folder of one sequence?")
-    return found
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
+    if not names or len(names) > MOST_LINES:
+        raise SequenceError(f"{folder} holds {len(names)} files {pattern}", "is it the folder of one sequence?")
+    return names
 
 
 def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageList:

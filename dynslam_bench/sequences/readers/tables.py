@@ -1,4 +1,4 @@
-"""Numbers of calibration files in YAML, OpenCV's dialect (``%YAML:1.0``, ``!!opencv-matrix``) included."""
+"""Tables and calibration files of data sets: YAML with OpenCV's matrices, CSV with nanoseconds, poses of a body."""
 
 from __future__ import annotations
 
@@ -69,10 +69,10 @@ def numbers(value: object, count: int, where: str) -> list[float]:
     """
     data = value.get("data") if isinstance(value, Mapping) else value
     listed: list[object] = data if isinstance(data, list) else [data]
-    found = [float(x) for x in listed if isinstance(x, (int, float)) and _finite(x)]
-    if not len(found) == len(listed) == count:
+    values = [float(x) for x in listed if isinstance(x, (int, float)) and _finite(x)]
+    if not len(values) == len(listed) == count:
         raise SequenceError(f"{where} holds no {count} numbers")
-    return found
+    return values
 
 
 def section(value: object, key: str, where: str) -> Any:
@@ -159,7 +159,7 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def column(heading: list[str], name: str, path: Path) -> int:
-    """Where a column stands.
+    """Index of a column.
 
     Raises:
         SequenceError: There is none.
@@ -196,10 +196,10 @@ def floats(rows: list[list[str]], path: Path) -> NDArray[np.float64]:
 
 def _numbers(texts: list[str], path: Path, meaning: str) -> NDArray[np.float64]:
     try:
-        found = np.array([float(text) for text in texts])
+        values = np.array([float(text) for text in texts])
     except ValueError:
         bad = next(text for text in texts if not is_number(text))
         raise SequenceError(f"{path}: '{bad[:40]}' is not {meaning}") from None
-    if not np.isfinite(found).all():
+    if not np.isfinite(values).all():
         raise SequenceError(f"{path} holds values that are not finite")
-    return found
+    return values

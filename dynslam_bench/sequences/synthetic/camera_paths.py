@@ -27,9 +27,9 @@ EYE_HEIGHT_M = 1.35
 TILT_RAD = math.radians(10.0)
 
 
-def camera_poses(motion: str, people: str, instance: int, times: Array) -> Array:
+def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     """Camera-to-world poses ``[N, 4, 4]`` at `times` (seconds from the start)."""
-    rng = stream(instance, "synthetic", "camera", people, motion)
+    rng = stream(scene, "synthetic", "camera", people, motion)
     tempo = 0.72 if people == "sitting" and motion == "xyz" else 1.0
     t = np.asarray(times, dtype=np.float64)
     offset = np.zeros((len(t), 3))  # along the camera's rest axes: right, down, forward
@@ -103,7 +103,7 @@ def rotations(vectors: Array) -> Array:
     return np.asarray(np.eye(3) + s * hat + c * (product(hat, hat)))
 
 
-# Long ways of a hand-held camera: closed walks along way points, at walking pace, exact at any time.
+# Long paths of a hand-held camera: closed loops along way points, at walking pace, exact at any time.
 
 _STEP_M = 0.4
 """Distance of the spline's control points."""
@@ -153,17 +153,17 @@ def walk_along(corners: list[tuple[float, float]], speed: float) -> Walk:
     return Walk(np.stack([np.interp(s, reach, ends[:, k]) for k in range(2)], axis=1), float(reach[-1]) / speed)
 
 
-def walking_camera(walk: Walk, instance: int, name: str, aside_deg: float, times: Array) -> Array:
+def walking_camera(walk: Walk, scene: int, name: str, aside_deg: float, times: Array) -> Array:
     """Poses ``[N, 4, 4]`` of a camera that is carried along a walk.
 
     Args:
-        walk: The way.
-        instance: Seeds the hand's jitter and how each lap strays from the others.
+        walk: The path.
+        scene: Seeds the hand's jitter and how each lap strays from the others.
         name: Names that seed.
-        aside_deg: How far the camera looks to the left of where it goes; it looks around by 12 degrees more.
+        aside_deg: How far the camera looks to the left of its direction of motion; it looks around by 12 degrees more.
         times: Seconds from the start.
     """
-    rng = stream(instance, "synthetic", "walk", name)
+    rng = stream(scene, "synthetic", "walk", name)
     t = np.asarray(times, dtype=np.float64)
     step_s = walk.lap_s / len(walk.control)
     ahead = walk.at(t + 2.3 * step_s) - walk.at(t - 0.8 * step_s)

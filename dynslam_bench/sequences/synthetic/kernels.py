@@ -1,4 +1,4 @@
-"""What the renderer's kernels are handed."""
+"""The renderer's numba kernels: intersections of rays, tiles, shading with antialiased edges, flow and motion blur."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Intrinsics = tuple[float, float, float, float]
 """Focal lengths and principal point, pixels."""
 
 
-# Where a ray meets a primitive.
+# Intersections of rays with primitives.
 
 NEAR_M = 0.05
 """Nothing nearer than this is seen, metres."""
@@ -29,42 +29,20 @@ def hit_box(
 ) -> tuple[float, int]:
     """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side)."""
     t_in, t_out, face = -1.0e30, 1.0e30, -1
-    if abs(dx) < 1e-12:
-        if abs(ox) > hx:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dx
-        a, b = (-hx - ox) * inv, (hx - ox) * inv
-        side = 0
-        if a > b:
-            a, b, side = b, a, 1
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if abs(dy) < 1e-12:
-        if abs(oy) > hy:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dy
-        a, b = (-hy - oy) * inv, (hy - oy) * inv
-        side = 2
-        if a > b:
-            a, b, side = b, a, 3
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
-    if abs(dz) < 1e-12:
-        if abs(oz) > hz:
-            return 1e30, -1
-    else:
-        inv = 1.0 / dz
-        a, b = (-hz - oz) * inv, (hz - oz) * inv
-        side = 4
-        if a > b:
-            a, b, side = b, a, 5
-        if a > t_in:
-            t_in, face = a, side
-        t_out = min(t_out, b)
+    origin, direction, half = (ox, oy, oz), (dx, dy, dz), (hx, hy, hz)
+    for axis in range(3):
+        o, d, h = origin[axis], direction[axis], half[axis]
+        if abs(d) < 1e-12:
+            if abs(o) > h:
+                return 1e30, -1
+        else:
+            inv = 1.0 / d
+            a, b, side = (-h - o) * inv, (h - o) * inv, 2 * axis
+            if a > b:
+                a, b, side = b, a, side + 1
+            if a > t_in:
+                t_in, face = a, side
+            t_out = min(t_out, b)
     if t_in > t_out or t_in < NEAR_M or t_in >= t_max:
         return 1e30, -1
     return t_in, face
@@ -117,7 +95,23 @@ def hit_round_cone(
     return best
 
 
-# The numba kernels of the renderer: ray casting over tile bins and edge antialiasing.
+# Ray casting over tiles, and antialiasing of edges.
+
+
+@dividing_kernel
+def hit_primitive(
+    kind: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a: float, b: float, c: float,
+    t_max: float,
+) -> tuple[float, int]:  # fmt: skip
+    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
+    if kind == ROUND_CONE:
+        t = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
+        return t, 0 if t < t_max else -1
+    if kind == BOX:
+        return hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
+    t = -oz / dz
+    return t, 4 if NEAR_M < t < t_max and abs(ox + t * dx) <= a and abs(oy + t * dy) <= b else -1
+
 
 TILE = 8
 atan2 = dividing_kernel(_atan2)
@@ -195,18 +189,9 @@ def cast_geometry(
                 dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
                 ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
                 a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
-                if kind[q] == ROUND_CONE:
-                    t_hit = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                    if t_hit < t:
-                        t, p, face = t_hit, q, 0
-                elif kind[q] == BOX:
-                    t_hit, face_hit = hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                    if face_hit >= 0:
-                        t, p, face = t_hit, q, face_hit
-                else:
-                    t_hit = -oz / dz
-                    if NEAR_M < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
-                        t, p, face = t_hit, q, 4
+                t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                if face_hit >= 0:
+                    t, p, face = t_hit, q, face_hit
             last = p
             hit[row, column] = 8 * p + face if p >= 0 else -1
             depth[row, column] = t if p >= 0 else 0.0
@@ -248,7 +233,7 @@ def shade_pixels(
             # Sample -1 is the pixel centre, which the first pass has traced.
             for sample in range(-1, samples if edge else 0):
                 x, y = (column - cx) / fx, (row - cy) / fy
-                seen, t, p, face = key, depth[row, column], centre, key & 7
+                surface, t, p, face = key, depth[row, column], centre, key & 7
                 if sample >= 0:
                     x, y = (column + jitter[sample, 0] - cx) / fx, (row + jitter[sample, 1] - cy) / fy
                     t, p, face = 1e30, -1, 0
@@ -265,28 +250,19 @@ def shade_pixels(
                         dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
                         ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
                         a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
-                        if kind[q] == ROUND_CONE:
-                            t_hit = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                            if t_hit < t:
-                                t, p, face = t_hit, q, 0
-                        elif kind[q] == BOX:
-                            t_hit, face_hit = hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t)
-                            if face_hit >= 0:
-                                t, p, face = t_hit, q, face_hit
-                        else:
-                            t_hit = -oz / dz
-                            if NEAR_M < t_hit < t and abs(ox + t_hit * dx) <= a and abs(oy + t_hit * dy) <= b:
-                                t, p, face = t_hit, q, 4
-                    seen = 8 * p + face if p >= 0 else -1
-                    if seen == key:
+                        t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                        if face_hit >= 0:
+                            t, p, face = t_hit, q, face_hit
+                    surface = 8 * p + face if p >= 0 else -1
+                    if surface == key:
                         red, green, blue = red + own_red, green + own_green, blue + own_blue
                         continue
-                if seen == last:
+                if surface == last:
                     red, green, blue = red + new_red, green + new_green, blue + new_blue
                     continue
-                last = seen
+                last = surface
                 new_red, new_green, new_blue, cos = 0.0, 0.0, 0.0, 0.0
-                if seen >= 0:
+                if surface >= 0:
                     su, sv = uv[p, face, 0], uv[p, face, 1]
                     u, v = uv[p, face, 2], uv[p, face, 3]
                     lx = local[p, 3] + t * (local[p, 0] * x + local[p, 1] * y + local[p, 2])
@@ -371,7 +347,7 @@ def shade_pixels(
             cosine[row, column] = own_cos
 
 
-# The numba kernels of motion in the image: exact flow, and blur along it. As in `raycast`, rows are independent.
+# Motion in the image: exact flow, and blur along it. Rows are independent.
 
 MOST_TAPS = 16
 """Samples of the longest blur."""

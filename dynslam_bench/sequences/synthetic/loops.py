@@ -1,4 +1,4 @@
-"""Long ways that come back: a room circled (20 m), a ring of corridors (60 m), six rooms along a corridor (120 m).
+"""Long paths that return: a room circled (20 m), a ring of corridors (60 m), six rooms along a corridor (120 m).
 
 `moved`: chairs and cartons stand elsewhere whenever the camera comes by again; each is moved while the camera is half a
 lap away, at a sixth of it. `repeated`: every stretch of wall is the same, down to its textures.
@@ -27,7 +27,7 @@ from dynslam_bench.sequences.synthetic.camera_paths import (
 )
 from dynslam_bench.sequences.synthetic.parts import BOX, Parts, turn
 from dynslam_bench.sequences.synthetic.people import Posture, draw_person
-from dynslam_bench.sequences.synthetic.replicas import Family, build_twin, window_of
+from dynslam_bench.sequences.synthetic.replicas import Family, build_replica, window_of
 from dynslam_bench.sequences.synthetic.rooms import (
     Point,
     add_floor,
@@ -52,7 +52,7 @@ _ASIDE = {"room": -32.0, "corridor": -14.0, "rooms": 0.0}
 class _Building:
     """What is built so far; every stretch of wall and every loose piece has its number."""
 
-    instance: int
+    scene: int
     repeated: bool
     parts: Parts = field(default_factory=Parts)
     loose: list[tuple[str, Parts, float, Point]] = field(default_factory=list)
@@ -61,25 +61,25 @@ class _Building:
     def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
         """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
         number = alike if self.repeated else self.bays
-        self.parts.extend(make(self.instance, number), yaw, (*at, 0.0), f"/{number}")
+        self.parts.extend(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
         self.bays += 1
 
     def piece(self, kind: str, yaw: float, at: Point) -> None:
         """Put a piece that may be moved on the floor."""
         number = 0 if self.repeated else len(self.loose)
         make = office_chair if kind == "chair" else cartons
-        plain, named = make(self.instance, number, len(self.loose) + 1), Parts()
+        plain, named = make(self.scene, number, len(self.loose) + 1), Parts()
         named.extend(plain, suffix=f"/{number}")
         self.loose.append((kind, named, yaw, at))
 
 
-def build_loop(variant: str, instance: int) -> World:
+def build_loop(variant: str, scene: int) -> World:
     """The building, its loose pieces, and a camera that is carried around in it."""
     shape, _, change = variant.partition("_")
-    building = _Building(instance, change == "repeated")
+    building = _Building(scene, change == "repeated")
     walk = _SHAPES[shape](building)
     moves = _moves(building, walk, change == "moved")
-    camera = partial(walking_camera, walk, instance, shape, _ASIDE[shape])
+    camera = partial(walking_camera, walk, scene, shape, _ASIDE[shape])
     bodies = tuple(
         Body(k + 1, "chair" if kind == "chair" else "box", parts, move)
         for k, ((kind, parts, _, _), move) in enumerate(zip(building.loose, moves, strict=True))
@@ -88,15 +88,15 @@ def build_loop(variant: str, instance: int) -> World:
 
 
 def _moves(building: _Building, walk: Walk, moved: bool) -> list[Callable[[float], tuple[Array, Array]]]:
-    """Where each loose piece stands, by lap."""
+    """The place of each loose piece, by lap."""
     paths: list[Callable[[float], tuple[Array, Array]]] = []
     for number, (_, _, yaw, at) in enumerate(building.loose):
-        rng = stream(building.instance, "synthetic", "moved", number)
+        rng = stream(building.scene, "synthetic", "moved", number)
         places = [(turn(yaw), np.array([*at, 0.0]))]
         for _ in range(2):
-            angle = np.radians(pick(rng, building.instance, 0.0, 360.0))
-            away = pick(rng, building.instance, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
-            places.append((turn(yaw + pick(rng, building.instance, 40.0, 320.0)), np.array([*at, 0.0]) + away))
+            angle = np.radians(pick(rng, building.scene, 0.0, 360.0))
+            away = pick(rng, building.scene, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
+            places.append((turn(yaw + pick(rng, building.scene, 40.0, 320.0)), np.array([*at, 0.0]) + away))
         near = walk.time_nearest(at)
         paths.append(partial(_stand, places if moved else places[:1], near, walk.lap_s))
     return paths
@@ -108,8 +108,8 @@ def _stand(places: list[tuple[Array, Array]], near_s: float, lap_s: float, time:
 
 def _room(b: _Building) -> Walk:
     """A hall with desks along its walls and a partition in the middle."""
-    rng, plan = stream(b.instance, "synthetic", "hall"), plan_room(b.instance, 0)
-    x, y = pick(rng, b.instance, 5.2, 5.5), pick(rng, b.instance, 4.2, 4.4)
+    rng, plan = stream(b.scene, "synthetic", "hall"), plan_room(b.scene, 0)
+    x, y = pick(rng, b.scene, 5.2, 5.5), pick(rng, b.scene, 4.2, 4.4)
     add_floor(b.parts, (-x, -y), (x, y), plan)
     for start, end in _around(x, y):
         add_wall(b.parts, start, end, plan)
@@ -139,19 +139,19 @@ def _around(x: float, y: float) -> list[tuple[Point, Point]]:
 
 def _corridor(b: _Building) -> Walk:
     """A ring of four corridors, 2.4 m wide, around a core."""
-    rng, plan = stream(b.instance, "synthetic", "ring"), plan_room(b.instance, 0)
-    x, y, width = pick(rng, b.instance, 9.6, 10.2), pick(rng, b.instance, 5.6, 6.0), 1.2
+    rng, plan = stream(b.scene, "synthetic", "ring"), plan_room(b.scene, 0)
+    x, y, width = pick(rng, b.scene, 9.6, 10.2), pick(rng, b.scene, 5.6, 6.0), 1.2
     add_floor(b.parts, (-x - width, -y - width), (x + width, y + width), plan)
     for sign in (1, -1):
         for start, end in _around(x + sign * width, y + sign * width):
             add_wall(b.parts, start, end, plan)
-            way = np.array(end) - start
-            length = float(norm(way))
-            yaw = float(np.degrees(atan2(way[1], way[0]))) + (0 if sign < 0 else 180)
-            inward = sign * np.array([-way[1], way[0]]) / length * 0.05
+            wall = np.array(end) - start
+            length = float(norm(wall))
+            yaw = float(np.degrees(atan2(wall[1], wall[0]))) + (0 if sign < 0 else 180)
+            inward = sign * np.array([-wall[1], wall[0]]) / length * 0.05
             count = int(length / 2.3)
             for k in range(count):
-                at = np.array(start) + way * (k + 0.5) / count + inward
+                at = np.array(start) + wall * (k + 0.5) / count + inward
                 b.bay(corridor_bay, yaw, (float(at[0]), float(at[1])), alike=b.bays % 4)
                 if k % 3 == 1:
                     out = at + inward / 0.05 * 0.35
@@ -160,9 +160,9 @@ def _corridor(b: _Building) -> Walk:
 
 
 def _rooms(b: _Building) -> Walk:
-    """A corridor with three rooms on either side; the walk goes once around in each and comes back."""
-    rng, plan = stream(b.instance, "synthetic", "floor"), plan_room(b.instance, 0)
-    wide, deep, half = pick(rng, b.instance, 6.6, 7.0), pick(rng, b.instance, 5.8, 6.2), 1.2
+    """A corridor with three rooms on either side; the path runs once around in each and returns."""
+    rng, plan = stream(b.scene, "synthetic", "floor"), plan_room(b.scene, 0)
+    wide, deep, half = pick(rng, b.scene, 6.6, 7.0), pick(rng, b.scene, 5.8, 6.2), 1.2
     ends = 1.5 * wide
     add_floor(b.parts, (-ends, -half - deep), (ends, half + deep), plan)
     for start, end in _around(ends, half + deep):
@@ -197,12 +197,12 @@ def _furnish(b: _Building, x: float, side: int, wide: float, front: float, back:
     """
     yaw = 0.0 if side > 0 else 180.0
     b.bay(office_bay, yaw, (x, side * (back - 0.05)))
-    for hand in (1, -1):
-        beside = x + hand * (wide / 2 - 0.05)
-        b.bay(corridor_bay, -90.0 * hand, (beside, side * (back - 2.6)), alike=1 if hand > 0 else 2)
-        b.bay(notices, -90.0 * hand, (beside, side * (front + 1.5)), alike=3)
-        b.bay(notices, yaw + 180.0, (x + hand * 1.75, side * (front + 0.05)), alike=4)
-        b.bay(notices, yaw, (x + hand * 1.55, side * (front - 0.05)), alike=5)
+    for end in (1, -1):
+        beside = x + end * (wide / 2 - 0.05)
+        b.bay(corridor_bay, -90.0 * end, (beside, side * (back - 2.6)), alike=1 if end > 0 else 2)
+        b.bay(notices, -90.0 * end, (beside, side * (front + 1.5)), alike=3)
+        b.bay(notices, yaw + 180.0, (x + end * 1.75, side * (front + 0.05)), alike=4)
+        b.bay(notices, yaw, (x + end * 1.55, side * (front - 0.05)), alike=5)
     b.piece("chair", yaw, (x + 0.4, side * (back - 1.55)))
     b.piece("box", yaw, (x - 0.1 * wide, side * 3.9))
 
@@ -223,21 +223,21 @@ LOOP = Family(
 # The camera follows a person around a room, as in Bonn's person tracking.
 
 
-def build_tracking(variant: str, instance: int) -> World:
+def build_tracking(variant: str, scene: int) -> World:
     """The hall of the loops, walked by a person and, two metres behind, the camera."""
-    hall, rng = build_loop("room", instance), stream(instance, "synthetic", "tracking")
+    hall, rng = build_loop("room", scene), stream(scene, "synthetic", "tracking")
     walk: Walk = hall.camera.args[0]  # type: ignore[attr-defined]  # a partial of `walking_camera`
-    lead_s = pick(rng, instance, 1.7, 2.0) / 0.45
-    person = draw_person(instance, 0)
+    lead_s = pick(rng, scene, 1.7, 2.0) / 0.45
+    person = draw_person(scene, 0)
     actor = Actor(replace(person, instance=len(hall.bodies) + 1), partial(_walking, walk, lead_s))
-    camera = partial(walking_camera, walk, instance, "tracking", 6.0)
-    return World(hall.room, camera, hall.window, hall.bodies, (actor,))
+    camera = partial(walking_camera, walk, scene, "tracking", 6.0)
+    return World(hall.static, camera, hall.window, hall.bodies, (actor,))
 
 
 def _walking(walk: Walk, lead_s: float, time: float) -> Posture:
     place, ahead = walk.at(np.array([time + lead_s, time + lead_s + 0.3]))
-    way = ahead - place
-    facing = math.degrees(atan2(way[1], way[0])) - 90.0
+    direction = ahead - place
+    facing = math.degrees(atan2(direction[1], direction[0])) - 90.0
     stride = 0.45 * (time + lead_s) * 2 * math.pi / 1.0
     return Posture(float(place[0]), float(place[1]), facing, stride, 0.6, 0.0, 0.0, time)
 
@@ -259,32 +259,32 @@ SWINGS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 """Amplitudes of each variant: right, down, forward in metres; pitch, yaw, roll in radians."""
 
 
-def build_fast(variant: str, instance: int) -> World:
-    """The office, with nobody or the walking people, or the hall of the loops."""
-    camera = partial(fast_camera, variant, instance)
+def build_fast(variant: str, scene: int) -> World:
+    """The office, without people or with the walking ones, or the hall of the loops."""
+    camera = partial(fast_camera, variant, scene)
     if variant == "walking":
-        twin = build_twin("walking", "xyz", instance)
-        return World(twin.room, camera, twin.window, twin.bodies, twin.actors, OPTICS)
+        office = build_replica("walking", "xyz", scene)
+        return World(office.static, camera, office.window, office.bodies, office.actors, OPTICS)
     if variant == "spin":
-        hall = build_loop("room", instance)
-        return World(hall.room, camera, hall.window, hall.bodies, optics=OPTICS)
-    plan = plan_room(instance)
-    return World(build_room(instance, plan), camera, window_of(plan), optics=OPTICS)
+        hall = build_loop("room", scene)
+        return World(hall.static, camera, hall.window, hall.bodies, optics=OPTICS)
+    plan = plan_room(scene)
+    return World(build_room(scene, plan), camera, window_of(plan), optics=OPTICS)
 
 
-def fast_camera(variant: str, instance: int, times: Array) -> Array:
+def fast_camera(variant: str, scene: int, times: Array) -> Array:
     """Poses ``[N, 4, 4]``: sines of several frequencies along and about all axes; `spin` also turns round and round."""
-    rng, t = stream(instance, "synthetic", "camera", "fast", variant), np.asarray(times, dtype=np.float64)
+    rng, t = stream(scene, "synthetic", "camera", "fast", variant), np.asarray(times, dtype=np.float64)
     shifts, turns = SWINGS[variant]
     offset, angles = hand(rng, t, 0.006, 3), hand(rng, t, math.radians(0.8), 3)
     for amplitudes, values in ((shifts, offset), (turns, angles)):
         for axis, amplitude in enumerate(amplitudes):
-            main, second = pick(rng, instance, 0.45, 0.7), pick(rng, instance, 0.8, 1.1)
+            main, second = pick(rng, scene, 0.45, 0.7), pick(rng, scene, 0.8, 1.1)
             values[:, axis] += 0.75 * amplitude * sin(2 * math.pi * (main * t + rng.random()))
             values[:, axis] += 0.4 * amplitude * sin(2 * math.pi * (second * t + rng.random()))
     yaw, place = np.zeros((len(t), 3)), np.array([0.0, 0.0, EYE_HEIGHT_M])
     if variant == "spin":
-        yaw[:, 2] = pick(rng, instance, 1.3, 1.6) * t
+        yaw[:, 2] = pick(rng, scene, 1.3, 1.6) * t
         place = np.array([2.7, 0.2, EYE_HEIGHT_M])
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     base = product(rotations(yaw), camera_axes(TILT_RAD))

@@ -35,27 +35,27 @@ from dynslam_bench.sequences.synthetic.scene import Actor, Body, World
 PERIOD_S = 20.0
 Draw = Callable[[float, float], float]
 Cast = tuple[tuple[Body, ...], tuple[Key, ...]]
-"""Bodies and, where somebody carries them, the carrier's timeline."""
+"""Bodies and, where a person carries them, the carrier's timeline."""
 
 
-def build_objects(variant: str, instance: int) -> World:
-    """The office, what moves in it, and the twins' xyz camera."""
-    plan, rng = plan_room(instance), stream(instance, "synthetic", "objects", variant)
-    room = build_room(instance, plan)
+def build_objects(variant: str, scene: int) -> World:
+    """The office, what moves in it, and the xyz camera path of TUM's replicas."""
+    plan, rng = plan_room(scene), stream(scene, "synthetic", "objects", variant)
+    room = build_room(scene, plan)
     if variant == "door":
         _add_partition(room, plan)
-    bodies, keys = _SCRIPTS[variant](partial(pick, rng, instance), instance, plan)
-    person = replace(draw_person(instance, 0), instance=9)
+    bodies, keys = _SCRIPTS[variant](partial(pick, rng, scene), scene, plan)
+    person = replace(draw_person(scene, 0), instance=9)
     actors = (Actor(person, partial(posture, keys, PERIOD_S)),) if keys else ()
-    return World(room, partial(camera_poses, "xyz", "objects", instance), window_of(plan), bodies, actors)
+    return World(room, partial(camera_poses, "xyz", "objects", scene), window_of(plan), bodies, actors)
 
 
 def _body(id: int, name: str, parts: Parts, keys: tuple[At, ...], period: float | None = PERIOD_S) -> Body:
     return Body(id, name, parts, partial(on_track, keys, period))
 
 
-def _balloon(j: Draw, instance: int, plan: Plan) -> Cast:
-    """Somebody walks to and fro and plays with a balloon in front of the camera."""
+def _balloon(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A person walks to and fro and plays with a balloon in front of the camera."""
     y, reach, high = j(0.95, 1.05), j(0.32, 0.42), j(1.45, 1.55)
     keys = [At(0.0, reach, y, high - 0.3)]
     for k in range(8):
@@ -66,7 +66,7 @@ def _balloon(j: Draw, instance: int, plan: Plan) -> Cast:
     return (_body(1, "sports ball", balloon(1, j(0.17, 0.2)), tuple(keys)),), tuple(walker)
 
 
-def _box_obstructing(j: Draw, instance: int, plan: Plan) -> Cast:
+def _box_obstructing(j: Draw, scene: int, plan: Plan) -> Cast:
     """A large carton is moved close across the view, held before it, and moved away again."""
     y, z, yaw = j(1.15, 1.25), j(1.06, 1.14), j(10, 25)
     box = printed_box(1, (j(0.34, 0.4), j(0.18, 0.24), j(0.28, 0.34)))
@@ -76,8 +76,8 @@ def _box_obstructing(j: Draw, instance: int, plan: Plan) -> Cast:
     return (_body(1, "box", box, tuple(keys)),), ()
 
 
-def _box_aside(j: Draw, instance: int, plan: Plan) -> Cast:
-    """Somebody carries a carton through the room; it never hides most of the view."""
+def _box_aside(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A person carries a carton through the room; it never hides most of the view."""
     y, z = j(1.3, 1.4), j(0.95, 1.05)
     box = printed_box(1, (j(0.21, 0.25), j(0.15, 0.19), j(0.17, 0.21)))
     times = ((0, -1.6), (1.5, -1.6), (5.5, 0.35), (7.5, 0.2), (10.0, 1.6), (12.0, 1.6), (16.0, -0.3), (18.5, -1.6),
@@ -87,12 +87,12 @@ def _box_aside(j: Draw, instance: int, plan: Plan) -> Cast:
     return (_body(1, "box", box, keys),), walker
 
 
-def _placed(j: Draw, instance: int, plan: Plan) -> Cast:
+def _placed(j: Draw, scene: int, plan: Plan) -> Cast:
     """A carton is brought and put down before the desk, where it stays."""
     return _stand(j, [(1.0, -1.7, 1.1), (3.5, -0.1, 1.0), (5.0, -0.05, 0.0)], came=True)
 
 
-def _removed(j: Draw, instance: int, plan: Plan) -> Cast:
+def _removed(j: Draw, scene: int, plan: Plan) -> Cast:
     """A carton stands before the desk and is taken away."""
     return _stand(j, [(6.0, -0.05, 0.0), (7.5, -0.1, 1.0), (10.0, -1.7, 1.1)], came=False)
 
@@ -119,8 +119,8 @@ def _stand(j: Draw, stations: list[tuple[float, float, float]], came: bool) -> C
     return (_body(1, "box", printed_box(1, half), keys, None), floor), (*first, *walker)
 
 
-def _kidnapped(j: Draw, instance: int, plan: Plan) -> Cast:
-    """A very large carton comes before the camera, fills the image while it moves, and goes."""
+def _kidnapped(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A very large carton comes before the camera, fills the image while it moves, and leaves."""
     y, z = j(1.0, 1.1), j(1.1, 1.2)
     box = printed_box(1, (j(1.15, 1.25), 0.12, j(0.8, 0.9)))
     keys = [At(0, -2.6, y, z), At(3.0, -2.6, y, z), At(5.0, -0.3, y, z), At(7.5, 0.3, y - 0.06, z + 0.05)]
@@ -129,18 +129,18 @@ def _kidnapped(j: Draw, instance: int, plan: Plan) -> Cast:
     return (_body(1, "box", box, tuple(keys)),), ()
 
 
-def _trolley(j: Draw, instance: int, plan: Plan) -> Cast:
-    """Somebody pushes a loaded trolley to and fro before the desk."""
+def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A person pushes a loaded trolley to and fro before the desk."""
     y = j(1.3, 1.4)
     stops = ((0, -2.0, 0), (1.5, -2.0, 0), (6.0, 0.15, 0), (8.0, 0.2, 6), (11.5, 2.3, 0), (12.5, 2.3, 180),
              (15.5, 0.1, 180), (16.5, 0.05, 174), (19.5, -2.0, 180), (20.0, -2.0, 360))  # fmt: skip
     keys = tuple(At(t, x, y, 0.0, yaw) for t, x, yaw in stops)
     walker = tuple(Key(k.t, k.x - 0.75 * cos(np.radians(k.yaw)), y, k.yaw - 90.0) for k in keys)
-    return (_body(1, "trolley", trolley(1, instance, plan), keys),), walker
+    return (_body(1, "trolley", trolley(1, scene, plan), keys),), walker
 
 
-def _chair(j: Draw, instance: int, plan: Plan) -> Cast:
-    """A chair with a carton on it is turned and rolled; nobody is seen."""
+def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A chair with a carton on it is turned and rolled; no person is in view."""
     x, y, turned = j(-0.2, 0.2), j(1.15, 1.25), j(150, 210)
     parts = Parts()
     add_chair(parts, 1, plan.tints["chair"], plan.tints["metal"])
@@ -156,7 +156,7 @@ _DOOR = (-0.5, 1.55, 1.0)
 """Hinge x and y, and the width of the door, metres."""
 
 
-def _door(j: Draw, instance: int, plan: Plan) -> Cast:
+def _door(j: Draw, scene: int, plan: Plan) -> Cast:
     """A door in a partition opens towards the camera and falls shut, twice in a period."""
     x, y, width = _DOOR
     wide, ajar = j(72, 80), j(20, 30)

@@ -1,4 +1,4 @@
-"""Primitives of a scene: unit shapes in a local frame, and how to collect them."""
+"""Primitives of a scene: unit shapes in a local frame, how to collect them, and paths of rigid bodies."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Parts:
             other: Whose primitives.
             yaw: Turned by this many degrees about the world's z axis, then ...
             shift: ... moved by this much, metres; None leaves them where they are.
-            suffix: Put behind the names of patterned textures, so that they are drawn anew.
+            suffix: Put behind the names of patterned textures, so that they are drawn again.
         """
         for name in ("kind", "scale", "shape", "instance", "uv", "tint"):
             getattr(self, name).extend(getattr(other, name))

@@ -64,9 +64,9 @@ class Posture:
     clock: float
 
 
-def draw_person(instance: int, index: int) -> Person:
-    """The `index`-th person (0 or 1) of an instance; the first always wears plaid, the other any pattern."""
-    rng = stream(instance, "synthetic", "person", index)
+def draw_person(scene: int, index: int) -> Person:
+    """The `index`-th person (0 or 1) of a scene; the first always wears plaid, the other any pattern."""
+    rng = stream(scene, "synthetic", "person", index)
     skins = np.array(
         [
             [1.0, 0.84, 0.74],
@@ -90,16 +90,16 @@ def draw_person(instance: int, index: int) -> Person:
     shirt = (
         ("plaid:0", "plaid:1")[index]
         if index == 0
-        else ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")[pick_one(rng, instance, list(range(6)))]
+        else ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")[pick_one(rng, scene, list(range(6)))]
     )
     return Person(
         instance=index + 1,
-        height=pick(rng, instance, 1.62, 1.88),
-        build=pick(rng, instance, 0.92, 1.12),
-        skin=skins[pick_one(rng, instance, list(range(6)))],
-        hair=hairs[pick_one(rng, instance, list(range(6)))] * (0.8 + 0.4 * rng.random()),
+        height=pick(rng, scene, 1.62, 1.88),
+        build=pick(rng, scene, 0.92, 1.12),
+        skin=skins[pick_one(rng, scene, list(range(6)))],
+        hair=hairs[pick_one(rng, scene, list(range(6)))] * (0.8 + 0.4 * rng.random()),
         trousers=np.array([[0.25, 0.32, 0.5], [0.2, 0.21, 0.25], [0.55, 0.48, 0.37], [0.32, 0.34, 0.3]])[
-            pick_one(rng, instance, list(range(4)))
+            pick_one(rng, scene, list(range(4)))
         ]
         * (0.85 + 0.3 * rng.random()),
         shoes=0.12 + 0.3 * rng.random() * np.ones(3),
@@ -384,7 +384,7 @@ class Key:
 
 @dataclass(frozen=True)
 class ChairKey:
-    """Where a chair stands at one time (facing as for people)."""
+    """The place of a chair at one time (facing as for people)."""
 
     t: float
     x: float
@@ -401,13 +401,13 @@ class Script:
     chairs: tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]
 
 
-def write_script(people: str, instance: int) -> Script:
-    """The script of an instance."""
-    rng = stream(instance, "synthetic", "script", people)
+def write_script(people: str, scene: int) -> Script:
+    """The script of a scene."""
+    rng = stream(scene, "synthetic", "script", people)
     flip = -1.0 if rng.random() < 0.5 else 1.0
 
     def j(low: float, high: float) -> float:
-        return pick(rng, instance, low, high)
+        return pick(rng, scene, low, high)
 
     script = _sitting(j) if people == "sitting" else _walking(j)
     return _mirror(script, flip)
@@ -485,7 +485,7 @@ def _walking(j: Draw) -> Script:
 
 
 def _chairs(cx: float, cy: float) -> tuple[tuple[ChairKey, ...], tuple[ChairKey, ...]]:
-    """A chair that rolls as somebody sits down on it and rises, and one that is pushed in passing."""
+    """A chair that rolls when a person sits down on it and rises, and one that is pushed in passing."""
     rest_y = cy + 0.2
     first = (
         ChairKey(0, cx, rest_y, 100),
@@ -524,7 +524,7 @@ def _ease(x: float) -> float:
 
 
 def _angle(a: float, b: float, s: float) -> float:
-    """From a to b degrees the short way round."""
+    """From a to b degrees through the smaller angle."""
     return a + s * ((b - a + 180.0) % 360.0 - 180.0)
 
 

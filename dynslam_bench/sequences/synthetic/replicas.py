@@ -1,4 +1,8 @@
-"""What announces a family of rendered sequences."""
+"""Families of rendered sequences in the office.
+
+Replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, and conditions that sensors
+dislike.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +58,8 @@ class Family:
 
     Attributes:
         name: First part of the ids.
-        variants: Second parts; the empty one stands for the name alone.
-        build: Variant and instance to the world that is filmed.
+        variants: Second parts; empty for the name alone.
+        build: Variant and scene number to the world that is filmed.
         tags: As in the catalogue: ``static``, ``low-dynamic``, ``high-dynamic``; of each variant, or of all.
         frames: Default length of each variant, or of all.
         versions: Raised whenever any pixel, pose or mask changes; of each variant, or of all.
@@ -89,23 +93,22 @@ def _of(values: Value | dict[str, Value], variant: str) -> Value:
     return values[variant] if isinstance(values, dict) else values
 
 
-# The twins of TUM's fr3 dynamic sequences: two people who walk, or sit, in an office, four motions of the camera.
+# Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.
 
 
-def build_twin(people: str, motion: str, instance: int) -> World:
+def build_replica(people: str, motion: str, scene: int) -> World:
     """The office with its two people and two chairs."""
-    plan, script = plan_room(instance), write_script(people, instance)
+    plan, script = plan_room(scene), write_script(people, scene)
     return World(
-        room=build_room(instance, plan),
-        camera=partial(camera_poses, motion, people, instance),
+        static=build_room(scene, plan),
+        camera=partial(camera_poses, motion, people, scene),
         window=window_of(plan),
         bodies=tuple(
             Body(3 + k, "chair", chair(plan, 3 + k, 1.0 if k == 0 else 0.8), partial(_roll, keys, script.period))
             for k, keys in enumerate(script.chairs)
         ),
         actors=tuple(
-            Actor(draw_person(instance, k), partial(posture, keys, script.period))
-            for k, keys in enumerate(script.people)
+            Actor(draw_person(scene, k), partial(posture, keys, script.period)) for k, keys in enumerate(script.people)
         ),
     )
 
@@ -127,41 +130,41 @@ def _roll(keys: tuple[ChairKey, ...], period: float, time: float) -> tuple[Array
     return turn(facing + 180.0), np.array([x, y, 0.0])
 
 
-WALKING = Family("walking", MOTIONS, partial(build_twin, "walking"), ("high-dynamic",), versions=0)
-SITTING = Family("sitting", MOTIONS, partial(build_twin, "sitting"), ("low-dynamic",), versions=0)
+WALKING = Family("walking", MOTIONS, partial(build_replica, "walking"), ("high-dynamic",), versions=0)
+SITTING = Family("sitting", MOTIONS, partial(build_replica, "sitting"), ("low-dynamic",), versions=0)
 
 
 # Four people who walk past each other all the time and hide most of the view.
 
 LANES_M = (1.0, 1.27, 1.54, 1.8)
-"""Distance of each person's way from the camera's plumb line: nobody walks through another."""
+"""Distance of each person's path from the camera's plumb line: no two people cross."""
 
 
-def build_crowd(motion: str, instance: int) -> World:
+def build_crowd(motion: str, scene: int) -> World:
     """The office, and people on lanes."""
-    plan = plan_room(instance)
-    actors = tuple(_walker(instance, k, lane) for k, lane in enumerate(LANES_M))
-    camera = partial(camera_poses, motion, "crowd", instance)
-    return World(build_room(instance, plan), camera, window_of(plan), actors=actors)
+    plan = plan_room(scene)
+    actors = tuple(_walker(scene, k, lane) for k, lane in enumerate(LANES_M))
+    camera = partial(camera_poses, motion, "crowd", scene)
+    return World(build_room(scene, plan), camera, window_of(plan), actors=actors)
 
 
-def _walker(instance: int, number: int, lane: float) -> Actor:
+def _walker(scene: int, number: int, lane: float) -> Actor:
     """To and fro on a lane, with a stop in the middle where the person turns to the camera and talks."""
-    rng = stream(instance, "synthetic", "crowd", number)
-    reach, pause = pick(rng, instance, 1.0, 1.45), pick(rng, instance, 0.8, 2.0)
-    stop, cross = pick(rng, instance, -0.5, 0.5), pick(rng, instance, 2.6, 3.4)
+    rng = stream(scene, "synthetic", "crowd", number)
+    reach, pause = pick(rng, scene, 1.0, 1.45), pick(rng, scene, 0.8, 2.0)
+    stop, cross = pick(rng, scene, -0.5, 0.5), pick(rng, scene, 2.6, 3.4)
     side = 1.0 if number % 2 else -1.0
     stations = [(0.0, -side * reach, side, 0.0), (cross * 0.5, side * stop, side, 0.0), (pause, side * stop, 0, 1.0)]
     stations += [(cross * 0.5, side * reach, side, 0.0), (0.7, side * reach, -side, 0.0)]
     stations += [(cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0)]
     times = itertools.accumulate(station[0] for station in stations)
     keys = tuple(
-        Key(t, x, lane, 180.0 - 90.0 * way if way else 180.0, 0, talk)
-        for t, (_, x, way, talk) in zip(times, stations, strict=True)
+        Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
+        for t, (_, x, direction, talk) in zip(times, stations, strict=True)
     )
     period = keys[-1].t
-    start = pick(rng, instance, 0.0, period)
-    person = replace(draw_person(instance, number), instance=number + 1)
+    start = pick(rng, scene, 0.0, period)
+    person = replace(draw_person(scene, number), instance=number + 1)
     return Actor(person, lambda time: replace(posture(keys, period, time + start), clock=time))
 
 
@@ -185,13 +188,13 @@ class Step:
         return np.asarray(self.reach * swing * (1.5 - 0.5 * swing * swing))
 
 
-def build_synchronous(variant: str, instance: int) -> World:
-    """The office, two people side by side, and a camera that goes with them."""
-    plan, rng = plan_room(instance), stream(instance, "synthetic", "synchronous")
-    step = Step(pick(rng, instance, 0.5, 0.6), pick(rng, instance, 4.4, 5.2), pick(rng, instance, 0.0, 1.0))
-    places = ((-pick(rng, instance, 0.3, 0.36), pick(rng, instance, 1.2, 1.3)), (pick(rng, instance, 0.28, 0.34), 1.35))
-    actors = tuple(Actor(draw_person(instance, k), partial(_stepping, step, place)) for k, place in enumerate(places))
-    return World(build_room(instance, plan), partial(_camera, step, instance), window_of(plan), actors=actors)
+def build_synchronous(variant: str, scene: int) -> World:
+    """The office, two people side by side, and a camera that moves with them."""
+    plan, rng = plan_room(scene), stream(scene, "synthetic", "synchronous")
+    step = Step(pick(rng, scene, 0.5, 0.6), pick(rng, scene, 4.4, 5.2), pick(rng, scene, 0.0, 1.0))
+    places = ((-pick(rng, scene, 0.3, 0.36), pick(rng, scene, 1.2, 1.3)), (pick(rng, scene, 0.28, 0.34), 1.35))
+    actors = tuple(Actor(draw_person(scene, k), partial(_stepping, step, place)) for k, place in enumerate(places))
+    return World(build_room(scene, plan), partial(_camera, step, scene), window_of(plan), actors=actors)
 
 
 def _stepping(step: Step, place: tuple[float, float], time: float) -> Posture:
@@ -200,8 +203,8 @@ def _stepping(step: Step, place: tuple[float, float], time: float) -> Posture:
     return Posture(place[0] + x, place[1], 180.0, 2 * x * 2 * math.pi / 1.35, 0.4 * gait, 0.0, 0.1, time)
 
 
-def _camera(step: Step, instance: int, times: Array) -> Array:
-    rng, t = stream(instance, "synthetic", "camera", "synchronous"), np.asarray(times, dtype=np.float64)
+def _camera(step: Step, scene: int, times: Array) -> Array:
+    rng, t = stream(scene, "synthetic", "camera", "synchronous"), np.asarray(times, dtype=np.float64)
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     poses[:, :3, :3] = product(camera_axes(TILT_RAD), rotations(hand(rng, t, math.radians(0.5), 3)))
     poses[:, :3, 3] = hand(rng, t, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
@@ -218,35 +221,35 @@ DARK = Optics(gain=0.13, color={"read_noise": 2.4, "shot_noise": 0.12, "shutter"
 SUNLIGHT = Optics(gain=1.25, depth={"disparity_noise_px": 0.25, "far_m": 4.0, "dark": 0.1, "edge_px": 4})
 
 
-def build_condition(alter: Callable[[World, int], World], variant: str, instance: int) -> World:
-    """The walking twin under a condition, with its own way of the camera."""
-    world = alter(build_twin("walking", "xyz", instance), instance)
-    camera = partial(camera_poses, "halfsphere", "conditions", instance)
+def build_condition(alter: Callable[[World, int], World], variant: str, scene: int) -> World:
+    """The replica of a walking sequence under a condition, with a camera path of its own."""
+    world = alter(build_replica("walking", "xyz", scene), scene)
+    camera = partial(camera_poses, "halfsphere", "conditions", scene)
     if variant == "walking":
         return replace(world, camera=camera)
     return replace(world, camera=camera, actors=(), bodies=())
 
 
-def _plain(world: World, instance: int) -> World:
+def _plain(world: World, scene: int) -> World:
     """The same things without a pattern."""
     room = Parts()
-    room.extend(world.room)
+    room.extend(world.static)
     room.texture = [tuple("plain" for _ in row) for row in room.texture]
-    return replace(world, room=room)
+    return replace(world, static=room)
 
 
-def _hall(world: World, instance: int) -> World:
+def _hall(world: World, scene: int) -> World:
     """A hall whose walls and furniture stand beyond the depth sensor's reach."""
-    plan, room, x, front, back = plan_room(instance, 0), Parts(), 7.0, -3.0, 8.6
+    plan, room, x, front, back = plan_room(scene, 0), Parts(), 7.0, -3.0, 8.6
     add_floor(room, (-x, front), (x, back), plan)
     for start, end in (((-x, front), (x, front)), ((x, front), (x, back)), ((x, back), (-x, back)),
                        ((-x, back), (-x, front))):  # fmt: skip
         add_wall(room, start, end, plan)
     for k in range(3):
-        room.extend(office_bay(instance, k), 0.0, ((k - 1) * 4.3, back - 0.05, 0.0), f"/{k}")
+        room.extend(office_bay(scene, k), 0.0, ((k - 1) * 4.3, back - 0.05, 0.0), f"/{k}")
     for k, side in enumerate((-1, 1)):
-        room.extend(office_bay(instance, 3 + k), -90.0 * side, (side * (x - 0.05), 5.0, 0.0), f"/{3 + k}")
-    return replace(world, room=room, window=(0.0, back, 2.15))
+        room.extend(office_bay(scene, 3 + k), -90.0 * side, (side * (x - 0.05), 5.0, 0.0), f"/{3 + k}")
+    return replace(world, static=room, window=(0.0, back, 2.15))
 
 
 def _seen_by(optics: Optics) -> Callable[[World, int], World]:

@@ -1,6 +1,7 @@
-"""What an instance decides about its room, drawn so that tuning and held-out instances share nothing.
+"""Rooms and furniture of a scene: plans, walls, desks, shelves, posters, chairs, and things that move.
 
-Every choice of size or place is drawn from the half of its pool that belongs to the instance's split.
+Scenes for tuning and held-out ones share no size and no place: each is drawn from the half of its pool that belongs to
+the scene's split.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Plan:
-    """What the instance decides about the room.
+    """Sizes, places and colours of the room of a scene.
 
     Attributes:
         back_y: Distance of the back wall.
@@ -44,27 +45,27 @@ class Plan:
     tints: dict[str, Array]
 
 
-def pick(rng: np.random.Generator, instance: int, low: float, high: float, steps: int = 64) -> float:
-    """A value of [low, high] from the even points of a grid for tuning instances, the odd ones for held-out ones."""
-    odd = instance in HELD_OUT_SCENES
+def pick(rng: np.random.Generator, scene: int, low: float, high: float, steps: int = 64) -> float:
+    """A value of [low, high] from the even points of a grid for tuning scenes, the odd ones for held-out ones."""
+    odd = scene in HELD_OUT_SCENES
     return low + (high - low) * (2 * int(rng.integers(steps)) + odd) / (2 * steps - 1)
 
 
-def pick_one(rng: np.random.Generator, instance: int, pool: list[int]) -> int:
+def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
     """A member of the split's half of the pool."""
-    half = pool[1::2] if instance in HELD_OUT_SCENES else pool[::2]
+    half = pool[1::2] if scene in HELD_OUT_SCENES else pool[::2]
     return half[int(rng.integers(len(half)))]
 
 
-def plan_room(instance: int, number: int | None = None) -> Plan:
-    """Draw the plan of an instance's room, or of one of its several rooms."""
-    rng = stream(instance, "synthetic", "room", *(() if number is None else (number,)))
+def plan_room(scene: int, number: int | None = None) -> Plan:
+    """Draw the plan of a scene's room, or of one of its several rooms."""
+    rng = stream(scene, "synthetic", "room", *(() if number is None else (number,)))
 
     def color(low: float, high: float, spread: float) -> Array:
-        base = pick(rng, instance, low, high)
+        base = pick(rng, scene, low, high)
         return np.clip(base + spread * (rng.random(3) - 0.5), 0.03, 1.0)
 
-    wood = pick(rng, instance, 0.55, 0.95) * np.array([1.0, 0.84, 0.66])
+    wood = pick(rng, scene, 0.55, 0.95) * np.array([1.0, 0.84, 0.66])
     tints = {
         "wall": color(0.72, 0.92, 0.08),
         "side": color(0.66, 0.9, 0.12),
@@ -79,12 +80,12 @@ def plan_room(instance: int, number: int | None = None) -> Plan:
         "bin": color(0.2, 0.6, 0.4),
     }
     return Plan(
-        back_y=pick(rng, instance, 3.35, 3.75),
-        left_x=-pick(rng, instance, 1.9, 2.4),
-        right_x=pick(rng, instance, 1.9, 2.4),
-        desk_y=pick(rng, instance, 2.0, 2.2),
-        desk_x=pick(rng, instance, -0.15, 0.15),
-        monitors=pick_one(rng, instance, [2, 3, 2, 3]),
+        back_y=pick(rng, scene, 3.35, 3.75),
+        left_x=-pick(rng, scene, 1.9, 2.4),
+        right_x=pick(rng, scene, 1.9, 2.4),
+        desk_y=pick(rng, scene, 2.0, 2.2),
+        desk_x=pick(rng, scene, -0.15, 0.15),
+        monitors=pick_one(rng, scene, [2, 3, 2, 3]),
         shelf_side=int(rng.integers(2)) * 2 - 1,
         posters=int(rng.integers(2, 5)),
         mirrored=bool(rng.integers(2)),
@@ -410,12 +411,12 @@ def add_chair(parts: Parts, instance: int, tint: Array, metal: Array) -> None:
         parts.add(BOX, eye, np.array([side * 0.27, 0.05, 0.55]), (0.015, 0.02, 0.1), instance=instance, tint=metal)
 
 
-# The room: walls, floor and ceiling, and where its furniture stands.
+# The room: walls, floor and ceiling, and the places of its furniture.
 
 
-def build_room(instance: int, plan: Plan) -> Parts:
+def build_room(scene: int, plan: Plan) -> Parts:
     """All fixed primitives."""
-    rng = stream(instance, "synthetic", "furniture")
+    rng = stream(scene, "synthetic", "furniture")
     parts, tint = Parts(), plan.tints
     height = 2.8
     back, front = plan.back_y, -2.5
@@ -505,11 +506,11 @@ def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[fl
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = math.sqrt(dx * dx + dy * dy)
-    facing, way = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
+    facing, direction = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
 
     def piece(a: float, b: float, bottom: float) -> None:
         half = ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2)
-        at = np.array([*start, 0.0]) + (a + b) / 2 * way + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
+        at = np.array([*start, 0.0]) + (a + b) / 2 * direction + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
         parts.add(BOX, facing, at, half, texture="plaster", repeat=(0.5, 0.5), tint=plan.tints["wall"])
 
     edges = [0.0] + [door + side * DOOR_M / 2 for door in sorted(doors) for side in (-1, 1)] + [length]
@@ -519,10 +520,10 @@ def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[fl
         piece(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M)
 
 
-def office_bay(instance: int, number: int) -> Parts:
+def office_bay(scene: int, number: int) -> Parts:
     """Four metres of an office's wall: desk, shelf, cabinet, posters."""
-    plan = _wall_plan(instance, number, 2.0)
-    rng, parts = stream(instance, "synthetic", "bay", number), Parts()
+    plan = _wall_plan(scene, number, 2.0)
+    rng, parts = stream(scene, "synthetic", "bay", number), Parts()
     add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=0.92)
     add_shelf(parts, rng, plan, plan.shelf_side)
     add_posters(parts, rng, plan)
@@ -530,10 +531,10 @@ def office_bay(instance: int, number: int) -> Parts:
     return parts
 
 
-def corridor_bay(instance: int, number: int) -> Parts:
+def corridor_bay(scene: int, number: int) -> Parts:
     """Two metres of a corridor's wall: posters, a shelf, a closed door or a notice board."""
-    plan = _wall_plan(instance, number, 0.7)
-    rng, parts = stream(instance, "synthetic", "bay", number), Parts()
+    plan = _wall_plan(scene, number, 0.7)
+    rng, parts = stream(scene, "synthetic", "bay", number), Parts()
     kind = number % 4
     if kind == 0:
         add_posters(parts, rng, replace(plan, left_x=-1.5, right_x=1.5))
@@ -548,9 +549,9 @@ def corridor_bay(instance: int, number: int) -> Parts:
     return parts
 
 
-def notices(instance: int, number: int) -> Parts:
+def notices(scene: int, number: int) -> Parts:
     """Nearly two metres of wall with four sheets on it at different heights."""
-    rng, parts = stream(instance, "synthetic", "notices", number), Parts()
+    rng, parts = stream(scene, "synthetic", "notices", number), Parts()
     for k in range(4):
         half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
         at = np.array([-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random()])
@@ -566,23 +567,23 @@ def _add_closed_door(parts: Parts, plan: Plan) -> None:
     parts.add(BOX, eye, np.array([0.0, -0.062, 1.5]), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,))
 
 
-def _wall_plan(instance: int, number: int, half: float) -> Plan:
+def _wall_plan(scene: int, number: int, half: float) -> Plan:
     """The plan of a stretch of wall about its own origin."""
     return replace(
-        plan_room(instance, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0
+        plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0
     )  # fmt: skip
 
 
-def office_chair(instance: int, number: int, id: int) -> Parts:
+def office_chair(scene: int, number: int, id: int) -> Parts:
     """An office chair about its own origin on the floor."""
-    parts, tints = Parts(), plan_room(instance, number).tints
+    parts, tints = Parts(), plan_room(scene, number).tints
     add_chair(parts, id, tints["chair"], tints["metal"])
     return parts
 
 
-def cartons(instance: int, number: int, id: int) -> Parts:
+def cartons(scene: int, number: int, id: int) -> Parts:
     """Two printed cartons on each other."""
-    parts, rng = Parts(), stream(instance, "synthetic", "cartons", number)
+    parts, rng = Parts(), stream(scene, "synthetic", "cartons", number)
     bottom = 0.0
     for k in range(2):
         half = (0.19 + 0.08 * rng.random(), 0.16 + 0.06 * rng.random(), 0.14 + 0.05 * rng.random())
@@ -617,9 +618,9 @@ def balloon(id: int, radius: float) -> Parts:
     return parts
 
 
-def trolley(id: int, instance: int, plan: Plan) -> Parts:
+def trolley(id: int, scene: int, plan: Plan) -> Parts:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
-    parts, eye, rng = Parts(), np.eye(3), stream(instance, "synthetic", "trolley")
+    parts, eye, rng = Parts(), np.eye(3), stream(scene, "synthetic", "trolley")
     parts.add(BOX, eye, np.array([0, 0, 0.16]), (0.45, 0.3, 0.02), instance=id, tint=plan.tints["metal"])
     for x in (-0.38, 0.38):
         for y in (-0.24, 0.24):

@@ -1,4 +1,7 @@
-"""What an instance of a family films, as data: a room, rigid bodies on paths, people, a camera, two sensors."""
+"""What a scene of a family films: static parts, rigid bodies on paths, people, a camera, two sensors.
+
+`World` is the description, `Scene` its primitives at any time and their motion between two times.
+"""
 
 from __future__ import annotations
 
@@ -69,10 +72,10 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Everything that an instance of a family decides.
+    """Everything that a scene of a family decides.
 
     Attributes:
-        room: What never moves.
+        static: What never moves.
         camera: Times ``[N]`` in seconds to camera-to-world poses ``[N, 4, 4]``.
         window: Where the glare of `RenderSettings` comes from, world coordinates in metres.
         bodies: Rigid things.
@@ -80,7 +83,7 @@ class World:
         optics: The sensors.
     """
 
-    room: Parts
+    static: Parts
     camera: Callable[[Array], Array]
     window: tuple[float, float, float]
     bodies: tuple[Body, ...] = ()
@@ -131,38 +134,38 @@ class Scene:
 
     Args:
         world: What is filmed.
-        instance: Seed of the textures.
+        scene: Number of the scene, the seed of the textures.
         settings: Renderer settings; only `people` matters here.
     """
 
-    def __init__(self, world: World, instance: int, settings: RenderSettings) -> None:
+    def __init__(self, world: World, scene: int, settings: RenderSettings) -> None:
         self.world = world
-        self.seed = instance
+        self.seed = scene
         self.mode = settings.people
         self.actors = () if self.mode == "none" else world.actors
-        room = Parts()
-        room.extend(world.room)
+        parts = Parts()
+        parts.extend(world.static)
         self._bodies = [(np.stack(body.parts.rotation), np.stack(body.parts.origin)) for body in world.bodies]
         for body in world.bodies:
-            room.extend(body.parts)
-        self.fixed = len(world.room)
+            parts.extend(body.parts)
+        self.fixed = len(world.static)
         for actor in self.actors:
-            add_person(room, actor.person, actor.posture(0.0))
-        self.kind = np.array(room.kind, np.int32)
-        self.scale, self.shape = np.stack(room.scale), np.stack(room.shape)
-        self.instance = np.array(room.instance, np.int32)
-        self.uv, self.tint = np.stack(room.uv), np.stack(room.tint)
-        self._fixed_rotation = np.stack(room.rotation[: self.fixed])
-        self._fixed_origin = np.stack(room.origin[: self.fixed])
-        names = sorted({name for row in room.texture for name in row})
+            add_person(parts, actor.person, actor.posture(0.0))
+        self.kind = np.array(parts.kind, np.int32)
+        self.scale, self.shape = np.stack(parts.scale), np.stack(parts.shape)
+        self.instance = np.array(parts.instance, np.int32)
+        self.uv, self.tint = np.stack(parts.uv), np.stack(parts.tint)
+        self._fixed_rotation = np.stack(parts.rotation[: self.fixed])
+        self._fixed_origin = np.stack(parts.origin[: self.fixed])
+        names = sorted({name for row in parts.texture for name in row})
         index = {name: i for i, name in enumerate(names)}
-        self.texture = np.array([[index[name] for name in row] for row in room.texture], np.int32)
+        self.texture = np.array([[index[name] for name in row] for row in parts.texture], np.int32)
         self.texture_names = names
         self.corners = self._corners()
         self._placed = lru_cache(maxsize=8)(self._place)
 
-    def atlas(self) -> textures.Atlas:
-        """The instance's textures."""
+    def atlas(self) -> textures.TextureAtlas:
+        """The scene's textures."""
         images = {}
         for name in self.texture_names:
             maker = textures.MAKERS[name.partition(":")[0]]

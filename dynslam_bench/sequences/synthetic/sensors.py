@@ -154,17 +154,17 @@ def dim(
 
 @dividing_kernel
 def expose(
-    row0: int, row1: int, seed: Scalar, color: Reals, gains: Reals, offset: Reals, read_noise: float, shot_noise: float,
+    row0: int, row1: int, seed: Scalar, color: Reals, gain: Reals, read_noise: float, shot_noise: float,
     out: Ints,
 ) -> None:  # fmt: skip
-    """8-bit colours of rows: gain of each row and channel, shot and read noise, rounding, clipping."""
+    """8-bit colours of rows: gain of each row, shot and read noise, rounding, clipping."""
     width = color.shape[1]
     for row in range(row0, row1):
         for u in range(width):
             h = _hash(seed, row * width + u)
             common = _normal(h)
             for ch in range(3):
-                value = color[row, u, ch] * gains[row, ch] + offset[row, ch]
+                value = color[row, u, ch] * gain[row]
                 sigma = math.sqrt(read_noise * read_noise + shot_noise * max(value, 0.0))
                 value += sigma * (0.75 * common + 0.66 * _normal(_hash(h, ch + 7)))
                 out[row, u, ch] = np.uint8(min(max(value, 0.0), 255.0) + 0.5) if value < 254.5 else np.uint8(255)

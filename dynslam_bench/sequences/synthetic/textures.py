@@ -15,23 +15,21 @@ Image = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Atlas:
+class TextureAtlas:
     """All textures and their mip levels as one array.
 
     Attributes:
         texels: uint8, four bytes a texel (the last unused), level after level, texture after texture.
         level_offset: int64 ``[T, L]`` offset of each level's first byte.
         log2_size: int32 ``[T]`` base-2 logarithm of each texture's edge.
-        names: Index of each texture by its name.
     """
 
     texels: NDArray[np.uint8]
     level_offset: NDArray[np.int64]
     log2_size: NDArray[np.int32]
-    names: dict[str, int]
 
 
-def build_atlas(textures: dict[str, Image]) -> Atlas:
+def build_atlas(textures: dict[str, Image]) -> TextureAtlas:
     """Pack textures; each is halved by 2x2 means down to one texel."""
     levels = 12
     offsets = np.zeros((len(textures), levels), np.int64)
@@ -52,7 +50,7 @@ def build_atlas(textures: dict[str, Image]) -> Atlas:
                 offsets[index, level:] = offsets[index, level]
                 break
             current = 0.25 * (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2])
-    return Atlas(np.concatenate(parts), offsets, log2, {name: i for i, name in enumerate(textures)})
+    return TextureAtlas(np.concatenate(parts), offsets, log2)
 
 
 def smooth_noise(rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None) -> NDArray[np.float64]:

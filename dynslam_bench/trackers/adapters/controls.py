@@ -1,4 +1,4 @@
-"""The control row that claims the camera stands still."""
+"""Controls, which measure little or nothing of the images, and the replay of a trajectory file."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
 
+MAX_CORNERS = 400
+MIN_INLIERS = 12
+REPROJECTION_PX = 2.0
+
 
 class NeverMove:
-    """Gives the identity pose on every frame, whatever it shows.
+    """The static-camera baseline: the identity pose on every frame.
 
-    Its error is the spread of the ground truth: a tracker that does not beat it has learned nothing from the images.
+    Its error is the spread of the ground truth: a tracker that is not better gains nothing from the images.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -36,21 +40,13 @@ class NeverMove:
         return TrackResult(T_world_cam=np.eye(4), state="ok")
 
 
-# The control row that measures the camera's velocity once and then only extrapolates it.
-
-CORNERS = 400
-LEAST_INLIERS = 12
-REPROJECTION_PX = 2.0
-
-
 class ConstantVelocity:
     """The motion model of a SLAM system without its measurements.
 
-    The first `frames` frames are aligned to their predecessors (corners followed by Lucas-Kanade, P3P with RANSAC on
-    their depth). Their mean twist, from the first pose to the last over the time between, is the velocity that every
-    later pose is extrapolated with, by time stamp. Where a frame cannot be aligned the velocity of the pairs before it
-    is kept, zero at first; so without any usable frame it stands still. It never measures anything after that: its
-    error says how far the motion model alone carries.
+    The first `frames` frames are aligned to their predecessors (corners tracked by Lucas-Kanade, P3P with RANSAC on
+    their depth). The velocity is their mean twist: the last pose relative to the first over the time between. Every
+    later pose is extrapolated with it, by time stamp. Where a frame cannot be aligned, the velocity so far is kept,
+    zero at first.
     """
 
     def __init__(self, settings: ConstantVelocitySettings) -> None:
@@ -62,11 +58,8 @@ class ConstantVelocity:
         self._camera = camera
         self._velocity: NDArray[np.float64] = np.zeros(6)
         self._pose: NDArray[np.float64] = np.eye(4)
-        self._first_stamp = 0.0
-        self._stamp = 0.0
-        self._seen = 0
-        self._grey: NDArray[np.uint8] | None = None
-        self._depth: NDArray[np.float32] | None = None
+        self._count = 0
+        self._previous: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
 
     def track(self, frame: Frame) -> TrackResult:
         """The measured pose of one of the first frames, the extrapolated one of any other; state ``ok`` throughout.
@@ -77,35 +70,24 @@ class ConstantVelocity:
         if self._camera is None:
             raise TrackerError("constant-velocity was given a frame before reset()")
         start = time.perf_counter()
-        inliers = 0
-        if self._seen == 0:
-            self._first_stamp = frame.timestamp
-        elapsed = frame.timestamp - self._stamp if self._seen else 0.0
-        if self._seen < self.settings.frames:
-            inliers = self._measure(frame, elapsed)
-        else:
-            self._pose = self._pose @ se3.exp(self._velocity * elapsed)
-            self._grey = self._depth = None
-        self._stamp = frame.timestamp
-        self._seen += 1
-        return TrackResult(
-            T_world_cam=self._pose.copy(),
-            state="ok",
-            stats={"inliers": float(inliers)},
-            timings={"tracking": time.perf_counter() - start},
-        )
-
-    def _measure(self, frame: Frame, elapsed: float) -> int:
-        """Align to the frame before, update pose and velocity; the number of points that agree."""
-        assert self._camera is not None
-        grey = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        inliers = 0
-        if self._grey is not None and self._depth is not None:
-            motion, inliers = relative_motion(self._camera, self._grey, self._depth, grey)
-            self._pose = self._pose @ (motion if motion is not None else se3.exp(self._velocity * elapsed))
+        if self._count == 0:
+            self._first_stamp = self._stamp = frame.timestamp
+        motion, inliers = None, 0
+        measured = self._count < self.settings.frames
+        if measured:
+            grey = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            if self._previous is not None:
+                motion, inliers = relative_motion(self._camera, *self._previous, grey)
+            self._previous = grey, frame.depth
+        if motion is None:
+            motion = se3.exp(self._velocity * (frame.timestamp - self._stamp))
+        self._pose = self._pose @ motion
+        if measured and self._count:
             self._velocity = se3.log(self._pose) / max(frame.timestamp - self._first_stamp, 1e-6)
-        self._grey, self._depth = grey, frame.depth
-        return inliers
+        self._stamp = frame.timestamp
+        self._count += 1
+        timings = {"tracking": time.perf_counter() - start}
+        return TrackResult(self._pose.copy(), "ok", {"inliers": float(inliers)}, timings)
 
 
 def relative_motion(
@@ -122,22 +104,20 @@ def relative_motion(
     Returns:
         ``T_a_b`` ``[4, 4]`` and the number of inliers; None and their number if fewer than 12 points agree.
     """
-    found_corners: object = cv2.goodFeaturesToTrack(grey_a, CORNERS, 0.01, 8)  # None if there are none
-    if found_corners is None:
-        return None, 0
-    corners = np.asarray(found_corners, dtype=np.float32).reshape(-1, 2)
+    detected: object = cv2.goodFeaturesToTrack(grey_a, MAX_CORNERS, 0.01, 8)  # None if there are none
+    corners = np.zeros((0, 2), np.float32) if detected is None else np.asarray(detected, np.float32).reshape(-1, 2)
     height, width = depth_a.shape
     column, row = np.rint(corners).astype(np.intp).T
     depth = depth_a[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
     corners, depth = corners[depth > 0], depth[depth > 0]
-    if len(corners) < LEAST_INLIERS:
+    if len(corners) < MIN_INLIERS:
         return None, 0
-    followed, found, _ = cv2.calcOpticalFlowPyrLK(grey_a, grey_b, corners[:, None], corners[:, None].copy())
-    good = found.reshape(-1) == 1
-    if good.sum() < LEAST_INLIERS:
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(grey_a, grey_b, corners[:, None], corners[:, None].copy())
+    good = status.reshape(-1) == 1
+    if good.sum() < MIN_INLIERS:
         return None, 0
     points = camera.unproject(camera.undistort_points(corners[good]), depth[good])
-    pixels = camera.undistort_points(followed.reshape(-1, 2)[good])
+    pixels = camera.undistort_points(tracked.reshape(-1, 2)[good])
     success, rotation, translation, agreeing = cv2.solvePnPRansac(
         points,
         pixels,
@@ -148,7 +128,7 @@ def relative_motion(
         flags=cv2.SOLVEPNP_P3P,
     )
     inliers = 0 if agreeing is None else len(agreeing)
-    if not success or inliers < LEAST_INLIERS:
+    if not success or inliers < MIN_INLIERS:
         return None, inliers
     chosen = np.asarray(agreeing).reshape(-1)
     rotation, translation = cv2.solvePnPRefineLM(
@@ -160,17 +140,13 @@ def relative_motion(
     return (se3.inverse(T_b_a), inliers) if se3.is_pose(T_b_a) else (None, inliers)
 
 
-# Any trajectory file as a tracker, so that foreign results enter the same pipeline.
-
-
 class Replay:
-    """Gives each frame the pose whose stamp lies nearest, as it stands in the file.
+    """A trajectory file as a tracker: each frame gets the pose with the nearest stamp.
 
-    A frame with no pose within the tolerance is lost; the two poses beside it are not interpolated. The poses stay in
-    the file's world frame.
+    A frame without a pose within the tolerance is lost; poses are not interpolated and keep the file's world frame.
 
     Args:
-        settings: Which file, and the tolerance.
+        settings: The file and the tolerance.
 
     Raises:
         TrajectoryError: The file is missing, damaged, or holds no pose.

@@ -1,4 +1,4 @@
-"""The DBoW2 text vocabulary of ORB-SLAM3: found, decompressed into the cache, checked before it is loaded."""
+"""The real ORB-SLAM3 (PyPI package pyorbslam3) in a process of its own; its vocabulary and settings file."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ HINT = (
     f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
     f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
 )
-MOST_BYTES = 512 * MEGABYTE
+MAX_BYTES = 512 * MEGABYTE
 """The vocabulary of ORB-SLAM3 has 145 MB."""
-MOST_MEMORY = 256 * MEGABYTE
-"""Most memory that its decompression may take."""
-TOKENS = 35  # parent, whether it is a leaf, 32 bytes of the descriptor, weight
+MAX_MEMORY = 256 * MEGABYTE
+"""Memory that its decompression may take."""
+TOKENS = 35
+"""Of a node: parent, whether it is a leaf, 32 bytes of the descriptor, weight."""
 
 
 def files(settings: OrbSlam3Settings) -> list[Path]:
-    """The vocabulary, whose content decides what ORB-SLAM3 finds again.
+    """The vocabulary file, part of a run's identity.
 
     Raises:
         TrackerError: See `find_vocabulary`.
@@ -70,14 +71,13 @@ def find_vocabulary(setting: str) -> Path:
 @lru_cache(maxsize=8)
 def _prepared(path: Path, size: int, modified_ns: int) -> Path:
     """Decompress if need be, check; once in a process as long as the file's size and time stay."""
+    packed = read_bytes(path, limit=MAX_BYTES, kind=TrackerError)
     if path.suffix != ".xz":
-        _check(read_bytes(path, limit=MOST_BYTES, kind=TrackerError), path)
+        _check(packed, path)
         return path
-    packed = read_bytes(path, limit=MOST_BYTES, kind=TrackerError)
     target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
     if target.is_file():
-        _check(read_bytes(target, limit=MOST_BYTES, kind=TrackerError), target)
-        return target
+        return _prepared(target, target.stat().st_size, target.stat().st_mtime_ns)
     try:
         text = _unpack(packed)
     except (lzma.LZMAError, EOFError, ValueError) as error:
@@ -90,16 +90,16 @@ def _prepared(path: Path, size: int, modified_ns: int) -> Path:
 
 
 def _unpack(packed: bytes) -> bytes:
-    """The content of an .xz file; a small file that claims or holds far more is a ValueError."""
-    reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MOST_MEMORY)
-    text = reader.decompress(packed, max_length=MOST_BYTES)
+    """The content of an .xz file; ValueError for one that unpacks to far more than a vocabulary."""
+    reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MAX_MEMORY)
+    text = reader.decompress(packed, max_length=MAX_BYTES)
     if not reader.eof:
-        raise ValueError(f"it is cut short, or unpacks to more than {MOST_BYTES >> 20} MB")
+        raise ValueError(f"it is truncated, or unpacks to more than {MAX_BYTES >> 20} MB")
     return text
 
 
 def _check(text: bytes, path: Path) -> None:
-    """Whether the text is a complete vocabulary; its own loader would run on with whatever it finds.
+    """Check that the text is a complete vocabulary; ORB-SLAM3's loader does not.
 
     Raises:
         TrackerError: Names the first line that is wrong.
@@ -117,18 +117,14 @@ def _check(text: bytes, path: Path) -> None:
             f"orbslam3: {path} is no ORB vocabulary: line 1 is '{shown}', not '<branching> <depth> <score> <weight>'",
             HINT,
         )
-    nodes = lines[1:]
-    while nodes and not nodes[-1].strip():
-        nodes.pop()
-    fault = _first_fault(nodes)
+    fault = _first_fault(text.rstrip().splitlines()[1:])
     if fault:
         raise TrackerError(f"orbslam3: the vocabulary {path} ({len(lines)} lines) is damaged: {fault}", HINT)
 
 
 def _first_fault(nodes: Iterable[bytes]) -> str:
-    """What is wrong with the tree, or an empty string; node 0 is the root, node i stands in line i + 1."""
+    """The first fault of the tree, or an empty string; node 0 is the root, node i is on line i + 1."""
     childless = {0}
-    leaves = 0
     for node, line in enumerate(nodes, start=1):
         tokens = line.split()
         if len(tokens) != TOKENS or not b"".join(tokens[:-1]).isdigit():
@@ -139,17 +135,12 @@ def _first_fault(nodes: Iterable[bytes]) -> str:
         childless.discard(parent)
         if tokens[1] == b"0":
             childless.add(node)
-        else:
-            leaves += 1
-    if childless:
-        return f"{len(childless)} inner nodes have no children, as if its end were missing"
-    return "" if leaves else "it has no words"
+    return f"{len(childless)} inner nodes have no children, as if its end were missing" if childless else ""
 
-
-# The real ORB-SLAM3, through the PyPI package pyorbslam3, in a process of its own.
 
 WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
-BORDER_PX = 16  # ORB-SLAM3 looks for no corners so near to the edge of a pyramid level
+BORDER_PX = 16
+"""ORB-SLAM3 extracts no corners so near to the edge of a pyramid level."""
 _VIEWER = (
     ("KeyFrameSize", 0.05), ("KeyFrameLineWidth", 1.0), ("GraphLineWidth", 0.9), ("PointSize", 2.0),
     ("CameraSize", 0.08), ("CameraLineWidth", 3.0), ("ViewpointX", 0.0), ("ViewpointY", -0.7), ("ViewpointZ", -1.8),
@@ -172,7 +163,7 @@ class OrbSlam3Program(ProgramTracker):
     """
 
     sensor: str
-    """How ORB-SLAM3 calls what it is given."""
+    """ORB-SLAM3's name of the sensor."""
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
         self.settings = settings
@@ -190,7 +181,7 @@ class OrbSlam3Program(ProgramTracker):
         """Write its settings file from the camera, start it and load the vocabulary.
 
         Raises:
-            TrackerError: ORB-SLAM3 cannot take the camera, or does not start; names what it said last.
+            TrackerError: ORB-SLAM3 cannot take the camera, or does not start; names its last message.
         """
         check_camera(camera, self.settings)
         super().reset(camera, rng=rng)
@@ -203,19 +194,19 @@ class OrbSlam3Program(ProgramTracker):
 
 
 class OrbSlam3(OrbSlam3Program, FinalizingProgramTracker):
-    """In RGB-D mode: online what it answers at each frame, final what it saves at the end."""
+    """RGB-D mode: online poses are its answers at each frame, final ones what it saves at the end."""
 
     sensor = "RGBD"
 
 
 class OrbSlam3Monocular(OrbSlam3Program):
-    """In monocular mode, which saves no poses of frames at the end; depth is not handed to it."""
+    """Monocular mode, which saves no poses of frames at the end; it gets no depth."""
 
     sensor = "MONOCULAR"
 
 
 def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
-    """Refuse what would make ORB-SLAM3 crash or track nonsense.
+    """Refuse cameras with which ORB-SLAM3 crashes or returns meaningless poses.
 
     Raises:
         TrackerError: Another camera model, intrinsics that are none, or an image too small for the pyramid.
@@ -275,7 +266,7 @@ def settings_yaml(camera: Camera, settings: OrbSlam3Settings, fps: float) -> str
 
 
 def _real(value: float) -> str:
-    """A number that OpenCV's parser takes for a real one: always with a point, as ``1.0`` or ``1.0e-07``."""
+    """A number that OpenCV's parser reads as real: always with a point, as ``1.0`` or ``1.0e-07``."""
     text = repr(value)
     mantissa, exponent, power = text.partition("e")
     return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power

@@ -1,4 +1,4 @@
-"""The process in which ORB-SLAM3 runs: its crashes, its `exit()`, its threads and its chatter stay in here."""
+"""The process in which ORB-SLAM3 runs: it isolates its crashes, its `exit()`, its threads and its output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Settings of the control trackers and of the adapters to foreign systems; light, as every settings module."""
+"""Settings and specs of the control trackers and of the adapters to external systems.
+
+Imports neither torch nor OpenCV.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ class ReplaySettings(Settings):
 
 
 class ProgramSettings(Settings):
-    """How long a foreign program may take."""
+    """Time limits of an external program."""
 
     start_timeout_s: float = Field(120.0, gt=0, description="seconds for starting and answering `reset`")
     frame_timeout_s: float = Field(30.0, gt=0, description="seconds for answering one `track`")
@@ -146,8 +149,6 @@ class Open3dOdometrySettings(Settings):
     iterations_middle: int = tunable(5, meaning="iterations at half the resolution", low=2, high=40)
     iterations_fine: int = tunable(3, meaning="iterations at full resolution", low=1, high=40)
 
-
-# Specs of the control trackers and of the adapters to foreign systems; imports neither torch nor OpenCV.
 
 _HERE = "dynslam_bench.trackers.adapters"
 
@@ -253,7 +254,7 @@ OPENCV_ODOMETRY = TrackerSpec(
 
 OPEN3D_ODOMETRY = TrackerSpec(
     id="open3d-odometry",
-    entry_point=f"{_HERE}.open3d_odometry:Open3dOdometry",
+    entry_point=f"{_HERE}.odometry:Open3dOdometry",
     label="Open3D RGB-D odometry",
     settings=Open3dOdometrySettings,
     summary="Open3D's dense multi-scale frame-to-frame RGB-D odometry.",
@@ -267,13 +268,5 @@ OPEN3D_ODOMETRY = TrackerSpec(
 
 def adapter_specs() -> list[TrackerSpec]:
     """The control trackers and the adapters."""
-    return [
-        NEVER_MOVE,
-        CONSTANT_VELOCITY,
-        REPLAY,
-        SUBPROCESS,
-        ORBSLAM3,
-        ORBSLAM3_MONO,
-        OPENCV_ODOMETRY,
-        OPEN3D_ODOMETRY,
-    ]
+    external = [SUBPROCESS, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY]
+    return [NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, *external]

@@ -1,4 +1,4 @@
-"""What a foreign program answers, as poses and numbers; anything else is one clear error."""
+"""A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,19 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.trackers.adapters.program import Program
 from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
 
+FRAME_FILE = "frame.raw"
+PROTOCOL = 2
+"""Version of the JSON lines."""
+CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m", "readout_s")
+
 
 def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[], float]) -> TrackResult:
     """The result of one frame.
 
     Args:
-        answer: What the program said.
+        answer: The program's answer.
         who: Program and frame, for messages.
-        elapsed_s: Seconds since it was asked; what its own timings do not explain becomes ``transfer``.
+        elapsed_s: Seconds since the request; ``transfer`` is what its own timings leave of them.
 
     Raises:
         TrackerError: It is no pose.
@@ -91,11 +96,6 @@ def _numbers(value: Any, what: str, who: str) -> dict[str, float]:
         raise TrackerError(f"{who}: {what} is not an object of numbers: {str(value)[:80]}") from None
 
 
-# How a foreign program gets the images: a memory-mapped file that is overwritten, or PNG files.
-
-FRAME_FILE = "frame.raw"
-
-
 class ImageExchange:
     """A private folder through which the frames reach a program; removed by `close`, at the latest with the object.
 
@@ -124,7 +124,7 @@ class ImageExchange:
             self._depth = self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
 
     def announce(self) -> dict[str, Any]:
-        """What the program is told once, in ``reset``."""
+        """The part ``images`` of the ``reset`` request."""
         if self.mode == "png":
             return {"mode": "png", "depth_factor": self.camera.depth_factor}
         return {
@@ -136,7 +136,7 @@ class ImageExchange:
         }
 
     def put(self, frame: Frame) -> dict[str, Any]:
-        """Hand over a frame; what the program is told of it in ``track``.
+        """Hand over a frame; returns the paths for the ``track`` request, in mode ``png``.
 
         Raises:
             TrackerError: The images do not have the camera's size.
@@ -172,32 +172,23 @@ class ImageExchange:
 
 
 def _with_space(size: int) -> TemporaryFolder:
-    """A folder with the file for the frames, its space taken already: a full disk would end the run by SIGBUS later.
+    """A folder with the file for the frames, its space allocated: on a full disk SIGBUS would end the run later.
 
     Raises:
         InfrastructureError: There is no room, neither in shared memory nor among the temporary files.
     """
     reasons = []
     for base in (SHARED_MEMORY, None):
+        folder = None
         try:
             folder = TemporaryFolder(base)
+            (folder.path / FRAME_FILE).write_bytes(bytes(size))
+            return folder
         except OSError as error:
             reasons.append(f"{base or tempfile.gettempdir()}: {error.strerror}")
-            continue
-        try:
-            (folder.path / FRAME_FILE).write_bytes(bytes(size))
-        except OSError as error:
-            folder.close()
-            reasons.append(f"{folder.path.parent}: {error.strerror}")
-            continue
-        return folder
+            if folder is not None:
+                folder.close()
     raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")
-
-
-# A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol).
-
-PROTOCOL = 2
-"""Of the JSON lines; since 2 the answer to ``track`` repeats its index."""
 
 
 class ProgramTracker:
@@ -231,7 +222,7 @@ class ProgramTracker:
         self._exchange: ImageExchange | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProgramTracker:
-        """Refused: what a program holds in memory cannot be copied.
+        """Refused: the memory of another process cannot be copied.
 
         Raises:
             TrackerError: Always.
@@ -239,7 +230,7 @@ class ProgramTracker:
         raise TrackerError(f"{self.name} is a program of its own, whose state cannot be copied")
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
-        """Start the program and tell it the camera.
+        """Start the program and send it the camera.
 
         Raises:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
@@ -256,15 +247,8 @@ class ProgramTracker:
             "op": "reset",
             "protocol": PROTOCOL,
             "camera": {
-                "width": camera.width,
-                "height": camera.height,
-                "fx": camera.fx,
-                "fy": camera.fy,
-                "cx": camera.cx,
-                "cy": camera.cy,
+                **{name: getattr(camera, name) for name in CAMERA_FIELDS},
                 "distortion": list(camera.distortion),
-                "baseline_m": camera.baseline_m,
-                "readout_s": camera.readout_s,
                 "fps": self.context.fps,
             },
             "images": self._exchange.announce(),
@@ -281,7 +265,7 @@ class ProgramTracker:
             raise
 
     def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
-        """What else the program is told at ``reset``; `folder` is a private one that lives as long as the sequence."""
+        """The part ``options`` of the ``reset`` request; `folder` is private and lives as long as the sequence."""
         return {}
 
     def track(self, frame: Frame) -> TrackResult:
@@ -290,7 +274,7 @@ class ProgramTracker:
         ``timings`` are those that the program states, with the rest of the time as ``transfer``.
 
         Raises:
-            TrackerError: It dies, hangs, or answers what is no pose.
+            TrackerError: It dies, hangs, or does not answer with a pose.
         """
         program, exchange = self._running()
         start = time.perf_counter()
@@ -327,7 +311,7 @@ class FinalizingProgramTracker(ProgramTracker):
         """The program's final trajectory; rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``, camera to world.
 
         Raises:
-            TrackerError: It dies, hangs, or answers what is no trajectory.
+            TrackerError: It dies, hangs, or does not answer with a trajectory.
         """
         program, _ = self._running()
         answer = program.ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")

@@ -28,7 +28,7 @@ MASKED = [
 ]
 OWN = {"huai-slam": 5, "cfp-slam": 5}
 """What the specs of systems with a compensation of their own promise; all others promise the shared default."""
-ONLY_MASKS = {"mask-rcnn", "dynaslam-n", "emfoa-oft-no-flow"}
+ONLY_MASKS = {"mask-rcnn", "dynaslam-n", "emfoa-oft?flow=none"}
 
 
 CAMERA = Camera(320, 240, 267.7, 269.6, 160.0, 120.0)

@@ -117,26 +117,6 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
     assert keep[lost].all() if rule == "keep" else not keep[lost].any()
 
 
-@pytest.mark.parametrize("rule", ["keep", "drop", "judge"])
-@pytest.mark.parametrize("name", ["di-slam", "seg-slam"])
-def test_a_static_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule: str) -> None:
-    block = next(each for each in system(name)._filters if "flow" in each.needs)
-    block.settings = block.settings.model_copy(update={"unmatched": rule})
-    frame, state, moving, _ = moving_scene("chair" if name == "seg-slam" else "person")
-    assert state.flow is not None
-    valid = np.where(moving, True, np.arange(len(moving)) % 3 > 0)
-    state.flow = FlowResult(state.flow.xy, valid, state.flow.cost)
-    keep = block.apply(frame, state).keep
-    dropped = np.zeros(len(valid), bool) if rule != "drop" or name == "seg-slam" else ~valid
-    np.testing.assert_array_equal(keep, ~moving & ~dropped)
-
-
-def test_opf_keeps_what_its_flow_loses() -> None:
-    frame, state, moving, lost = moving_scene("person")
-    keep = system("opf-slam")._filters[0].apply(frame, state).keep
-    assert keep[lost].all() and not keep[moving & ~lost].any()
-
-
 @pytest.mark.parametrize("name", sorted(set(TESTED) | FOLLOWED))
 def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> None:
     """What the flow of a system finds is what OpenCV's tracker finds, though a way back would contradict some of it."""
