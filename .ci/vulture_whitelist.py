@@ -35,6 +35,9 @@ build_masks_only  # trackers.systems.dynaslam: a variant's spec
 build_object_mode  # trackers.systems.emfoa_oft: a variant's spec
 
 # called by a library
+as_json  # options of verbs: the callback of --json switches the output
+help_all  # the same: the callback of --help-all writes the help
+__dir__  # the interpreter: dir(dynslam_bench)
 __getattr__  # Python asks it for names of a package that are loaded late
 action_space  # gymnasium.Env
 observation_space  # gymnasium.Env

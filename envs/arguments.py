@@ -64,7 +64,7 @@ def open_frames(
         if len(frames) != 2:
             raise SequenceError(f"frames {list(frames)} has {len(frames)} entries", "give (start, stop)")
         frames = (int(frames[0] or 0), frames[1])
-    start, stop = parse_frames(cast("tuple[int, int | None] | str | None", frames))
+    start, stop = parse_frames(frames)
     if isinstance(sequence, str | Path):
         return open_sequence(
             sequence,

@@ -58,7 +58,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     **Action.** ``Discrete(1)`` without `control` (pure evaluation); otherwise ``Box(-1, 1, (k,))`` over the named
     online settings (see `ActionMap`), in force from the frame of the step on; an episode begins with `settings`.
-    The tracker then needs the method of `core.steering.Reconfigurable`, ``configure(settings)``: it takes the complete
+    The tracker then needs the method of `core.settings.Reconfigurable`, ``configure(settings)``: it takes the complete
     settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
 
     **Observation.** ``stats``: float32 ``[24]`` (see `observation.STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
@@ -66,7 +66,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`). Frames without a tracked pose, and
     all remaining ones when `lost_after` ends an episode, cost twice the true motion (``neg_rpe``: not having moved, and
-    having to catch up), or the length of the true way so far (``neg_pose_error``).
+    having to catch up), or the length of the true path so far (``neg_pose_error``).
 
     **Info**: ``frame_index``, ``timestamp``, ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the
     tracker's diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames;
@@ -97,7 +97,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         camera: Name or file of the camera for folders that do not say theirs; None to read it from the folder.
         threads: Threads that the tracker may use.
         cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
-            stage times are the same either way, and `stats` says what came from it (``cached_stages``).
+            stage times are the same either way, and `stats` says which came from it (``cached_stages``).
 
     Raises:
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
@@ -381,7 +381,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 check_same_size(camera, self.sequence.camera)
 
     def _ready_tracker(self) -> Tracker:
-        """The tracker for the current settings and sequence; built anew only if one of them changed."""
+        """The tracker for the current settings and sequence; rebuilt only if one of them changed."""
         key = (self.settings, self.sequence)
         if self._tracker is None or self._tracker_key != key:
             self.close()

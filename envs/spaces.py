@@ -186,7 +186,7 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
     ("matches", "matches / kept keypoints"),
     ("inliers", "inliers / matches"),
     ("residual", "r / (r + 1 px) of the reprojection residual r"),
-    ("mask_fraction", "share of the image held for dynamic"),
+    ("mask_fraction", "share of the image taken for dynamic"),
     ("map_points", "n / (n + 5000) of the map points"),
     ("keyframes", "n / (n + 100) of the keyframes"),
     ("keyframe", "1 if this frame became a keyframe, else 0"),
@@ -324,9 +324,9 @@ REWARDS: dict[str, Callable[[OnlineSample], float]] = {
 
 - ``neg_rpe``: minus the translational error of the motion since the previous frame; needs no alignment and adds up.
   A frame without a tracked pose costs twice the true motion: it did not move, and it has to catch up. The first tracked
-  pose after it is a jump from the last one (see `OnlineError`), which costs only what goes beyond the way paid for. So
-  to admit a loss never earns more than to repeat the last pose, and to stay lost never more than to find the way back.
-- ``neg_pose_error``: minus the causal translational pose error, at most the length of the true way so far (an error of
+  pose after it is a jump from the last one (see `OnlineError`), which costs only the error beyond the charged path. So
+  reporting a loss never earns more than repeating the last pose, and staying lost never more than recovering.
+- ``neg_pose_error``: minus the causal translational pose error, at most the length of the true path so far (an error of
   100 %). A frame without a tracked pose earns minus that length: no pose, however far it has drifted, earns less, so
   that getting lost pays nowhere but before the first tracked pose, which begins the episode's frame of reference.
 

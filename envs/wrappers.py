@@ -118,7 +118,7 @@ class SequenceSampler(SlamWrapper):
         env: A `SlamEnv`, wrapped or not.
         sequences: Ids or folders; with ``rgbd`` observations all must have the same image size.
         mode: ``round_robin`` takes them in order; ``random`` draws from the wrapper's own generator, which a `reset`
-            with a seed founds anew.
+            with a seed seeds.
 
     Raises:
         SettingsError: No sequences, or an unknown mode.
@@ -162,7 +162,7 @@ class SequenceSampler(SlamWrapper):
 
 
 class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
-    """Makes ``rgbd`` observations small 8-bit images, colour and depth alike, as stable-baselines3 expects images.
+    """Makes ``rgbd`` observations small 8-bit images, colour and depth, as stable-baselines3 expects images.
 
     ``rgb`` becomes uint8 ``[height, width, 3]``, averaged over the pixels that fall together; ``depth`` becomes uint8
     ``[height, width, 1]``, the nearest pixel's, in steps of 20 m / 254: 0 is missing, 255 is 20 m or more. ``stats``

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
-from dynslam_bench.core.passwords import without_passwords
 from dynslam_bench.core.records import Record
+from dynslam_bench.core.sanitise import without_passwords
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
 

@@ -19,7 +19,6 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.passwords import words_without_passwords
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.sanitise import storable, words_without_passwords
 from dynslam_bench.core.settings import apply_overrides, flatten

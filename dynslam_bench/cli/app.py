@@ -23,7 +23,7 @@ from dynslam_bench.cli import (
 )
 from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START
 from dynslam_bench.cli.output import download_bar, set_json_mode, write_error
-from dynslam_bench.core.download_progress import show_downloads
+from dynslam_bench.core.download import show_downloads
 from dynslam_bench.core.errors import DynslamError
 
 INTERRUPT_CODE = 130

@@ -117,7 +117,7 @@ def run_demo(results: Path | str = "results", *, frames: int = 60, jobs: int = 2
 
 
 def study_spec(frames: int, trials: int) -> StudySpec:
-    """A study of the error, which does not depend on the machine's load, on three scenes, judged on three others."""
+    """A study of the error, which does not depend on the machine's load, on three scenes, checked on three others."""
     from dynslam_bench.core.records import digest
     from dynslam_bench.runs.identity import source_fingerprint
     from dynslam_bench.trackers import TRACKERS

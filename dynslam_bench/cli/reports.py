@@ -192,7 +192,7 @@ def demo(
     jobs: Jobs = 2,
     trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
 ) -> None:
-    """Run trackers on rendered sequences, report them, tune one: the whole way, with no download."""
+    """Run trackers on rendered sequences, report them, tune one: all steps, with no download."""
     from dynslam_bench.cli.demo import run_demo
 
     outcome = run_demo(results, frames=frames, jobs=jobs, trials=trials)

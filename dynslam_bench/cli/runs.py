@@ -98,7 +98,7 @@ def list_(
 
     from dynslam_bench.core.errors import RunError, did_you_mean
     from dynslam_bench.runs.record import Status
-    from dynslam_bench.runs.run_list import list_runs
+    from dynslam_bench.runs.store import list_runs
 
     if status is not None and status not in get_args(Status):
         raise RunError(f"unknown status '{status}'", did_you_mean(status, get_args(Status)))

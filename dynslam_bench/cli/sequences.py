@@ -88,7 +88,7 @@ def info(
     camera: Camera = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what is known of a sequence, and what it holds if it is on this machine."""
+    """Show the facts of a sequence, and its contents if it is on this machine."""
     from dynslam_bench.sequences.catalogue import describe
 
     facts: dict[str, Any] = describe(name, data_root=data_root, camera=camera)
@@ -166,7 +166,7 @@ def doctor(
     camera: Camera = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a recording's images with its camera and its truth; exits with 4 where a fault was found."""
+    """Compare a recording's images with its camera and its truth; exits with 4 if there is a fault."""
     from dynslam_bench.sequences.doctor import diagnose
 
     with progress(name) as advance:

@@ -126,10 +126,10 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
     """The reported numbers of a system: those of its spec, of publications, and the claims of the paper."""
     from dynslam_bench.reports.model.published import CLAIMED, claimed, published
 
-    own = [
+    stated = [
         (name, metric, value, "its spec", "") for name, row in spec.reported.items() for metric, value in row.items()
     ]
-    read = [
+    measured = [
         (p.sequence, p.metric, p.value, p.source, "; ".join(filter(None, (p.alignment, p.remarks))))
         for p in published().itertuples()
         if p.system in spec.published_as
@@ -140,7 +140,7 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
         if c.system in spec.published_as and c.kind == "value"
     ]
     names = ("sequence", "metric", "value", "source", "remarks")
-    return [dict(zip(names, row, strict=True)) for row in own + read + paper]
+    return [dict(zip(names, row, strict=True)) for row in stated + measured + paper]
 
 
 @app.command()
@@ -165,7 +165,7 @@ def test(
     memory_limit: MemoryLimit = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check that a tracker keeps its contract, in a process of its own."""
+    """Check that a tracker keeps its contract, in a child process."""
     from dynslam_bench.testing import isolated_tracker_report
 
     def on_check(check: Check) -> None:

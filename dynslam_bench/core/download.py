@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from urllib.parse import SplitResult
     from urllib.request import Request
 
+
 CHUNK = 1 << 18
 MOST_BYTES = 32 * 2**30
 DEADLINE_S = 24 * 3600.0

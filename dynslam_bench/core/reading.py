@@ -18,6 +18,7 @@ from dynslam_bench.core.errors import DynslamError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+
 MEGABYTE = 1 << 20
 RECORD_BYTES = 16 * MEGABYTE
 """Most bytes of a record, a settings file or anything else that is written by hand or by frame."""

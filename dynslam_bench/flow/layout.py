@@ -112,14 +112,13 @@ def level_shape(height: int, width: int, step: int) -> tuple[int, int]:
 @lru_cache(maxsize=16)
 def map_geometry(height: int, width: int) -> MapGeometry:
     """The arrangement of the seven levels for an image size in pixels."""
-    base, stride, shift, bias, total = [], [], [], [], 0
+    levels, total = [], 0
     for step in LEVEL_STEPS:
         rows, columns = level_shape(height, width, step)
         margin = MARGIN // step
-        base.append(total)
-        stride.append(columns + 2 * margin)
-        # full-image x (pixel centres at integers) falls into map pixel floor((x + 0.5) / step)
-        shift.append(int(np.log2(step * SUBPIXEL)))
-        bias.append(SUBPIXEL // 2 + margin * step * SUBPIXEL)
+        # full-image x (pixel centres at integers) lies in map pixel floor((x + 0.5) / step)
+        shift, bias = int(np.log2(step * SUBPIXEL)), SUBPIXEL // 2 + margin * step * SUBPIXEL
+        levels.append((total, columns + 2 * margin, shift, bias))
         total += (rows + 2 * margin) * (columns + 2 * margin)
-    return MapGeometry(*(np.asarray(column, dtype=np.int64) for column in (base, stride, shift, bias)), total)
+    table = np.array(levels, dtype=np.int64).T.copy()
+    return MapGeometry(table[0], table[1], table[2], table[3], total)

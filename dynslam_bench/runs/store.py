@@ -44,6 +44,7 @@ from dynslam_bench.runs.run_index import (
 if TYPE_CHECKING:
     import pandas as pd
 
+
 LOGGER = logging.getLogger(__name__)
 DEFAULT_PROTOCOL = "tum-rgbd/v1"
 Which = Literal["online", "final"]

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from dynslam_bench.contracts.tracker import MapOutputs
-from dynslam_bench.core.array_files import MOST_BYTES, read_npz
 from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
 from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
 from dynslam_bench.core.records import Record, schema, write_atomic

@@ -191,13 +191,14 @@ def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
 
 
 def _determinism(construct: Callable[[], DynamicFilter], steps: Steps) -> None:
-    results = [_run(construct(), steps) for _ in range(2)]
-    _same(*results, "two runs differ", "all randomness has to come from state.seed")
+    first, second = _run(construct(), steps), _run(construct(), steps)
+    _same(first, second, "two runs differ", "all randomness has to come from state.seed")
 
 
 def _two_resets(candidate: DynamicFilter, steps: Steps) -> None:
-    results = [_run(candidate, steps) for _ in range(2)]
-    _same(*results, "the verdict changes after a second reset()", "reset() keeps something of the sequence before")
+    first, second = _run(candidate, steps), _run(candidate, steps)
+    cause = "reset() keeps something of the sequence before"
+    _same(first, second, "the verdict changes after a second reset()", cause)
 
 
 def _same(first: list[FilterResult], second: list[FilterResult], fault: str, cause: str) -> None:

@@ -149,9 +149,9 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     first, second = grey(scene[0]), grey(scene[1])
     grid = _grid(first.shape, points)
 
-    def results(target: Image, points: NDArray[np.float32], **options: NDArray[np.float32]) -> FlowResult:
+    def results(target: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None) -> FlowResult:
         flow = construct()
-        result = flow.track(flow.prepare(first.copy()), flow.prepare(target.copy()), points.copy(), **options)
+        result = flow.track(flow.prepare(first.copy()), flow.prepare(target.copy()), points.copy(), guess=guess)
         check_flow_result(result, points, stats_names_of(flow))
         return result
 
@@ -178,7 +178,7 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     report.run("images are left alone", left_alone)
     report.run("no points", lambda: results(second, grid[:0]))
     report.run("points outside", outside)
-    report.run("guesses", lambda: results(second, grid, guess=guess))
+    report.run("guesses", lambda: results(second, grid, guess))
     report.run("determinism", lambda: _flow_determinism(construct, first, second, grid))
     report.run("a small shift is found", lambda: _flow_finds_shift(results, first, grid))
     for name, frame in hard_frames(scene[0]).items():

@@ -106,7 +106,7 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
 
         SEGMENTERS.get(subject)  # an unknown name is an error, not a failed check
         scene, masks = testing.CornerSequence(2), SegmentationSettings(source=f"plugin:{subject}")
-        build = partial(build_segmenter, masks, sequence_id=scene.id, masks=scene.masks)
+        build: Any = partial(build_segmenter, masks, sequence_id=scene.id, masks=scene.masks)
         return testing.segmenter_report(build, sequence=scene)
     if kind == "flow":
         from dynslam_bench.flow.registry import FLOWS, build_flow

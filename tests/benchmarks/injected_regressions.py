@@ -45,9 +45,9 @@ def injected(name: str, tracker: str, bad: dict[str, Any]) -> TrackerSpec:
     return replace(spec, id=f"injected-{name}", settings=worse, presets={})
 
 
-MOTION = injected("motion", "emfoa-oft-no-masks", {"motion.enabled": False})
+MOTION = injected("motion", "emfoa-oft?masks=none", {"motion.enabled": False})
 FEATURES = injected("features", "mask-rcnn", {"features.n_features": 500, "segmentation.source": "embedded"})
-THRESHOLD = injected("threshold", "emfoa-oft-no-masks", {"motion.threshold_px": 10.0})
+THRESHOLD = injected("threshold", "emfoa-oft?masks=none", {"motion.threshold_px": 10.0})
 DILATION = injected("dilation", "mask-rcnn", {"segmentation.dilation_px": 0, "segmentation.source": "embedded"})
 MASKED_CASES = ("features", "dilation")
 SCENES = {

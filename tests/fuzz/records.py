@@ -26,8 +26,7 @@ from dynslam_bench.runs.frames import FrameLog, load_frames
 from dynslam_bench.runs.run_index import INDEX_FILE
 from dynslam_bench.runs.store import list_runs
 from dynslam_bench.sequences.fetch import Receipt
-from dynslam_bench.tuning import Study, StudySummary
-from dynslam_bench.tuning import storage as cmaes_state
+from dynslam_bench.tuning import Study, StudySummary, samplers
 
 from .mutate import mutate_json, mutate_lines, mutate_zip
 from .target import Target, at
@@ -252,5 +251,5 @@ TARGETS = [
         mutate_zip,
     ),
     Target("stage cache entry", _read_entry, lambda: [_entry()]),
-    Target("state of CMA-ES", lambda data, folder: cmaes_state._OnlyStates.loads(data or b""), _state_seeds),
+    Target("state of CMA-ES", lambda data, folder: samplers.restore_cma(data or b""), _state_seeds),
 ]

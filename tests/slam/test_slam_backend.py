@@ -265,7 +265,7 @@ def resting(room):
 
 
 def strolling(room):
-    return [room.see(pose, index, limit=300) for index, pose in enumerate(room.path(24))]
+    return [room.see(pose, index, limit=300) for index, pose in enumerate(room.path(40))]
 
 
 @pytest.mark.parametrize(
@@ -273,6 +273,7 @@ def strolling(room):
     [
         ("keyframes__max_gap", (10, 90), resting, {}),
         ("bundle_adjustment__window", (2, 20), strolling, {"keyframes__tracked_share": 0.95}),
+        ("keyframes__redundant_share", (0.7, 1.0), strolling, {"keyframes__tracked_share": 0.95}),
     ],
 )
 def test_both_ends_of_a_range_give_other_results(room, name, ends, frames, others):

@@ -90,7 +90,7 @@ class MonocularSemanticSettings(MonocularSystemSettings, SemanticSystemSettings)
     segmentation: UnrepairedSettings = UnrepairedSettings()
 
 
-class PublishedFlowSettings(FlowSettings):
+class PublishedFlowSettings(FlowMethodSettings):
     """Lucas-Kanade as published systems use it: none of their sources names a forward-backward check."""
 
     method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
@@ -245,18 +245,18 @@ def describe_dilation(segmentation: SegmentationSettings) -> str:
     return f"masks grown by {segmentation.dilation_px} px (not stated)"
 
 
-def describe_tracks(flow: FlowSettings) -> str:
+def describe_tracks(flow: FlowMethodSettings) -> str:
     """How a system's flow is computed."""
     limit = flow.forward_backward_px
     check = f"a check of {limit:g} px on the way back" if limit else "no check on the way back"
     return f"Lucas-Kanade tracks (window {flow.window_px} px, begun at the motion model's guess, {check})"
 
 
-def describe_matches(flow: FlowSettings, unmatched: Unmatched) -> str:
+def describe_matches(flow: FlowMethodSettings, unmatched: Unmatched) -> str:
     """How a system that tests matches computes them, and how it treats features without one."""
     return f"matches are {describe_tracks(flow)}; {UNMATCHED[unmatched]}"
 
 
-def describe_links(flow: FlowSettings) -> str:
+def describe_links(flow: FlowMethodSettings) -> str:
     """How a system with a memory of features follows them, and how it treats new ones."""
     return f"features are followed by {describe_tracks(flow)}, not by descriptors; one without a past begins at 0.5"

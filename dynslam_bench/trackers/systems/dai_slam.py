@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import CorrelationSettings
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.trackers.systems.composition import SystemSettings, composed, describe_tracks
 
 
