@@ -446,8 +446,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
         }
         values |= {name: row.metrics.get(name) for name in metrics}
         lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
-    columns_of_values = dict(zip(kinds, zip(*lines, strict=True), strict=True)) if lines else dict.fromkeys(kinds, ())
-    return pd.DataFrame({name: pd.array(list(columns_of_values[name]), dtype=kind) for name, kind in kinds.items()})
+    return pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
 
 
 def load_frame(

@@ -265,13 +265,13 @@ def _all_rows(
         on_progress(done, total, f"scoring {rows[-1][0].tracker.id} on {rows[-1][0].sequence.id}" if rows else "")
 
     taken: dict[int, list[tuple[RunRow, str]]] = {id(cache): [] for cache in caches}
-    for (cache, _), (rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
-        taken[id(cache)] += rows
+    for (cache, _), (new_rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
+        taken[id(cache)] += new_rows
         loaded.unreadable += unreadable
     everything = []
-    for cache, known_rows in zip(caches, kept, strict=True):
+    for cache, rows in zip(caches, kept, strict=True):
         cache.add(taken[id(cache)])
-        everything += [*known_rows.values(), *(row for row, _ in taken[id(cache)])]
+        everything += [*rows.values(), *(row for row, _ in taken[id(cache)])]
     return everything
 
 
